@@ -1,0 +1,114 @@
+"""Photometric augmentation: light, colour, focus, sensor noise and compression vary, poses do not.
+
+To add one, write a method with the image and the generator as arguments, give its range a
+constructor argument and call it in :meth:`Photometric.__call__`, where the order is the order of a
+camera: light and colour, lens, sensor, file.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+Image = UInt8[np.ndarray, "height width 3"]
+Range = tuple[float, float]
+
+# BT.601 luma weights: grey keeps its brightness when saturation or hue changes.
+_LUMA = np.array([0.299, 0.587, 0.114])
+# RGB to YIQ, in which a hue change is a rotation of the (I, Q) plane.
+_YIQ = np.array([_LUMA, [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
+_RGB = np.linalg.inv(_YIQ)
+
+
+class Photometric:
+    """Random photometric changes, each drawn from the item's own generator.
+
+    Args:
+        brightness: Largest offset, as a share of 255.
+        contrast: Largest relative change of the contrast about mid-grey.
+        saturation: Largest relative change of the saturation.
+        hue: Largest hue rotation, radians.
+        colour_gain: Largest relative change of each colour channel (white balance).
+        blur_probability: Chance of a Gaussian blur.
+        blur_sigma: Range of its sigma, pixels.
+        noise_probability: Chance of Gaussian noise, independent per pixel and channel.
+        noise_sigma: Range of its standard deviation, grey levels.
+        jpeg_probability: Chance of one JPEG compression.
+        jpeg_quality: Range of its quality, 1 … 100.
+
+    Raises:
+        ValueError: A range is negative or its ends are exchanged, or a probability is outside
+            [0, 1].
+    """
+
+    def __init__(
+        self,
+        brightness: float = 0.2,
+        contrast: float = 0.3,
+        saturation: float = 0.3,
+        hue: float = 0.15,
+        colour_gain: float = 0.1,
+        blur_probability: float = 0.2,
+        blur_sigma: Range = (0.3, 1.2),
+        noise_probability: float = 0.3,
+        noise_sigma: Range = (1.0, 8.0),
+        jpeg_probability: float = 0.1,
+        jpeg_quality: Range = (40, 95),
+    ) -> None:
+        ranges = {
+            "blur_sigma": blur_sigma,
+            "noise_sigma": noise_sigma,
+            "jpeg_quality": jpeg_quality,
+        }
+        changes = {"brightness": brightness, "contrast": contrast, "saturation": saturation}
+        changes |= {"hue": hue, "colour_gain": colour_gain}
+        chances = {"blur": blur_probability, "noise": noise_probability, "jpeg": jpeg_probability}
+        bad = [f"{k}={v}" for k, v in ranges.items() if not 0 <= v[0] <= v[1]]
+        bad += [f"{k}={v}" for k, v in changes.items() if v < 0]
+        bad += [f"{k}_probability={v}" for k, v in chances.items() if not 0 <= v <= 1]
+        if bad:
+            raise ValueError(f"not an allowed range or probability: {', '.join(bad)}")
+        self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
+        self.hue, self.colour_gain = hue, colour_gain
+        self.blur_probability, self.blur_sigma = blur_probability, blur_sigma
+        self.noise_probability, self.noise_sigma = noise_probability, noise_sigma
+        self.jpeg_probability, self.jpeg_quality = jpeg_probability, jpeg_quality
+
+    def __call__(self, image: Image, rng: np.random.Generator) -> Image:
+        """Return a changed copy of an RGB image."""
+        image = cv2.transform(image, self._colour_matrix(rng))
+        if rng.random() < self.blur_probability:
+            image = cv2.GaussianBlur(image, (0, 0), rng.uniform(*self.blur_sigma))
+        if rng.random() < self.noise_probability:
+            image = _noisy(image, rng.uniform(*self.noise_sigma), rng)
+        if rng.random() < self.jpeg_probability:
+            image = _compressed(image, round(rng.uniform(*self.jpeg_quality)))
+        return np.asarray(image)
+
+    def _colour_matrix(self, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
+        """Compose all colour changes into one affine map, so pixels are rounded once."""
+        angle = rng.uniform(-self.hue, self.hue)
+        chroma = 1 + rng.uniform(-self.saturation, self.saturation)
+        turn = np.eye(3)
+        cos, sin = chroma * np.cos(angle), chroma * np.sin(angle)
+        turn[1:, 1:] = [[cos, -sin], [sin, cos]]
+        gain = 1 + rng.uniform(-self.colour_gain, self.colour_gain, 3)
+        contrast = 1 + rng.uniform(-self.contrast, self.contrast)
+        linear = contrast * gain[:, None] * (_RGB @ turn @ _YIQ)
+        offset = 127.5 * (1 - contrast) + 255 * rng.uniform(-self.brightness, self.brightness)
+        return np.column_stack([linear, np.full(3, offset)])
+
+
+def _noisy(image: Image, sigma: float, rng: np.random.Generator) -> Image:
+    noise = rng.standard_normal(image.shape, dtype=np.float32)
+    noise *= np.float32(sigma)
+    noise += image
+    return np.asarray(cv2.convertScaleAbs(np.maximum(noise, 0, out=noise)))
+
+
+def _compressed(image: Image, quality: int) -> Image:
+    # The codec takes the channels as B, G, R; a swapped order would weigh red and blue wrongly.
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))

@@ -1,0 +1,169 @@
+"""The DataModule: sources in, batches for training and validation out, one seed for everything."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from lightning.pytorch import LightningDataModule
+
+from dopepp.data.augment import Photometric
+from dopepp.data.draws import Purpose, item_rng
+from dopepp.data.loader import EpochSampler, PoseLoader, SampleDataset
+from dopepp.data.masking import RandomMask
+from dopepp.data.resize import letterbox_sample, pad_sample, resize_sample
+from dopepp.data.sample import DescribedSource, Sample
+from dopepp.errors import UserError
+from dopepp.virtual.backgrounds import Backgrounds
+
+
+@dataclass(frozen=True)
+class SourceRow:
+    """A line of the start-up print.
+
+    Attributes:
+        split: ``train``, ``val`` or ``test``.
+        source: The source's name.
+        num_images: Images it holds.
+        num_instances: Instances per object; empty where counting is not cheap.
+    """
+
+    split: str
+    source: str
+    num_images: int
+    num_instances: dict[str, int]
+
+
+class PoseDataModule(LightningDataModule):
+    """Training, validation and test data for pose estimation.
+
+    Training items are resized, masked, augmented and padded; validation items only letterboxed;
+    test items come at their native resolution, as :class:`Sample`.
+
+    Args:
+        train: Training data.
+        val: Validation data (model selection, thresholds); its epoch is always 0.
+        test: Test data; its epoch is always 0.
+        object_names: The objects in the network's order.
+        input_size: The network's input (width, height), pixels.
+        batch_size: Images per batch and process.
+        num_workers: Loader processes; 0 loads in the training process.
+        seed: Seed of order, masking and augmentation.
+        masking: Random mask local processing, or None.
+        augment: Photometric augmentation, or None.
+        backgrounds: Other pictures that masking may need; required with ``masking``.
+
+    Raises:
+        UserError: The training data are less than one batch.
+        ValueError: ``masking`` without ``backgrounds``.
+    """
+
+    def __init__(
+        self,
+        train: DescribedSource,
+        val: DescribedSource,
+        test: DescribedSource,
+        object_names: Sequence[str],
+        input_size: tuple[int, int],
+        batch_size: int,
+        num_workers: int = 0,
+        seed: int = 0,
+        masking: RandomMask | None = None,
+        augment: Photometric | None = None,
+        backgrounds: Backgrounds | None = None,
+    ) -> None:
+        super().__init__()
+        if masking is not None and backgrounds is None:
+            raise ValueError("masking needs backgrounds, for objects that fill their picture")
+        if len(train) < batch_size:
+            raise UserError(
+                f"{len(train)} training images for batches of {batch_size}",
+                "at least one full batch per epoch",
+                "lower data.batch_size or raise data.samples_per_epoch",
+            )
+        self.train_source, self.val_source, self.test_source = train, val, test
+        self.object_names, self.input_size = list(object_names), input_size
+        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self._masking, self._augment, self._backgrounds = masking, augment, backgrounds
+
+    def train_item(self, epoch: int, index: int) -> Sample:
+        """Return a training item, a pure function of (seed, epoch, index).
+
+        Masking and augmentation come between resizing and padding: the padding is neither
+        background nor does it get noise, as at prediction.
+        """
+        sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
+        rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
+        if self._masking is not None and self._backgrounds is not None:
+            sample = self._masking(sample, rng, self._backgrounds)
+        if self._augment is not None:
+            sample = replace(sample, image=self._augment(sample.image, rng))
+        return pad_sample(sample, self.input_size)
+
+    def val_item(self, epoch: int, index: int) -> Sample:
+        """Return a validation item, letterboxed."""
+        return letterbox_sample(self.val_source.sample(index, epoch), self.input_size)
+
+    def train_dataloader(self) -> PoseLoader:
+        """Return the shuffled loader; the last incomplete batch is dropped."""
+        return self._loader(SampleDataset(self.train_item, len(self.train_source)), shuffle=True)
+
+    def val_dataloader(self) -> PoseLoader:
+        """Return the loader in order; over all ranks every item comes exactly once."""
+        return self._loader(SampleDataset(self.val_item, len(self.val_source)), shuffle=False)
+
+    def _loader(self, dataset: SampleDataset, shuffle: bool) -> PoseLoader:
+        rank = self.trainer.global_rank if self.trainer is not None else 0
+        world_size = self.trainer.world_size if self.trainer is not None else 1
+        return PoseLoader(
+            dataset,
+            EpochSampler(dataset, self.seed, shuffle, rank, world_size),
+            self.object_names,
+            batch_size=self.batch_size,
+            drop_last=shuffle,
+            num_workers=self.num_workers,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+    def test_samples(self) -> Iterator[Sample]:
+        """Yield the test images at native resolution, in order."""
+        for index in range(len(self.test_source)):
+            yield self.test_source.sample(index, 0)
+
+    def check_objects(self) -> None:
+        """Fail when an object to learn is in no training source.
+
+        Raises:
+            UserError: Names the objects that are missing.
+        """
+        missing = [name for name in self.object_names if not self.train_source.contains(name)]
+        if missing:
+            sources = ", ".join(info.name for info in self.train_source.describe())
+            raise UserError(
+                f"no instance of {', '.join(missing)} in the training data ({sources})",
+                "objects with at least one instance in a training source",
+                "take the object out, or add a source that shows it (e.g. renders)",
+            )
+
+    def summary(self) -> list[SourceRow]:
+        """Return the sources of every split, for the start-up print."""
+        return [
+            SourceRow(split, info.name, info.num_images, dict(info.num_instances))
+            for split, source in self._splits().items()
+            for info in source.describe()
+        ]
+
+    def fingerprint(self) -> str:
+        """Return a SHA-256 over everything that decides the images, without the images."""
+        record = {
+            split: [[info.name, info.num_images, dict(info.identity)] for info in source.describe()]
+            for split, source in self._splits().items()
+        }
+        text = json.dumps({"seed": self.seed, **record}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _splits(self) -> dict[str, DescribedSource]:
+        return {"train": self.train_source, "val": self.val_source, "test": self.test_source}

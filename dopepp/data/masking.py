@@ -1,0 +1,162 @@
+"""Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
+
+A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
+box high and wide. The network still has to place the keypoints that the patch covers: keypoints
+stay as they are, while masks and visible fractions lose the covered pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.data.silhouette import silhouette
+from dopepp.virtual.backgrounds import Backgrounds
+
+MIN_PATCH_PX = 2
+"""A patch of one pixel is a solid colour, whatever it shows."""
+
+
+class RandomMask:
+    """Cover each instance with one background patch, with a probability.
+
+    Args:
+        probability: Chance of each instance to get a patch.
+        max_height: Largest patch height as a share of the object's box height (paper: 0.8).
+        max_width: Largest patch width as a share of the object's box width (paper: 0.8).
+        min_contrast: A crop counts as solid when no colour channel's standard deviation reaches
+            this many grey levels.
+        max_draws: Crops drawn from each picture until one is not solid; an instance for which even
+            the other picture gives none stays uncovered, with ``masked_fraction`` 0.
+
+    Raises:
+        ValueError: A share or the probability is outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        probability: float = 0.5,
+        max_height: float = 0.8,
+        max_width: float = 0.8,
+        min_contrast: float = 3.0,
+        max_draws: int = 8,
+    ) -> None:
+        if not all(0.0 <= share <= 1.0 for share in (probability, max_height, max_width)):
+            raise ValueError(
+                f"probability={probability}, max_height={max_height}, max_width={max_width}: "
+                "each must be in [0, 1]"
+            )
+        self.probability, self.max_height, self.max_width = probability, max_height, max_width
+        self.min_contrast, self.max_draws = min_contrast, max_draws
+
+    def __call__(self, sample: Sample, rng: np.random.Generator, other: Backgrounds) -> Sample:
+        """Return a masked copy of the sample; the argument is not changed.
+
+        Args:
+            sample: Image with instances, unpadded, so that padding is never taken as background.
+            rng: The item's generator.
+            other: Gives another picture when the image has no fitting background left.
+        """
+        silhouettes = [
+            silhouette(instance, sample.image.shape[:2]) for instance in sample.instances
+        ]
+        occupied = np.zeros(sample.image.shape[:2], bool)
+        for seen in silhouettes:
+            occupied |= seen
+        free = cv2.integral(occupied.astype(np.uint8))
+        image, covered = sample.image.copy(), np.zeros_like(occupied)
+        for seen in silhouettes:
+            if rng.random() >= self.probability or not seen.any():
+                continue
+            patch = self._patch(seen, rng)
+            if patch is None:
+                continue
+            rows, columns = patch
+            size = (rows.stop - rows.start, columns.stop - columns.start)
+            crop = self._crop(sample.image, free, size, rng, other)
+            if crop is not None:
+                image[rows, columns], covered[rows, columns] = crop, True
+        instances = [
+            _covered_instance(instance, seen, covered)
+            for instance, seen in zip(sample.instances, silhouettes, strict=True)
+        ]
+        return replace(sample, image=image, instances=instances)
+
+    def _patch(
+        self, seen: Bool[np.ndarray, "height width"], rng: np.random.Generator
+    ) -> tuple[slice, slice] | None:
+        """Draw a patch inside the object's box; None when the box is too small for any."""
+        slices = []
+        for axis, limit in ((1, self.max_height), (0, self.max_width)):
+            hit = np.flatnonzero(seen.any(axis=axis))
+            start, extent = int(hit[0]), int(hit[-1] - hit[0] + 1)
+            longest = int(limit * extent)
+            if longest < MIN_PATCH_PX:
+                return None
+            length = int(rng.integers(MIN_PATCH_PX, longest + 1))
+            offset = start + int(rng.integers(0, extent - length + 1))
+            slices.append(slice(offset, offset + length))
+        return slices[0], slices[1]
+
+    def _crop(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        free: np.ndarray,
+        size: tuple[int, int],
+        rng: np.random.Generator,
+        other: Backgrounds,
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Draw a crop from the image's background, else from another picture."""
+        height, width = size
+        # Sum of occupied pixels in every window of this size, from the integral image.
+        occupied = (
+            free[height:, width:]
+            - free[:-height, width:]
+            - free[height:, :-width]
+            + free[:-height, :-width]
+        )
+        places = np.flatnonzero(occupied.ravel() == 0)
+        for _ in range(self.max_draws if len(places) else 0):
+            row, column = divmod(int(rng.choice(places)), occupied.shape[1])
+            crop = image[row : row + height, column : column + width]
+            if self._has_contrast(crop):
+                return crop
+        for _ in range(self.max_draws):
+            crop = _crop_of_other(other, image.shape[:2], size, rng)
+            if self._has_contrast(crop):
+                return crop
+        return None
+
+    def _has_contrast(self, crop: UInt8[np.ndarray, "rows columns 3"]) -> bool:
+        return float(crop.reshape(-1, 3).std(axis=0).max()) >= self.min_contrast
+
+
+def _covered_instance(
+    instance: Instance,
+    seen: Bool[np.ndarray, "height width"],
+    covered: Bool[np.ndarray, "height width"],
+) -> Instance:
+    before = int(np.count_nonzero(seen))
+    if before == 0:
+        return instance
+    share = int(np.count_nonzero(seen & covered)) / before
+    return replace(
+        instance,
+        mask=None if instance.mask is None else instance.mask & ~covered,
+        visible_fraction=instance.visible_fraction * (1 - share),
+        masked_fraction=share,
+    )
+
+
+def _crop_of_other(
+    other: Backgrounds, shape: tuple[int, int], size: tuple[int, int], rng: np.random.Generator
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Crop (height, width) from another picture of the image's (height, width)."""
+    picture = other.draw(rng, shape[1], shape[0])
+    row = int(rng.integers(0, shape[0] - size[0] + 1))
+    column = int(rng.integers(0, shape[1] - size[1] + 1))
+    return np.asarray(picture[row : row + size[0], column : column + size[1]])

@@ -1,0 +1,103 @@
+"""What every reader returns: one image with its camera and the posed objects on it.
+
+To add a format, write a class with the :class:`DescribedSource` methods and one YAML file in
+``conf/data``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+
+@dataclass
+class Instance:
+    """One object on an image.
+
+    Attributes:
+        label: The part's name.
+        T_cam_obj: Rigid transform from object to camera frame, (4, 4), metres, float64.
+        keypoints: Projected cuboid corners and centroid, pixels, NaN behind the camera.
+        visible_fraction: Visible share of the object's full silhouette, occlusion and truncation
+            both counted, in [0, 1].
+        mask: Visible pixels, or None where the source has none.
+        masked_fraction: Share of the visible pixels that random mask local processing has covered;
+            ``visible_fraction`` and ``mask`` are already reduced by it.
+    """
+
+    label: str
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    keypoints: Float[np.ndarray, "9 2"]
+    visible_fraction: float = 1.0
+    mask: Bool[np.ndarray, "height width"] | None = None
+    masked_fraction: float = 0.0
+
+
+@dataclass
+class Sample:
+    """One image and its ground truth.
+
+    Attributes:
+        image: RGB, uint8.
+        K: Camera matrix in pixels of this image, float64.
+        instances: The objects of interest on it, possibly none.
+        depth: Metres along z, float32, 0 where unknown; None where the source has none.
+        source: Name of the source, e.g. ``ycb_video/data``.
+        key: The item within its source, e.g. ``0050/000003``.
+    """
+
+    image: UInt8[np.ndarray, "height width 3"]
+    K: Float[np.ndarray, "3 3"]
+    instances: list[Instance] = field(default_factory=list)
+    depth: Float[np.ndarray, "height width"] | None = None
+    source: str = ""
+    key: str = ""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.image.shape[1], self.image.shape[0]
+
+
+class Source(Protocol):
+    """A map-style data set; item ``index`` is a pure function of (its seed, epoch, index)."""
+
+    name: str
+
+    def __len__(self) -> int:
+        """Return how many items an epoch has."""
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return item ``index`` of ``epoch``."""
+
+
+@dataclass(frozen=True)
+class SourceInfo:
+    """What a source holds, for the start-up print and the data fingerprint.
+
+    Attributes:
+        name: Name of the source.
+        num_images: Images it holds (for renders: distinct items of an epoch).
+        identity: Everything that decides the items (file list, seed, preset, part hashes, …), as
+            plain values that JSON can write.
+        num_instances: Instances of each object, empty where counting them is not cheap.
+    """
+
+    name: str
+    num_images: int
+    identity: Mapping[str, object] = field(default_factory=dict)
+    num_instances: Mapping[str, int] = field(default_factory=dict)
+
+
+class DescribedSource(Source, Protocol):
+    """A source that the DataModule can train on: it also says what it holds."""
+
+    def describe(self) -> list[SourceInfo]:
+        """Return one entry per elementary source in it."""
+
+    def contains(self, label: str) -> bool:
+        """Tell whether any item of any epoch can hold an instance of this object."""

@@ -1,0 +1,165 @@
+"""Wireframes of objects' cuboids on the image, so that a person can judge a pose.
+
+The +z face is drawn bright and thick with an arrow head on it that points to +y; so, unless that
+face is seen edge-on, every orientation looks different, even of a cube.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dopepp.drawing.text import draw_text
+from dopepp.geometry.camera import resize_points
+from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
+
+Colour = tuple[int, int, int]
+"""RGB, 0..255."""
+
+YELLOW: Final[Colour] = (255, 221, 0)
+"""Predicted; DOPE++ where two networks are compared (paper Fig. 14)."""
+GREEN: Final[Colour] = (40, 220, 60)
+"""Ground truth."""
+BLUE: Final[Colour] = (70, 165, 255)
+"""The DOPE baseline (paper Fig. 14)."""
+
+MIN_WIDTH_PX: Final = 640
+"""Narrower images are enlarged before drawing: lines and legend need that many pixels."""
+
+_FRACTION_BITS: Final = 4
+"""cv2 takes sub-pixel coordinates as integers, here in 1/16 pixel."""
+_BACK_SHADE: Final = 0.8
+"""Brightness of the edges off the +z face."""
+_FRONT: Final = frozenset(np.flatnonzero(CORNER_SIGNS[:, 2] > 0).tolist())
+_FRONT_BOTTOM: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [-1, 1]).all(axis=1)).tolist())
+_FRONT_TOP: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [1, 1]).all(axis=1)).tolist())
+
+
+@dataclass(frozen=True)
+class Wireframe:
+    """A cuboid to draw.
+
+    Attributes:
+        keypoints: Its eight corners and centroid, pixels; NaN where there is none.
+        colour: Colour of its lines, RGB.
+        label: Its entry in the legend; empty for none.
+    """
+
+    keypoints: Float[np.ndarray, "9 2"]
+    colour: Colour = YELLOW
+    label: str = ""
+
+
+def overlay(
+    image: UInt8[np.ndarray, "height width 3"],
+    wireframes: Sequence[Wireframe],
+    min_width_px: int = MIN_WIDTH_PX,
+) -> UInt8[np.ndarray, "out_height out_width 3"]:
+    """Draw wireframes and their legend on a copy of the image, enlarged if it is narrow.
+
+    Later wireframes lie on top, so pass the truth first.
+    """
+    factor = max(1, -(-min_width_px // image.shape[1]))
+    canvas = enlarge(image, factor)
+    # On a sheet of tiles half as wide, lines are still a pixel thick.
+    thickness = max(1, canvas.shape[1] // 320)
+    for wireframe in wireframes:
+        points = resize_points(wireframe.keypoints, factor, factor)
+        canvas = draw_wireframe(canvas, points, wireframe.colour, thickness)
+    labels = {frame.label: frame.colour for frame in wireframes if frame.label}
+    size = max(12, canvas.shape[0] // 22)
+    for line, (label, colour) in enumerate(labels.items()):
+        draw_text(canvas, label, (size // 2, size // 2 + line * int(1.4 * size)), size, colour)
+    return canvas
+
+
+def draw_wireframe(
+    image: UInt8[np.ndarray, "height width 3"],
+    keypoints: Float[np.ndarray, "9 2"],
+    colour: Colour = YELLOW,
+    thickness: int = 1,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw one cuboid, anti-aliased, on a copy of the image.
+
+    Edges with a keypoint that is not finite are left out; those that leave the image are cut.
+
+    Args:
+        image: RGB.
+        keypoints: Eight corners in NDDS order and the centroid, pixels.
+        colour: RGB.
+        thickness: Thickness of the back edges, pixels; those of the +z face get one more.
+    """
+    canvas = np.ascontiguousarray(image).copy()
+    points = np.asarray(keypoints, np.float64)
+    shade = tuple(round(_BACK_SHADE * value) for value in colour)
+    front = [edge for edge in EDGES if _FRONT.issuperset(edge)]
+    for a, b in EDGES:
+        if (a, b) not in front:
+            _line(canvas, points[a], points[b], shade, thickness)
+    tip = points[list(_FRONT_TOP)].mean(axis=0)
+    for a in _FRONT_BOTTOM:
+        _line(canvas, points[a], tip, colour, thickness)
+    for a, b in front:
+        _line(canvas, points[a], points[b], colour, thickness + 1)
+    _line(canvas, points[CENTROID], points[CENTROID], colour, thickness + 3)
+    return canvas
+
+
+def enlarge(
+    image: UInt8[np.ndarray, "height width 3"], factor: int
+) -> UInt8[np.ndarray, "out_height out_width 3"]:
+    """Enlarge a copy of the image by a whole factor; ``resize_points`` moves keypoints along.
+
+    Raises:
+        ValueError: The factor is below 1.
+    """
+    if factor < 1:
+        raise ValueError(f"factor must be a whole number >= 1, got {factor}")
+    if factor == 1:
+        return np.ascontiguousarray(image).copy()
+    resized = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(resized, np.uint8)
+
+
+def _line(
+    canvas: UInt8[np.ndarray, "height width 3"],
+    start: Float[np.ndarray, "2"],
+    end: Float[np.ndarray, "2"],
+    colour: tuple[int, ...],
+    thickness: int,
+) -> None:
+    """Draw a segment in place; equal ends make a dot, ends that are not finite nothing."""
+    clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
+    if clipped is None:
+        return
+    ends = np.rint(np.array(clipped) * (1 << _FRACTION_BITS)).astype(int)
+    a, b = ends.tolist()
+    cv2.line(canvas, tuple(a), tuple(b), colour, thickness, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def _clip(
+    start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: int, height: int, margin: int
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
+    """Cut a segment to the image and a margin (Liang–Barsky): cv2 overflows far outside."""
+    if not (np.isfinite(start).all() and np.isfinite(end).all()):
+        return None
+    direction = end - start
+    first, last = 0.0, 1.0
+    for axis, size in enumerate((width, height)):
+        for sign, bound in ((-1, margin), (1, size - 1 + margin)):
+            # Inside is sign·(start + s·direction) <= bound.
+            slope, room = sign * direction[axis], bound - sign * start[axis]
+            if slope > 0:
+                last = min(last, room / slope)
+            elif slope < 0:
+                first = max(first, room / slope)
+            elif room < 0:
+                return None
+    if first > last:
+        return None
+    return start + first * direction, start + last * direction

@@ -1,0 +1,24 @@
+"""The one exception for a user's mistake: what was got, what is allowed, what to do."""
+
+from __future__ import annotations
+
+
+class UserError(ValueError):
+    """A mistake in an input, a file or an option that its user can correct.
+
+    Entry points print it as one line and exit with code 2; the library raises it, so that a
+    caller can catch it as the ``ValueError`` it is.
+
+    Args:
+        got: What was found, with the file, the field and the value.
+        allowed: What would have been accepted.
+        fix: What to do about it.
+    """
+
+    def __init__(self, got: str, allowed: str, fix: str) -> None:
+        self.got, self.allowed, self.fix = got, allowed, fix
+        super().__init__(" ".join(f"got {got}; allowed: {allowed}; fix: {fix}".split()))
+
+    def __reduce__(self) -> tuple[type[UserError], tuple[str, str, str]]:
+        """Survive the pickling between a loader's worker and its parent."""
+        return type(self), (self.got, self.allowed, self.fix)

@@ -1,0 +1,1 @@
+"""Experiments: the only package that knows Hydra; below it only plain values travel."""

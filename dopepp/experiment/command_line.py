@@ -1,0 +1,145 @@
+"""The two entry points' shell: from the command line to a plain config, from errors to one line.
+
+Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dopepp.errors import UserError
+from dopepp.experiment import display, record
+
+_log = logging.getLogger(__name__)
+
+Job = Callable[[dict[str, Any], Path], object]
+
+DONE: Final = 0
+FAILED: Final = 1
+USERS_MISTAKE: Final = 2
+INTERRUPTED: Final = 130
+
+
+def run_job(config: DictConfig, job: Job) -> None:
+    """Resolve the config once and run a job in Hydra's run folder.
+
+    In a multirun a failing job leaves ``failed.json`` and lets the others run.
+    """
+    hydra = HydraConfig.get()
+    run_dir = Path(hydra.runtime.output_dir)
+    if hydra.mode != RunMode.MULTIRUN:
+        job(_plain(config), run_dir)
+        return
+    try:
+        plain = _plain(config)
+        _refuse_parallel_multirun(plain)
+        job(plain, run_dir)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or repr(error)
+        expected = isinstance(error, UserError)
+        _log.error("job %s failed: %s", hydra.job.num, reason, exc_info=not expected)
+        run_dir.mkdir(parents=True, exist_ok=True)
+        record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    """Resolve every interpolation; below this line there are only plain values."""
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
+    devices = config.get("trainer", {}).get("devices", 1)
+    if devices != 1:
+        raise UserError(
+            f"trainer.devices={devices} in a multirun",
+            "one device per job: each further process would run the whole sweep again",
+            "set trainer.devices=1, or run the jobs one by one",
+        )
+
+
+def entry(main: Callable[[], None]) -> None:
+    """Run an entry point and exit with its code; a user's mistake is printed as one line."""
+    # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("dopepp").setLevel(logging.INFO)
+    sys.argv = [sys.argv[0], *_resumed(sys.argv[1:])]
+    try:
+        main()
+    except KeyboardInterrupt:
+        _exit("interrupted", INTERRUPTED)
+    except UserError as error:
+        _exit(str(error), USERS_MISTAKE)
+    except (HydraException, OmegaConfBaseException) as error:
+        _exit(_explain(error), USERS_MISTAKE)
+
+
+def _exit(line: str, code: int) -> None:
+    display.console.file.flush()
+    sys.stderr.write(f"{line}\n")
+    raise SystemExit(code)
+
+
+def _resumed(arguments: list[str]) -> list[str]:
+    """For ``resume=RUN``, put the run's own overrides first and go on in its folder."""
+    runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
+    if not runs or runs[-1] in ("", "null"):
+        return arguments
+    run = Path(runs[-1])
+    stored = run / ".hydra" / "overrides.yaml"
+    if not stored.is_file():
+        return arguments  # the run itself says what is wrong with the folder
+    overrides = [str(text) for text in OmegaConf.load(stored)]
+    kept = [text for text in overrides if not text.startswith(("resume=", "hydra.run.dir="))]
+    return [*kept, *arguments, f"hydra.run.dir={run}"]
+
+
+def _explain(error: Exception) -> str:
+    """Turn Hydra's or OmegaConf's message into one line with got, allowed and fix."""
+    text = " ".join(" ".join(str(part) for part in (error, error.__cause__ or "")).split())
+    missing_key = re.search(r"Could not override '([^']+)'", text)
+    if missing_key:
+        key = missing_key.group(1)
+        return str(
+            UserError(
+                f"override {key!r}, which names no option",
+                "the options of `--cfg job`" + _nearest(key),
+                "check the spelling",
+            )
+        )
+    choice = re.search(
+        r"Could not find '([^']+)' Available options in '([^']+)': (.*?) Config", text
+    )
+    if choice:
+        name, group, available = choice.groups()
+        return str(UserError(f"{group}={name.rpartition('/')[2]}", available, "choose one of them"))
+    missing = re.search(r"Missing mandatory value: (\S+)", text)
+    if missing:
+        key = missing.group(1)
+        return str(UserError(f"no {key}", f"{key}=… on the command line", f"add {key}=…"))
+    return str(UserError(text, "overrides as `key=value`", "see `--help`"))
+
+
+def _nearest(key: str) -> str:
+    """Name the option that was probably meant."""
+    options = [text.partition("=")[0] for text in _KNOWN_OPTIONS]
+    close = difflib.get_close_matches(key, options, n=1)
+    return f", nearest {close[0]}" if close else ""
+
+
+_KNOWN_OPTIONS: Final = ()

@@ -1,0 +1,75 @@
+"""What a person sees in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.tree import Tree
+
+from dopepp.data.datamodule import SourceRow
+from dopepp.experiment.report import Report
+from dopepp.metrics.pose import MEAN
+from dopepp.metrics.row import COLUMNS
+
+# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width.
+console = Console(highlight=False, width=None if Console().is_terminal else 180)
+
+
+def show_config(config: Mapping[str, Any]) -> None:
+    """Print the composed config as a tree."""
+    tree = Tree("[bold]config")
+    _branch(tree, config)
+    console.print(tree)
+
+
+def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            _branch(tree.add(f"[bold]{key}"), value)
+        else:
+            tree.add(f"{key}: {value!r}", style="default")
+
+
+def show_sources(rows: Sequence[SourceRow]) -> None:
+    """Print where the images come from and how many each source gives."""
+    table = Table("split", "source", "images", "instances", title="data")
+    for row in rows:
+        instances = ", ".join(f"{name} {count:,}" for name, count in row.num_instances.items())
+        table.add_row(row.split, row.source, f"{row.num_images:,}", instances or "one per render")
+    console.print(table)
+
+
+def show_report(report: Report) -> None:
+    """Print a row per object, each with its reference rows below it."""
+    headings = [column.heading for column in COLUMNS]
+    table = Table("object", "poses from", *headings, title=f"{report.num_images} test images")
+    names = [name for name in report.rows if name != MEAN or len(report.rows) > 2]
+    for name in names:
+        table.add_section()
+        for row in (report.rows[name], *(rows[name] for rows in report.references.values())):
+            own = row is report.rows[name]
+            cells = [column.text(row) for column in COLUMNS]
+            table.add_row(name if own else "", row.method, *cells, style="bold" if own else "dim")
+    console.print(table)
+
+
+def show_comparison(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a comparison table."""
+    table = Table(*header, title="comparison")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def show_files(run_dir: Path) -> None:
+    """Print what a run folder holds."""
+    table = Table("file", "bytes", title=f"run folder {run_dir}")
+    for path in sorted(run_dir.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(run_dir).parts)
+        if path.is_file() and not hidden:
+            table.add_row(str(path.relative_to(run_dir)), f"{path.stat().st_size:,}")
+    console.print(table)

@@ -1,0 +1,277 @@
+"""One training run and one evaluation, from a plain config to a run folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import Logger
+
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.png import write_png
+from dopepp.drawing.sheet import contact_sheet
+from dopepp.errors import UserError
+from dopepp.experiment import display, record
+from dopepp.experiment.compare import compare
+from dopepp.experiment.gates import (
+    CALLBACKS,
+    LOGGERS,
+    optimizer_factory,
+    scheduler_factory,
+)
+from dopepp.experiment.hardware import choose_precision, estimate_training_s
+from dopepp.experiment.report import Report, measure
+from dopepp.experiment.sources import build_datamodule, build_parts, build_test_source
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.maps.encode import MapGeometry
+from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.spec import LOSSES, build_network
+from dopepp.parts.part import Part
+from dopepp.recovery.recover import RecoveryOptions
+from dopepp.training.loggers import GuardedLogger, MetricsTable
+from dopepp.training.saving import AtomicCheckpointIO
+from dopepp.training.system import PoseSystem
+
+_log = logging.getLogger(__name__)
+
+QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
+
+
+def train(config: dict[str, Any], run_dir: Path) -> Report:
+    """Train, then measure the best checkpoint on the test set.
+
+    Args:
+        config: The composed and resolved config, plain values.
+        run_dir: Folder that everything is written to.
+
+    Raises:
+        UserError: A choice, a file or an option is wrong.
+    """
+    seed = int(config["seed"])
+    seed_everything(seed, verbose=False)
+    display.show_config(config)
+    parts = build_parts(config["data"])
+    datamodule = build_datamodule(config["data"], parts, seed)
+    datamodule.check_objects()
+    fingerprint = datamodule.fingerprint()
+    record.write_config(run_dir, config)
+    environment = record.environment(seed, fingerprint)
+    record.write_json(run_dir / record.VERSIONS_FILE, environment)
+    display.show_sources(datamodule.summary())
+
+    system = build_system(config, parts, fingerprint)
+    trainer = build_trainer(config, run_dir)
+    _announce_duration(config, system, datamodule, trainer)
+    resume_from = _resume_path(config["resume"])
+    trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+    if not trainer.is_global_zero:
+        raise SystemExit(0)  # the first process alone measures and reports
+    return _measure_run(config, run_dir, trainer)
+
+
+def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str) -> PoseSystem:
+    """Build the network, its loss and its optimiser as the config names them."""
+    model, maps = config["model"], config["maps"]
+    loss = LOSSES.build(model["loss"])
+    spec = {name: model[name] for name in ("backbone", "attention", "head")}
+    spec |= {"activation": loss.activation, "num_objects": len(parts)}
+    network = build_network(spec)
+    geometry = MapGeometry(network.stride, maps["sigma"], maps["field_radius"])
+    recovery = RecoveryOptions(sigma=geometry.sigma, **config["recovery"])
+    description = Checkpoint(
+        spec=spec,
+        state_dict={},
+        parts=parts,
+        input_size=tuple(config["data"]["input_size"]),
+        stride=network.stride,
+        sigma=geometry.sigma,
+        recovery=vars(recovery),
+        data={"name": model["name"], "seed": config["seed"], "config": config["data"]},
+        data_fingerprint=fingerprint,
+    )
+    if config["init_from"] is not None:
+        _start_from(network, Path(config["init_from"]))
+    return PoseSystem(
+        network,
+        loss,
+        parts,
+        geometry,
+        recovery,
+        optimizer_factory(config["optimizer"]),
+        scheduler_factory(config["scheduler"]),
+        description.to_payload(),
+        compile_network=model["compile"],
+    )
+
+
+def _start_from(network: torch.nn.Module, path: Path) -> None:
+    """Copy a checkpoint's weights into a network of the same shape."""
+    trained, _ = load_network(path)
+    try:
+        network.load_state_dict(trained.state_dict())
+    except RuntimeError as error:
+        raise UserError(
+            f"init_from={path}, whose network differs from the chosen one",
+            "a checkpoint of the same backbone, attention, head, width and number of objects",
+            "choose the model it was trained with",
+        ) from error
+
+
+def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
+    """Build Lightning's trainer with the config's callbacks and loggers."""
+    options = dict(config["trainer"])
+    accelerator = options["accelerator"]
+    if accelerator == "auto":
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    options["precision"], reason = choose_precision(options["precision"], accelerator)
+    display.console.print(f"precision {options['precision']}: {reason}")
+    callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
+    loggers: list[Logger] = [MetricsTable(run_dir / "metrics.csv")]
+    loggers += [
+        GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir)))
+        for node in (config["logger"] or {}).values()
+    ]
+    return Trainer(
+        **{**options, "accelerator": accelerator},
+        default_root_dir=run_dir,
+        logger=loggers,
+        callbacks=[*callbacks, TQDMProgressBar(refresh_rate=10)],
+        plugins=[AtomicCheckpointIO()],
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        # The DataModule's own sampler knows rank and epoch.
+        use_distributed_sampler=False,
+    )
+
+
+def _announce_duration(
+    config: Mapping[str, Any], system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
+) -> None:
+    """Without an accelerator, say how long the run will take and what takes less."""
+    if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
+        return
+    seconds = estimate_training_s(
+        system.network, datamodule, config["trainer"], str(trainer.precision)
+    )
+    hours = seconds / 3600
+    duration = f"{hours:,.1f} hours" if hours >= 1 else f"{seconds / 60:.0f} minutes"
+    advice = f"; for a first result in minutes: {QUICKSTART}" if hours >= 1 else ""
+    display.console.print(f"no accelerator: about {duration} to finish{advice}")
+
+
+def _resume_path(resume: str | None) -> Path | None:
+    if resume is None:
+        return None
+    path = Path(resume) / record.LAST_CHECKPOINT
+    if not path.is_file():
+        raise UserError(
+            f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
+            "the folder of an interrupted run",
+            "pass that run's folder, or start anew without resume",
+        )
+    return path
+
+
+def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> Report:
+    """Measure the best checkpoint of a finished run and write everything down."""
+    checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
+    path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
+    if not path.is_file():
+        path = run_dir / record.LAST_CHECKPOINT
+    device = trainer.strategy.root_device
+    estimator = PoseEstimator.load(path, device)
+    name = str(config["model"]["name"])
+    return measure_and_record(
+        {name: estimator}, config["data"], int(config["seed"]), run_dir, num_pictures=12
+    )[0]
+
+
+def measure_and_record(
+    estimators: Mapping[str, PoseEstimator],
+    data: Mapping[str, Any],
+    seed: int,
+    run_dir: Path,
+    num_pictures: int,
+) -> list[Report]:
+    """Measure estimators on a test set; show and write tables, curves and pictures."""
+    last = list(estimators.values())[-1]
+    parts = _parts_of(last, data)
+    source = build_test_source(data, parts, seed)
+    samples = (source.sample(index, 0) for index in range(len(source)))
+    reports, tiles = measure(estimators, samples, num_pictures)
+    for report in reports:
+        display.show_report(report)
+    record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
+    curves = {
+        f"{report.name} {name}" if len(reports) > 1 else name: errors
+        for report in reports
+        for name, errors in report.errors.items()
+    }
+    save_accuracy_curves(run_dir / "auc", curves, title=f"{len(source)} test images")
+    if tiles:
+        write_png(run_dir / "overlay.png", contact_sheet(tiles))
+    if len(reports) > 1:
+        compare(reports, run_dir)
+    display.show_files(run_dir)
+    return reports
+
+
+def _parts_of(estimator: PoseEstimator, data: Mapping[str, Any]) -> list[Part]:
+    """Return the estimator's parts with the meshes and points that the test data have for them."""
+    names = [part.name for part in estimator.parts]
+    if data["root"] is not None and data["objects"] is None:
+        data = {**data, "objects": names}
+    available = {part.name: part for part in build_parts(data)}
+    missing = [name for name in names if name not in available]
+    if missing:
+        raise UserError(
+            f"test data without {', '.join(missing)}, which the checkpoint was trained on",
+            ", ".join(names),
+            "point data.root or data.parts to data of these objects",
+        )
+    return [available[name] for name in names]
+
+
+def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
+    """Measure a checkpoint, and a baseline beside it, on its own test set or another one.
+
+    Args:
+        config: The composed and resolved evaluation config, plain values.
+        run_dir: Folder that everything is written to.
+
+    Raises:
+        UserError: A checkpoint, an option or the data are wrong.
+    """
+    device = config["device"]
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    paths = [path for path in (config["baseline"], config["ckpt_path"]) if path is not None]
+    loaded = [PoseEstimator.load(path, device) for path in paths]
+    own = loaded[-1].checkpoint
+    stored = own.data
+    data = stored.get("config") if config["data"] is None else config["data"]
+    if not isinstance(data, dict):
+        raise UserError(
+            f"{config['ckpt_path']}, which names no data", "data=… on the command line", "add it"
+        )
+    names = _unique([str(one.checkpoint.data.get("name", "estimate")) for one in loaded], paths)
+    record.write_config(run_dir, config)
+    environment = record.environment(int(config["seed"]), own.data_fingerprint)
+    record.write_json(run_dir / record.VERSIONS_FILE, environment)
+    seed = int(stored.get("seed", config["seed"]))
+    estimators = dict(zip(names, loaded, strict=True))
+    return measure_and_record(estimators, data, seed, run_dir, config["num_pictures"])
+
+
+def _unique(names: list[str], paths: list[str]) -> list[str]:
+    """Tell two checkpoints of one model apart by their files."""
+    if len(set(names)) == len(names):
+        return names
+    return [f"{name} ({path})" for name, path in zip(names, paths, strict=True)]

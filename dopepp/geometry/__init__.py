@@ -1,0 +1,1 @@
+"""Pure maths on numpy: camera, rotations, the cuboid and perspective-n-point."""

@@ -1,0 +1,147 @@
+"""The pinhole camera: OpenCV axes (x right, y down, z forward), pixel (0, 0) a pixel's centre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.errors import UserError
+
+
+def transform(
+    T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Map points from frame b into frame a with a rigid 4×4 transform."""
+    return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
+
+
+def make_transform(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Put a rotation and a translation into a 4×4 rigid transform (float64)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation
+    return T
+
+
+def invert_transform(T_a_b: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Return T_b_a of a rigid transform T_a_b."""
+    rotation = T_a_b[:3, :3].T
+    return make_transform(rotation, -rotation @ T_a_b[:3, 3])
+
+
+def project(
+    points_cam: Float[np.ndarray, "*batch 3"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*batch 2"]:
+    """Project camera-frame points (metres) to pixels; points at or behind the camera become NaN."""
+    points_cam = np.asarray(points_cam, np.float64)
+    depth = points_cam[..., 2:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rays = np.where(depth > 0, points_cam / depth, np.nan)
+    return np.asarray((rays @ np.asarray(K, np.float64).T)[..., :2])
+
+
+def project_keypoints(
+    cuboid: Float[np.ndarray, "9 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "9 2"]:
+    """Project an object's nine keypoints to pixels (NaN where one is behind the camera)."""
+    return project(transform(T_cam_obj, cuboid), K)
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """Assemble K from focal lengths and principal point, all in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def resize_camera(
+    K: Float[np.ndarray, "3 3"], scale_x: float, scale_y: float
+) -> Float[np.ndarray, "3 3"]:
+    """Follow an image resize: u becomes s·(u + ½) − ½ because pixel 0 is a pixel's centre."""
+    resized = np.array(K, np.float64)
+    resized[0] *= scale_x
+    resized[1] *= scale_y
+    resized[0, 2] += (scale_x - 1) / 2
+    resized[1, 2] += (scale_y - 1) / 2
+    return resized
+
+
+def resize_points(
+    points_px: Float[np.ndarray, "*batch 2"], scale_x: float, scale_y: float
+) -> Float[np.ndarray, "*batch 2"]:
+    """Move pixel coordinates through the same resize as :func:`resize_camera`."""
+    scale = np.array([scale_x, scale_y])
+    return np.asarray(scale * (np.asarray(points_px) + 0.5) - 0.5)
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """How an image of one size is brought into a network's input size, and back.
+
+    The image is scaled by one factor to fit inside the input and then padded on the right and at
+    the bottom; padding leaves K unchanged. The two axis scales differ only by rounding to whole
+    pixels.
+
+    Attributes:
+        width: Width of the resized image before padding, pixels.
+        height: Height of the resized image before padding, pixels.
+        scale_x: ``width`` over the original width.
+        scale_y: ``height`` over the original height.
+    """
+
+    width: int
+    height: int
+    scale_x: float
+    scale_y: float
+
+    @classmethod
+    def fit(cls, image_size: tuple[int, int], input_size: tuple[int, int]) -> Letterbox:
+        """Fit an image of (width, height) into an input of (width, height)."""
+        scale = min(input_size[0] / image_size[0], input_size[1] / image_size[1])
+        width = min(input_size[0], max(1, round(image_size[0] * scale)))
+        height = min(input_size[1], max(1, round(image_size[1] * scale)))
+        return cls(width, height, width / image_size[0], height / image_size[1])
+
+    def camera(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+        """Return K for the letterboxed image."""
+        return resize_camera(K, self.scale_x, self.scale_y)
+
+    def points(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Move original pixel coordinates into the letterboxed image."""
+        return resize_points(points_px, self.scale_x, self.scale_y)
+
+    def original_points(
+        self, points_px: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Move letterboxed pixel coordinates back into the original image."""
+        return resize_points(points_px, 1 / self.scale_x, 1 / self.scale_y)
+
+
+def check_camera(
+    K: Float[np.ndarray, "3 3"], image_size: tuple[int, int], source: str
+) -> Float[np.ndarray, "3 3"]:
+    """Return K as float64 after checking that it can belong to an image of (width, height).
+
+    Raises:
+        UserError: K is not a finite pinhole matrix, its principal point lies outside the image, or
+            its focal length gives a field of view outside 5° – 150°.
+    """
+    K = np.asarray(K, np.float64)
+    width, height = image_size
+    pinhole = "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    if K.shape != (3, 3) or not np.isfinite(K).all() or np.abs(K[2] - [0, 0, 1]).max() > 1e-6:
+        raise UserError(f"K {K.tolist()} of {source}", pinhole, "pass the camera's own K")
+    fits = 0 <= K[0, 2] < width and 0 <= K[1, 2] < height
+    # 5° and 150° of view are focal lengths of 11.5 and 0.13 image widths.
+    longest = max(width, height)
+    if not fits or not all(0.13 * longest <= f <= 11.5 * longest for f in (K[0, 0], K[1, 1])):
+        raise UserError(
+            f"K with fx={K[0, 0]:.6g}, fy={K[1, 1]:.6g}, cx={K[0, 2]:.6g}, cy={K[1, 2]:.6g} "
+            f"for the {width}×{height} image of {source}",
+            "a principal point inside the image and a field of view of 5° – 150°",
+            "pass the K of this image size (K scales with the image)",
+        )
+    return K

@@ -1,0 +1,90 @@
+"""Rotations: quaternions are (w, x, y, z), matrices act on column vectors, angles are radians."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+
+def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Turn a quaternion of any non-zero norm into a rotation matrix.
+
+    Raises:
+        ValueError: The quaternion is zero or not finite.
+    """
+    quaternion = np.asarray(quaternion_wxyz, np.float64)
+    norm = np.linalg.norm(quaternion)
+    if not np.isfinite(norm) or norm == 0.0:
+        raise ValueError(f"a quaternion must be finite and non-zero, got {quaternion.tolist()}")
+    w, x, y, z = quaternion / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """Turn a rotation matrix into its unit quaternion (w, x, y, z) with w >= 0.
+
+    The quaternion is the leading eigenvector of Bar-Itzhack's symmetric 4×4 matrix (J. Guidance
+    2000), which has no singular case and projects a slightly non-orthogonal matrix.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
+    symmetric = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    quaternion = np.linalg.eigh(symmetric)[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion
+
+
+def rotation_vector_to_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Exponential map: rotate by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
+    x, y, z = vector
+    angle = float(np.sqrt(x * x + y * y + z * z))
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # sinc(x/π) = sin(x)/x is exact at 0; (1 − cos)/x² = sinc²(x/2)/2 loses no digits near 0.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * skew + second * skew @ skew)
+
+
+def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
+    """Return the angle of each rotation in [0, π].
+
+    ``atan2(|axial vector|, trace − 1)`` keeps full precision near 0 and π, unlike ``arccos``.
+    """
+    rotation = np.asarray(rotation, np.float64)
+    axial = np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(axial, axis=-1), trace - 1.0))
+
+
+def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Draw a rotation uniformly over SO(3): a normalised 4-D Gaussian is a uniform quaternion."""
+    return quaternion_to_matrix(rng.normal(size=4))
+
+
+def is_rotation(rotation: Float[np.ndarray, "3 3"], tolerance: float = 1e-3) -> bool:
+    """Tell whether a 3×3 matrix is finite, orthogonal within ``tolerance`` and right-handed."""
+    rotation = np.asarray(rotation, np.float64)
+    return bool(
+        rotation.shape == (3, 3)
+        and np.isfinite(rotation).all()
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() <= tolerance
+        and np.linalg.det(rotation) > 0
+    )

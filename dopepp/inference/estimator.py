@@ -1,0 +1,161 @@
+"""PoseEstimator: one file in, poses out; needs neither Hydra nor any config."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import Letterbox, check_camera, project_keypoints
+from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.network import PoseNetwork
+from dopepp.parts.part import Part
+from dopepp.recovery.detection import Detection
+from dopepp.recovery.recover import RecoveryOptions, recover
+
+Maps = tuple[
+    Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
+]
+
+
+class PoseEstimator:
+    """Finds the 6D poses of the trained parts on RGB images of any size.
+
+    Args:
+        network: The trained network.
+        checkpoint: What the network was trained for.
+        device: Where to run it, e.g. ``cpu`` or ``cuda``.
+    """
+
+    def __init__(
+        self, network: PoseNetwork, checkpoint: Checkpoint, device: str | torch.device = "cpu"
+    ) -> None:
+        self.device = torch.device(device)
+        self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.checkpoint = checkpoint
+        self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
+        self.recovery = parse_recovery(checkpoint.recovery)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> PoseEstimator:
+        """Load a checkpoint written by training.
+
+        Raises:
+            UserError: The file is missing, not a checkpoint, or not safe to load.
+        """
+        return cls(*load_network(Path(path)), device)
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """The objects this estimator knows, in the network's order."""
+        return self.checkpoint.parts
+
+    def predict(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        K: Float[np.ndarray, "3 3"],
+        distortion: Float[np.ndarray, "coefficients"] | None = None,
+    ) -> list[Detection]:
+        """Find all known objects on one image.
+
+        Args:
+            image: RGB, uint8, any size.
+            K: Camera matrix in pixels of this image.
+            distortion: OpenCV distortion coefficients; the image is undistorted first, with the
+                same K, and pixels of the result refer to the undistorted image.
+
+        Returns:
+            Detections, best score first, in pixels of the given size and metres.
+
+        Raises:
+            UserError: The image is no RGB picture, or K cannot belong to it.
+        """
+        image, K = _checked(image, K)
+        if distortion is not None:
+            image = cv2.undistort(image, K, np.asarray(distortion, np.float64))
+        letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
+        belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
+        found = recover(
+            belief,
+            field,
+            self.cuboids,
+            letterbox.camera(K),
+            self.network.stride,
+            [part.name for part in self.parts],
+            **vars(self.recovery),
+        )
+        cuboids = {part.name: part.cuboid for part in self.parts}
+        return [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
+
+    def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
+        """Run the network on one image whose sides are multiples of its size multiple."""
+        pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
+        with torch.inference_mode():
+            belief, field = self.network.maps(pixels)
+        return belief[0].float(), field[0].float()
+
+
+def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
+    """Turn a checkpoint's thresholds into options.
+
+    Raises:
+        UserError: A name is none of the options', as in a file of another program.
+    """
+    allowed = [entry.name for entry in fields(RecoveryOptions)]
+    unknown = sorted(set(stored) - set(allowed))
+    if unknown:
+        raise UserError(
+            f"recovery option {unknown[0]!r} in the checkpoint",
+            ", ".join(allowed),
+            "use a checkpoint written by this version",
+        )
+    return RecoveryOptions(**stored)  # type: ignore[arg-type]
+
+
+def letterboxed(
+    image: UInt8[np.ndarray, "height width 3"], letterbox: Letterbox, multiple: int
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
+    size = (letterbox.width, letterbox.height)
+    if size != (image.shape[1], image.shape[0]):
+        shrinks = letterbox.scale_x < 1
+        image = cv2.resize(
+            image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        )
+    rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
+    return np.pad(image, ((0, rows), (0, columns), (0, 0)))
+
+
+def _checked(
+    image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"]
+) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "3 3"]]:
+    """Check that the arguments are an RGB image and its camera matrix."""
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise UserError(
+            f"an image of shape {image.shape} and type {image.dtype}",
+            "(height, width, 3) uint8 in RGB order",
+            "convert the image, e.g. cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)",
+        )
+    return image, check_camera(K, (image.shape[1], image.shape[0]), "predict")
+
+
+def _in_original(
+    detection: Detection,
+    cuboid: Float[np.ndarray, "9 3"],
+    letterbox: Letterbox,
+    K: Float[np.ndarray, "3 3"],
+) -> Detection:
+    """Express a detection's pixels in the original image; the pose is the same in both."""
+    return replace(
+        detection,
+        keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
+        peaks=letterbox.original_points(detection.peaks),
+        reprojection_error_px=detection.reprojection_error_px / letterbox.scale_x,
+    )

@@ -1,0 +1,126 @@
+"""What a result must be compared with: poses that nobody had to estimate.
+
+Three rows, all with the true position: any rotation at all, a rotation from the test set's own
+range, and the one rotation that suits the test set best. Where a task's range of poses is narrow,
+its pass rates are high for anybody; these rows say how high.
+
+Every measure here depends only on the rotation Q between the true and the guessed orientation,
+because the part is turned about its own centre (the cuboid's), so each row is a list of Qs.
+
+To add a reference, write a function that returns its Qs and name it in :func:`reference_rows`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import random_rotation
+from dopepp.metrics.functional import add, add_s, pass_rate, rotation_error_deg
+from dopepp.metrics.row import PoseRow, summarise
+from dopepp.parts.part import Part
+
+CHANCE_ALL: Final = "chance, all rotations"
+CHANCE_RANGE: Final = "chance, test range"
+BEST_CONSTANT: Final = "best constant pose"
+REFERENCES: Final = (CHANCE_ALL, CHANCE_RANGE, BEST_CONSTANT)
+
+_MAX_POSES: Final = 300
+"""Test poses that take part; the best constant tries each against each."""
+_NUM_DRAWS: Final = 2000
+"""Guesses of a chance row: a share near 15 % then has a standard error of 0.8 %."""
+_NUM_POINTS: Final = 500
+"""ADD points of a guess: the mean of 500 of 2,000 distances is right to about 1 %."""
+_NUM_SURFACE_DRAWS: Final = 300
+"""Guesses whose ADD-S is taken, which needs all points and so costs far more than ADD."""
+
+
+def reference_rows(
+    part: Part, T_cam_obj: Float[np.ndarray, "n 4 4"], seed: int = 0
+) -> dict[str, PoseRow]:
+    """Compute the three reference rows of one part on one test set.
+
+    Args:
+        part: The part.
+        T_cam_obj: True poses of its instances that count.
+        seed: Seed of the draws; the same seed gives the same rows.
+
+    Returns:
+        The rows by name, in the order of :data:`REFERENCES`. Without instances their measures are
+        None; with a single one, so is ``chance, test range``.
+    """
+    rng = np.random.default_rng(seed)
+    rotations = np.asarray(T_cam_obj, np.float64).reshape(-1, 4, 4)[:, :3, :3]
+    num_instances = len(rotations)
+    # Sorted, so that the rows do not depend on the order in which ranks gathered the poses.
+    rotations = rotations[np.lexsort(rotations.reshape(-1, 9).T)]
+    if len(rotations) > _MAX_POSES:
+        rotations = rotations[rng.choice(len(rotations), _MAX_POSES, replace=False)]
+    centred = np.asarray(part.points, np.float64) - part.cuboid[CENTROID]
+    few = rng.permutation(len(centred))[:_NUM_POINTS]
+    points, few_points = torch.from_numpy(centred), torch.from_numpy(centred[few])
+    guesses = dict.fromkeys(REFERENCES, np.empty((0, 3, 3)))
+    if len(rotations):
+        guesses[CHANCE_ALL] = np.stack([random_rotation(rng) for _ in range(_NUM_DRAWS)])
+        guesses[CHANCE_RANGE] = _other_poses(rotations, rng)
+        guesses[BEST_CONSTANT] = _best_constant(rotations, few_points, 0.1 * part.diameter)
+    rows = {}
+    for name, guess in guesses.items():
+        rows[name] = PoseRow(object=part.name, method=name, num_instances=0)
+        if len(guess):
+            rows[name] = _row(part, name, torch.from_numpy(guess), few_points, points)
+        rows[name].num_instances = num_instances
+    return rows
+
+
+def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -> PoseRow:
+    """Measure guesses that are off by the rotations Q, (n, 3, 3), at the true position."""
+    identity = torch.eye(3, dtype=torch.float64).expand_as(Q)
+    # Chance guesses are in random order (the first are a fair sample), constant ones all fit.
+    some = Q[:_NUM_SURFACE_DRAWS]
+    return summarise(
+        part.name,
+        name,
+        part.diameter,
+        add=add(Q, Q.new_zeros(len(Q), 3), identity, Q.new_zeros(len(Q), 3), few_points),
+        add_s=add_s(
+            some,
+            some.new_zeros(len(some), 3),
+            identity[: len(some)],
+            some.new_zeros(len(some), 3),
+            points,
+        ),
+        rotation_deg=rotation_error_deg(Q, identity),
+    )
+
+
+def _other_poses(
+    rotations: Float[np.ndarray, "n 3 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "draws 3 3"]:
+    """Take some OTHER pose of the test set for each: all ordered pairs, or random ones of many."""
+    n = len(rotations)
+    # Pair k of the n·(n − 1) ordered pairs: the true pose, then how far on the guessed one is.
+    true, step = np.divmod(rng.permutation(n * (n - 1))[:_NUM_DRAWS], max(n - 1, 1))
+    guessed = (true + 1 + step) % n
+    return np.asarray(rotations[true].transpose(0, 2, 1) @ rotations[guessed])
+
+
+def _best_constant(
+    rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
+) -> Float[np.ndarray, "n 3 3"]:
+    """Try every test rotation and their mean as the answer to all; equal rates go by mean ADD."""
+    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
+    # Nearest rotation to the mean (chordal L2): a reflection is turned at the smallest axis.
+    mean = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    candidates = np.concatenate([rotations, mean[None]])
+    Q = rotations.transpose(0, 2, 1)[None] @ candidates[:, None]
+    guess = torch.from_numpy(Q.reshape(-1, 3, 3))
+    zero, identity = guess.new_zeros(len(guess), 3), torch.eye(3).double().expand_as(guess)
+    errors = add(guess, zero, identity, zero, points).reshape(len(candidates), len(rotations))
+    rates = [(pass_rate(row, threshold), -float(row.mean())) for row in errors]
+    return np.asarray(Q[rates.index(max(rates))])

@@ -1,0 +1,166 @@
+"""One row of a result table: every measure of one method on one object.
+
+To add a measure, give :class:`PoseRow` a field, :func:`summarise` its formula and
+:data:`COLUMNS` its heading; tables, CSV and ``metrics.json`` follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dopepp.metrics.functional import auc, pass_rate
+
+NOT_AVAILABLE: Final = "n/a"
+
+
+@dataclass
+class PoseRow:
+    """Measures of one method on one object; None where a measure does not exist ("n/a").
+
+    Shares lie in [0, 1]. (Not frozen: torchmetrics rebuilds what ``compute`` returns.)
+
+    Attributes:
+        object: The part's name, or ``mean``.
+        method: What produced the poses: the estimator, or a reference row's name.
+        num_instances: Ground-truth instances that count; poses tried in a reference row.
+        add_01d: Share with ADD below a tenth of the diameter.
+        pass_5cm: Share with ADD below 0.05 m.
+        pass_10cm: Share with ADD below 0.1 m.
+        auc_10cm: Exact area under the ADD accuracy-threshold curve up to 0.1 m.
+        add_s_01d: Share with ADD-S below a tenth of the diameter.
+        auc_s_10cm: Exact area under the ADD-S curve up to 0.1 m.
+        median_rotation_deg: Over matched instances, degrees.
+        median_translation: Over matched instances, metres.
+        miss_rate: Share of instances without a matched prediction.
+        precision: TP / (TP + FP); 0 without predictions.
+        false_positives: Predictions matched with no instance.
+    """
+
+    object: str
+    method: str
+    num_instances: int
+    add_01d: float | None = None
+    pass_5cm: float | None = None
+    pass_10cm: float | None = None
+    auc_10cm: float | None = None
+    add_s_01d: float | None = None
+    auc_s_10cm: float | None = None
+    median_rotation_deg: float | None = None
+    median_translation: float | None = None
+    miss_rate: float | None = None
+    precision: float | None = None
+    false_positives: int | None = None
+
+    def to_record(self) -> dict[str, str | int | float | None]:
+        """Return a plain dict that JSON can hold; ``PoseRow(**record)`` reads it back."""
+        return asdict(self)
+
+    def texts(self) -> dict[str, str]:
+        """Return what a table prints: heading to text, in the columns' order."""
+        return {column.heading: column.text(self) for column in COLUMNS}
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a table shows one field of :class:`PoseRow`.
+
+    Attributes:
+        field: The field's name.
+        heading: What stands above it, with the unit.
+        scale: Factor from the stored unit to the shown one.
+        decimals: Digits after the point.
+    """
+
+    field: str
+    heading: str
+    scale: float = 1.0
+    decimals: int = 0
+
+    def text(self, row: PoseRow) -> str:
+        """Return the cell, ``n/a`` where the measure does not exist."""
+        value = getattr(row, self.field)
+        if value is None:
+            return NOT_AVAILABLE
+        return f"{value * self.scale:.{self.decimals}f}"
+
+
+COLUMNS: Final[tuple[Column, ...]] = (
+    Column("num_instances", "instances"),
+    Column("add_01d", "ADD-0.1d %", 100, 1),
+    Column("pass_5cm", "ADD<5cm %", 100, 1),
+    Column("pass_10cm", "ADD<10cm %", 100, 1),
+    Column("auc_10cm", "AUC[0,10cm] %", 100, 1),
+    Column("add_s_01d", "ADD-S-0.1d %", 100, 1),
+    Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1),
+    Column("median_rotation_deg", "rotation °", 1, 1),
+    Column("median_translation", "translation mm", 1000, 1),
+    Column("miss_rate", "missed %", 100, 1),
+    Column("precision", "precision %", 100, 1),
+    Column("false_positives", "false pos."),
+)
+"""The measures of a table, in order; ``object`` and ``method`` name its rows."""
+
+_TOTALS: Final = ("num_instances", "false_positives")
+
+
+def summarise(
+    name: str,
+    method: str,
+    diameter: float,
+    add: Float[Tensor, "n"],
+    add_s: Float[Tensor, "n"],
+    rotation_deg: Float[Tensor, "n"],
+) -> PoseRow:
+    """Fill the measures that follow from the errors of N >= 1 poses alone.
+
+    Args:
+        name: The part's name.
+        method: What produced the poses.
+        diameter: The part's diameter, metres.
+        add: ADD of each pose, metres, infinite for a miss.
+        add_s: ADD-S of each pose, metres, infinite for a miss.
+        rotation_deg: Rotation error of each pose, degrees, infinite for a miss.
+    """
+    return PoseRow(
+        object=name,
+        method=method,
+        num_instances=len(add),
+        add_01d=pass_rate(add, 0.1 * diameter),
+        pass_5cm=pass_rate(add, 0.05),
+        pass_10cm=pass_rate(add, 0.1),
+        auc_10cm=auc(add, 0.1),
+        add_s_01d=pass_rate(add_s, 0.1 * diameter),
+        auc_s_10cm=auc(add_s, 0.1),
+        median_rotation_deg=finite_median(rotation_deg),
+    )
+
+
+def finite_median(errors: Float[Tensor, "n"]) -> float | None:
+    """Median of the finite errors (the mean of the middle two if even); None if there is none."""
+    finite = errors[errors.isfinite()].double().sort().values
+    if len(finite) == 0:
+        return None
+    return float((finite[(len(finite) - 1) // 2] + finite[len(finite) // 2]) / 2)
+
+
+def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:
+    """Average each measure over the objects that have it and at least one instance.
+
+    Counts are totals over all objects. An object without ground truth takes no part in the means.
+    """
+    mean = PoseRow(object="mean", method=method, num_instances=0)
+    for column in COLUMNS:
+        counted = column.field in _TOTALS
+        values = [getattr(row, column.field) for row in rows if counted or row.num_instances]
+        known = torch.tensor([v for v in values if v is not None], dtype=torch.float64)
+        if counted:
+            setattr(mean, column.field, int(known.sum()))
+        elif len(known):
+            setattr(mean, column.field, float(known.mean()))
+    return mean

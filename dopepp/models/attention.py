@@ -1,0 +1,108 @@
+"""Attention between backbone and head: takes ``channels`` and keeps the shape.
+
+To add one: a subclass of :class:`Attention` in this module and one YAML file in
+``conf/model/attention``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dopepp.errors import UserError
+from dopepp.models.gate import check_integer
+from dopepp.models.layers import initialise
+
+
+class Attention(nn.Module, ABC):
+    """A module that re-weights feature maps without changing their shape."""
+
+    @abstractmethod
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch channels height width"]:
+        """Return the re-weighted features."""
+
+
+class Identity(Attention):
+    """Leaves the features as they are."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch channels height width"]:
+        """Return the features."""
+        return features
+
+
+class SE(Attention):
+    """Squeeze-and-excitation (Hu et al. 2018): features · σ(MLP(mean over the map)).
+
+    Args:
+        channels: Channels of the features.
+        reduction: Factor by which the MLP's hidden layer is narrower.
+
+    Raises:
+        UserError: ``reduction`` is out of range.
+    """
+
+    def __init__(self, channels: int, reduction: int = 16) -> None:
+        super().__init__()
+        self.mlp = _bottleneck(channels, reduction)
+        initialise(self)
+
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch channels height width"]:
+        """Return the features weighted by channel."""
+        weights: Tensor = self.mlp(features.mean(dim=(2, 3))).sigmoid()
+        return features * weights[:, :, None, None]
+
+
+class CBAM(Attention):
+    """The paper's attention (Eq. 5, 6): first by channel, then by place.
+
+    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map, one MLP for both (Eq. 5). Place:
+    features · σ(conv([mean; maximum])) over the channels (Eq. 6).
+
+    Args:
+        channels: Channels of the features.
+        reduction: Factor by which the MLP's hidden layer is narrower.
+        kernel_size: Side of the spatial convolution, odd; the paper's is 3.
+
+    Raises:
+        UserError: An argument is out of range.
+    """
+
+    def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:
+        super().__init__()
+        if check_integer("kernel_size", kernel_size, 1, 31) % 2 == 0:
+            raise UserError(f"kernel_size={kernel_size}", "an odd number", "use 3 (the paper's)")
+        self.mlp = _bottleneck(channels, reduction)
+        self.spatial = nn.Conv2d(2, 1, kernel_size, padding=kernel_size // 2, bias=False)
+        initialise(self)
+
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch channels height width"]:
+        """Return the features weighted by channel and by place."""
+        squeezed = self.mlp(features.mean(dim=(2, 3))) + self.mlp(features.amax(dim=(2, 3)))
+        features = features * squeezed.sigmoid()[:, :, None, None]
+        place = torch.cat([features.mean(1, keepdim=True), features.amax(1, keepdim=True)], dim=1)
+        weights: Tensor = self.spatial(place).sigmoid()
+        return features * weights
+
+
+def _bottleneck(channels: int, reduction: int) -> nn.Sequential:
+    """Return W1·ReLU(W0·x), without biases as in both papers, at least one hidden unit."""
+    hidden = max(1, channels // check_integer("reduction", reduction, 1, 1024))
+    return nn.Sequential(
+        nn.Linear(channels, hidden, bias=False),
+        nn.ReLU(inplace=True),
+        nn.Linear(hidden, channels, bias=False),
+    )

@@ -1,0 +1,167 @@
+"""Backbones: an RGB image to feature maps at stride 8.
+
+To add one: a subclass of :class:`Backbone` in this module and one YAML file in
+``conf/model/backbone`` (``docs/adding-a-backbone.md``).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import ClassVar, Final
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dopepp.errors import UserError
+from dopepp.models.gate import check_flag
+from dopepp.models.layers import conv_block, initialise, scaled_channels
+from dopepp.models.storage import read_mapping
+
+POOL: Final = "pool"
+
+
+class Backbone(nn.Module, ABC):
+    """What a head builds upon.
+
+    Attributes:
+        out_channels: Channels of the feature maps.
+        stride: Input pixels per feature cell, along each axis.
+    """
+
+    out_channels: int
+    stride: int = 8
+
+    @abstractmethod
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+        """Return the feature maps of normalised images."""
+
+
+class VGG19(Backbone):
+    """DOPE's backbone: VGG19's layers 0–22, then 3×3 convolutions 512→256 and 256→128.
+
+    Args:
+        width: Factor on every channel count; 1 is the paper's.
+        batch_norm: Put batch norm behind every convolution, in place of its bias.
+        weights_path: A ``state_dict`` of torchvision's ``vgg19`` (keys ``features.N.weight`` and
+            ``features.N.bias``) to start the VGG layers from. It is where training starts, not part
+            of the architecture, so checkpoints do not repeat it.
+
+    Raises:
+        UserError: An argument is out of range, or the weights do not fit.
+    """
+
+    plan: ClassVar[tuple[int | str, ...]] = (
+        *(64, 64, POOL),
+        *(128, 128, POOL),
+        *(256, 256, 256, 256, POOL),
+        *(512, 512),
+    )
+    reduction: ClassVar[tuple[int, ...]] = (256, 128)
+
+    def __init__(
+        self, width: float = 1.0, batch_norm: bool = False, weights_path: str | None = None
+    ) -> None:
+        super().__init__()
+        check_flag("batch_norm", batch_norm)
+        layers: list[nn.Module] = []
+        channels = 3
+        for step in (*self.plan, *self.reduction):
+            if isinstance(step, str):
+                layers.append(nn.MaxPool2d(2))
+                continue
+            wider = scaled_channels(step, width)
+            layers.append(conv_block(channels, wider, 3, batch_norm=batch_norm))
+            channels = wider
+        self.layers = nn.Sequential(*layers)
+        self.out_channels = channels
+        initialise(self)
+        if weights_path is not None:
+            if width != 1 or batch_norm or not isinstance(weights_path, str):
+                raise UserError(
+                    f"weights_path={weights_path!r:.200}, width={width:g}, batch_norm={batch_norm}",
+                    "a file's path, and only with width=1 and batch_norm=false",
+                    "drop weights_path, or set width=1 and batch_norm=false",
+                )
+            self._load_pretrained(weights_path)
+
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+        """Return the feature maps of normalised images."""
+        return self.layers(images)  # type: ignore[no-any-return]
+
+    def _load_pretrained(self, path: str) -> None:
+        weights = read_mapping(Path(path), "a torchvision-format state_dict of vgg19 (.pth)")
+        convolutions = [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
+        # torchvision numbers every layer: a convolution and its ReLU count two, a pooling one.
+        position, number = 0, 0
+        for step in self.plan:
+            if step == POOL:
+                position += 1
+                continue
+            for name, parameter in convolutions[number].named_parameters():
+                key = f"features.{position}.{name}"
+                value = weights.get(key)
+                if not isinstance(value, Tensor) or value.shape != parameter.shape:
+                    got = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
+                    raise UserError(
+                        f"{got} under {key} in {path}",
+                        f"a tensor of shape {tuple(parameter.shape)}",
+                        "pass a state_dict of torchvision.models.vgg19",
+                    )
+                parameter.data.copy_(value)
+            position, number = position + 2, number + 1
+
+
+class VGG19Original(VGG19):
+    """Table 4's "original": VGG19's first 24 layers (one convolution more), then the same two."""
+
+    plan: ClassVar[tuple[int | str, ...]] = (*VGG19.plan, 512)
+
+
+class DSC(Backbone):
+    """The paper's light backbone of depthwise separable convolutions (Fig. 7).
+
+    A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
+    each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels.
+
+    Args:
+        width: Factor on every channel count; 1 is the paper's.
+        batch_norm: Put batch norm behind every convolution, in place of its bias.
+
+    Raises:
+        UserError: An argument is out of range.
+    """
+
+    plan: ClassVar[tuple[int | str, ...]] = (
+        *(64, POOL),
+        *(128, 128, POOL),
+        *(256, 256, 256, 256, POOL),
+        *(512, 512, 512, 256, 128),
+    )
+
+    def __init__(self, width: float = 1.0, batch_norm: bool = False) -> None:
+        super().__init__()
+        check_flag("batch_norm", batch_norm)
+        channels = scaled_channels(64, width)
+        layers: list[nn.Module] = [conv_block(3, channels, 3, batch_norm=batch_norm)]
+        for step in self.plan:
+            if isinstance(step, str):
+                layers.append(nn.MaxPool2d(2))
+                continue
+            wider = scaled_channels(step, width)
+            depthwise = conv_block(channels, channels, 3, groups=channels, batch_norm=batch_norm)
+            layers += [depthwise, conv_block(channels, wider, 1, batch_norm=batch_norm)]
+            channels = wider
+        self.layers = nn.Sequential(*layers)
+        self.out_channels = channels
+        initialise(self)
+
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+        """Return the feature maps of normalised images."""
+        return self.layers(images)  # type: ignore[no-any-return]

@@ -1,0 +1,62 @@
+"""The building block that every network part is made of, its width rule and its initialisation."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from torch import nn
+
+from dopepp.models.gate import check_number
+
+MIN_WIDTH: Final = 1 / 64
+MAX_WIDTH: Final = 4.0
+"""Bounds of the width factor, so that a hostile spec cannot ask for unlimited memory."""
+
+_CHANNEL_STEP: Final = 8
+"""Channel counts are multiples of this: what vectorised convolutions block by."""
+
+
+def scaled_channels(channels: int, width: float) -> int:
+    """Scale a channel count by a width factor, rounded to a multiple of 8 and at least 8.
+
+    Raises:
+        UserError: The factor lies outside (0, 4].
+    """
+    width = check_number("width", width, MIN_WIDTH, MAX_WIDTH)
+    return max(_CHANNEL_STEP, round(channels * width / _CHANNEL_STEP) * _CHANNEL_STEP)
+
+
+def conv_block(
+    in_channels: int,
+    out_channels: int,
+    kernel_size: int,
+    *,
+    stride: int = 1,
+    groups: int = 1,
+    batch_norm: bool = False,
+) -> nn.Sequential:
+    """Return convolution, batch norm (or a bias in its place) and ReLU; size kept for stride 1."""
+    conv = nn.Conv2d(
+        in_channels,
+        out_channels,
+        kernel_size,
+        stride=stride,
+        padding=kernel_size // 2,
+        groups=groups,
+        bias=not batch_norm,
+    )
+    norm = [nn.BatchNorm2d(out_channels)] if batch_norm else []
+    return nn.Sequential(conv, *norm, nn.ReLU(inplace=True))
+
+
+def initialise(module: nn.Module) -> None:
+    """Draw every convolution and linear weight from He's normal law for ReLU; biases start at 0.
+
+    The variance 2 / fan_in (He et al. 2015, Eq. 10) keeps the activations' scale through a network
+    without batch norm as deep as the DOPE cascade.
+    """
+    for layer in module.modules():
+        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)

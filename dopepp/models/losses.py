@@ -1,0 +1,160 @@
+"""Losses on the stages' maps; each publishes the belief activation that it is paired with.
+
+To add one: a subclass of :class:`MapLoss` in this module and one YAML file in ``conf/model/loss``.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dopepp.models.gate import check_number
+from dopepp.models.heads import Stage
+
+
+class MapLoss(nn.Module, ABC):
+    """A loss summed over the stages.
+
+    Attributes:
+        activation: Name of the belief activation that the network must be built with.
+    """
+
+    activation: ClassVar[str]
+
+    @abstractmethod
+    def parts(
+        self,
+        logits: Float[Tensor, "batch 9*objects height width"],
+        field: Float[Tensor, "batch 16*objects height width"],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> dict[str, Tensor]:
+        """Return one stage's weighted terms by name; the stage's loss is their sum."""
+
+    def forward(
+        self,
+        stages: Sequence[Stage],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """Return the loss and its terms, detached; each is summed over the stages.
+
+        The terms are computed in float32 also under autocast: sums over exponentials lose their
+        digits in 16 bits.
+        """
+        terms: dict[str, Tensor] = {}
+        with torch.autocast(belief_target.device.type, enabled=False):
+            for logits, field in stages:
+                parts = self.parts(
+                    logits.float(), field.float(), belief_target.float(), field_target.float()
+                )
+                for name, value in parts.items():
+                    terms[name] = terms[name] + value if name in terms else value
+        total = torch.stack(list(terms.values())).sum()
+        return total, {name: value.detach() for name, value in terms.items()}
+
+
+class MapMSE(MapLoss):
+    """DOPE's loss: mean squared error of the belief maps plus that of the vector fields."""
+
+    activation = "identity"
+
+    def parts(
+        self,
+        logits: Float[Tensor, "batch 9*objects height width"],
+        field: Float[Tensor, "batch 16*objects height width"],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> dict[str, Tensor]:
+        """Return one stage's ``belief`` and ``field`` terms."""
+        return {
+            "belief": functional.mse_loss(logits, belief_target),
+            "field": functional.mse_loss(field, field_target),
+        }
+
+
+_LINEAR_FROM: Final = 2.0
+"""The exponential goes on as its tangent from e² ≈ 7 times too much mass on, so gradients stay
+bounded whatever the logits."""
+
+
+class SpatialCrossEntropy(MapLoss):
+    r"""Where a keypoint is and how much of it there is, each with a gradient from the start on.
+
+    The belief is exp(z). Its Poisson (generalised Kullback–Leibler) divergence from a target g,
+    Σ exp(z) − g·z − g + g·log g, splits exactly, with N = Σg and Λ = Σexp(z), into
+
+    - *where*: N · KL(g/N ‖ softmax(z)), and
+    - *how much*: Λ − N − N·log(Λ/N).
+
+    Both are divided by one Gaussian's mass 2πσ², so a visible keypoint weighs about 1, one cut off
+    by the border less, and an absent one leaves just Λ. MSE on such sparse maps starts on a
+    plateau: an all-zero map is nearly as good as any. The *where* term does not see how large the
+    beliefs are, only which cells have them, so it pulls from the first step on.
+
+    Args:
+        sigma: Standard deviation of the target's Gaussians, cells.
+        count_weight: Weight of the *how much* term.
+        field_weight: Weight of the field term: smooth L1 per cell inside the keypoints' discs,
+            the only place where the field is defined and read.
+
+    Raises:
+        UserError: An argument is out of range.
+    """
+
+    activation = "exp"
+
+    def __init__(self, sigma: float, count_weight: float = 1.0, field_weight: float = 1.0) -> None:
+        super().__init__()
+        # At σ = 0.1 a Gaussian is one cell; at 100 it is wider than any map.
+        self.mass = 2 * math.pi * check_number("sigma", sigma, 0.1, 100.0) ** 2
+        self.count_weight = check_number("count_weight", count_weight, 0.0, 1e6)
+        self.field_weight = check_number("field_weight", field_weight, 0.0, 1e6)
+
+    def parts(
+        self,
+        logits: Float[Tensor, "batch 9*objects height width"],
+        field: Float[Tensor, "batch 16*objects height width"],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> dict[str, Tensor]:
+        """Return one stage's ``where``, ``count`` and ``field`` terms."""
+        z, g = logits.flatten(2), belief_target.flatten(2)
+        # Unit of both terms: one Gaussian's mass; `count` is N and `log_total` log Λ in that unit.
+        share = g / self.mass
+        count = share.sum(-1)
+        log_total = z.logsumexp(-1) - math.log(self.mass)
+        # N·KL = Σ s·log(s/N) − Σ s·(z − log Λ), with s·log s = 0 at s = 0.
+        log_softmax = z.log_softmax(-1)
+        where = torch.xlogy(share, share).sum(-1) - torch.xlogy(count, count)
+        where = where - (share * log_softmax).sum(-1)
+        how_much = _capped_exp(log_total, count) - count + torch.xlogy(count, count)
+        how_much = how_much - count * log_total
+        return {
+            "where": where.mean(),
+            "count": self.count_weight * how_much.mean(),
+            "field": self.field_weight * _field_error(field, field_target),
+        }
+
+
+def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
+    """Return exp, and its tangent beyond e² times the expected count (at least one)."""
+    limit = count.clamp(min=1.0).log() + _LINEAR_FROM
+    excess = (value - limit).clamp(min=0.0)
+    return torch.minimum(value, limit).exp() * (1 + excess)
+
+
+def _field_error(field: Tensor, target: Tensor) -> Tensor:
+    """Return the mean smooth-L1 distance of the vectors over the cells of all discs."""
+    corners = (field.shape[0], field.shape[1] // 2, 2, *field.shape[2:])
+    field, target = field.view(corners), target.view(corners)
+    inside = (target != 0).any(dim=2, keepdim=True)
+    error = functional.smooth_l1_loss(field, target, reduction="none") * inside
+    return error.sum() / inside.sum().clamp(min=1)

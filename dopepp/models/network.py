@@ -1,0 +1,89 @@
+"""The network: normalisation, backbone, attention and head, wired from what each publishes."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from jaxtyping import Float, Num
+from torch import Tensor, nn
+
+from dopepp.errors import UserError
+from dopepp.models.activation import find_activation
+from dopepp.models.attention import Attention
+from dopepp.models.backbones import Backbone
+from dopepp.models.heads import Head, Stage
+
+# ImageNet's statistics, which torchvision's weights expect, on the 0–255 scale.
+_MEAN: Final = tuple(255 * value for value in (0.485, 0.456, 0.406))
+_STD: Final = tuple(255 * value for value in (0.229, 0.224, 0.225))
+
+
+class PoseNetwork(nn.Module):
+    """RGB images to belief maps and vector fields.
+
+    The normalisation is part of the network, so training, inference and exported files cannot
+    disagree about it.
+
+    Args:
+        backbone: Images to features.
+        attention: Features to features.
+        head: Features to stages.
+        activation: Name of the belief activation.
+        num_objects: Number of objects C.
+
+    Attributes:
+        stride: Pixels per map cell, along each axis.
+        size_multiple: Image height and width must be multiples of this.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        attention: Attention,
+        head: Head,
+        activation: str,
+        num_objects: int,
+    ) -> None:
+        super().__init__()
+        self.backbone, self.attention, self.head = backbone, attention, head
+        self.activation, self.num_objects = activation, num_objects
+        self.activate = find_activation(activation)
+        self.stride = backbone.stride
+        self.size_multiple = backbone.stride * head.cell_multiple
+        # Not persistent: they are constants of the code, and a checkpoint must not alter them.
+        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, images: Num[Tensor, "batch 3 height width"]) -> list[Stage]:
+        """Return the belief logits and vector field of every stage.
+
+        Args:
+            images: RGB, 0–255, uint8 or floating point.
+
+        Raises:
+            UserError: The images' shape does not fit the network.
+        """
+        height, width = images.shape[-2:]
+        fits = images.ndim == 4 and images.shape[1] == 3
+        if not fits or height % self.size_multiple or width % self.size_multiple:
+            raise UserError(
+                f"images of shape {tuple(images.shape)}",
+                f"(batch, 3, height, width), height and width multiples of {self.size_multiple}",
+                "pad the images on the right and at the bottom",
+            )
+        normalised = (images.to(self.mean.dtype) - self.mean) / self.std
+        return self.head(self.attention(self.backbone(normalised)))  # type: ignore[no-any-return]
+
+    def maps(
+        self, images: Num[Tensor, "batch 3 height width"]
+    ) -> tuple[
+        Float[Tensor, "batch 9*objects height/8 width/8"],
+        Float[Tensor, "batch 16*objects height/8 width/8"],
+    ]:
+        """Return the last stage's belief maps (after the activation) and vector field."""
+        logits, field = self(images)[-1]
+        return self.activate(logits), field

@@ -1,0 +1,68 @@
+"""A plain dict to a network: the one description that configs and checkpoints share.
+
+A spec holds ``backbone``, ``attention`` and ``head`` nodes (``_target_`` and arguments),
+``activation`` and ``num_objects``. Channel counts are not in it: the builder hands on what each
+part publishes. To make a class of another package buildable, ``BACKBONES.register(dotted name)``.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from dopepp.errors import UserError
+from dopepp.models import attention, backbones, heads, losses
+from dopepp.models.activation import find_activation
+from dopepp.models.gate import Gate, check_integer
+from dopepp.models.network import PoseNetwork
+
+BACKBONES = Gate.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
+ATTENTIONS = Gate.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
+HEADS = Gate.of_module("head", heads.Head, heads)
+LOSSES = Gate.of_module("loss", losses.MapLoss, losses)  # type: ignore[type-abstract]
+
+SPEC_KEYS = ("backbone", "attention", "head", "activation", "num_objects")
+
+
+def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
+    """Build the network that a spec describes.
+
+    Args:
+        spec: ``{"backbone": node, "attention": node, "head": node, "activation": name,
+            "num_objects": C}``; see :mod:`dopepp.models.gate` for nodes.
+
+    Raises:
+        UserError: A key is missing or unknown, a target is not allowed, or an argument is.
+    """
+    if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
+        got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
+        raise UserError(
+            f"a model spec with {got}", f"exactly {', '.join(SPEC_KEYS)}", "add or remove keys"
+        )
+    activation, num_objects = spec["activation"], spec["num_objects"]
+    find_activation(activation)
+    check_integer("num_objects", num_objects, 1, heads.MAX_OBJECTS)
+    backbone = BACKBONES.build(spec["backbone"])
+    channels = backbone.out_channels
+    return PoseNetwork(
+        backbone,
+        ATTENTIONS.build(spec["attention"], channels=channels),
+        HEADS.build(
+            spec["head"], in_channels=channels, num_objects=num_objects, activation=activation
+        ),
+        activation,
+        num_objects,
+    )
+
+
+def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a deep copy of a spec without ``weights_path``.
+
+    Pretrained weights are where training started; a checkpoint holds the trained ones, so it must
+    not need, nor make its reader open, a file of somebody else's machine.
+    """
+    plain: dict[str, Any] = copy.deepcopy(dict(spec))
+    if isinstance(plain.get("backbone"), dict):
+        plain["backbone"].pop("weights_path", None)
+    return plain

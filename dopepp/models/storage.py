@@ -1,0 +1,101 @@
+"""Torch files: written whole or not at all, read as the untrusted input they are."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from dopepp.errors import UserError
+
+MAX_BYTES: Final = 4 * 2**30
+"""The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
+
+
+def write_atomic(payload: Mapping[str, Any], path: Path) -> None:
+    """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
+
+    Raises:
+        OSError: The folder cannot be written; the old file is intact and nothing else is left.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            torch.save(dict(payload), stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)  # noqa: PTH105 -- documented as atomic under this name
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if os.name == "posix":  # the rename is durable once its folder is; Windows cannot open folders
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def read_mapping(path: Path, what: str) -> dict[Any, Any]:
+    """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
+
+    Args:
+        path: The file.
+        what: What it should be, for messages.
+
+    Raises:
+        UserError: The file is missing, damaged, holds something else or more than tensors and
+            plain values.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"{path}, which is no file", what, "correct the path")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged or hostile file raises whatever its bytes lead to
+        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
+        raise UserError(
+            f"{path}, which torch refuses to load ({reason})",
+            what,
+            "get the file again; load none that you do not trust",
+        ) from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} with a {type(content).__name__} in it", what, "pass another file")
+    return content
+
+
+def check_container(path: Path, what: str) -> int:
+    """Return a file's unpacked size after checking that loading it cannot take more memory.
+
+    ``torch.save`` stores without compression, so a file that promises more than it has is a bomb.
+
+    Args:
+        path: The file.
+        what: What it should be, for messages.
+
+    Raises:
+        UserError: The file is missing, is not a torch file, is cut short or unpacks to too much.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}, which is no file", what, "correct the path")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise UserError(
+            f"{path}, which is not a torch file or was cut short", what, "copy or write it again"
+        ) from error
+    limit = min(MAX_BYTES, path.stat().st_size)
+    if size > limit:
+        raise UserError(
+            f"{path}, which unpacks to {size} bytes",
+            f"{what} of at most {limit} bytes",
+            "load no file that you do not trust",
+        )
+    return size

@@ -1,0 +1,143 @@
+"""Mesh files (STL, OBJ, PLY) and YCB-Video models, in metres, checked before they are used.
+
+To add a format, write a reader that returns vertices, faces, uv and texture, and one line in
+:data:`READERS`.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from dopepp.errors import UserError
+from dopepp.parts.measure import face_areas
+from dopepp.parts.obj import read_obj
+from dopepp.parts.part import UNITS, Mesh, Part, make_part
+from dopepp.parts.stl_ply import read_ply, read_stl
+
+logger = logging.getLogger(__name__)
+
+ASSUMED_UNIT: Final = "mm"
+"""What CAD programs write into files that cannot state a unit."""
+
+MAX_BYTES: Final = 500_000_000
+"""Ten million triangles: far beyond any use here, and a bound on memory."""
+
+READERS: Final = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
+"""The reader of each suffix."""
+
+
+def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """Read an STL, OBJ or PLY file.
+
+    Args:
+        path: The file; its suffix tells the format.
+        unit: The file's unit: mm, cm, m or inch. None takes millimetres and says so in the log.
+
+    Returns:
+        The mesh in metres: duplicate STL vertices merged, flat triangles dropped, uv and texture
+        where an OBJ or PLY names a texture in its own folder.
+
+    Raises:
+        UserError: The file is missing, too large, of another format or damaged; the unit is
+            unknown; there is no face with an area; a coordinate is not finite; a texture is
+            missing, damaged or outside of the mesh's folder.
+    """
+    path = Path(path)
+    if unit is not None and unit not in UNITS:
+        raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), "state the file's unit")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        suffixes = ", ".join(READERS)
+        raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
+    if not path.is_file():
+        raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
+    if path.stat().st_size > MAX_BYTES:
+        raise _damaged(path, f"{path.stat().st_size / 1e6:.0f} MB", "reduce its triangles")
+    try:
+        vertices, faces, uv, texture = reader(path)
+    except UserError:
+        raise
+    except Exception as error:  # whatever a parser makes of a damaged file
+        raise _damaged(path, f"{type(error).__name__}: {error}") from error
+    mesh = _checked(path, UNITS[unit or ASSUMED_UNIT] * vertices, faces, uv, texture)
+    if unit is None:
+        logger.warning("%s states no unit: taken as %s (unit=… changes it)", path, ASSUMED_UNIT)
+    return mesh
+
+
+def ycb_part(root: str | Path, name: str) -> Part:
+    """Make a part from a YCB-Video folder: ``models/NAME/points.xyz`` and ``textured.obj``.
+
+    The ADD points are all of ``points.xyz``. Without a ``textured.obj`` the part has no mesh, and
+    its points give cuboid and diameter. Both files are in metres.
+
+    Raises:
+        UserError: The folder has no models, no model of that name, or one of its files is damaged.
+    """
+    models = Path(root) / "models"
+    names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
+    if not names:
+        raise UserError(
+            f"{root}, which has no models/NAME/points.xyz",
+            "the root folder of YCB-Video",
+            "check data.root, or unpack YCB_Video_Models into its models folder",
+        )
+    if name not in names:
+        raise UserError(f"unknown object {name!r}", ", ".join(names), f"choose one of {models}")
+    points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
+    mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
+    return make_part(name, mesh, _read_points(points_path), unit="m")
+
+
+def _read_points(path: Path) -> Float[np.ndarray, "points 3"]:
+    allowed = "lines of three finite numbers"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns of an empty file
+            points = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError, UserWarning) as error:
+        raise UserError(f"{path}: {error}", allowed, "replace the file") from error
+    if points.shape[1] != 3 or not np.isfinite(points).all():
+        raise UserError(f"{path} of shape {points.shape}", allowed, "replace the file")
+    return np.asarray(points, np.float64)
+
+
+def _checked(
+    path: Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    uv: Float[np.ndarray, "vertices 2"] | None,
+    texture: UInt8[np.ndarray, "height width 3"] | None,
+) -> Mesh:
+    """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
+    if not len(vertices) or not len(faces):
+        raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
+    if not np.isfinite(vertices).all() or not (uv is None or np.isfinite(uv).all()):
+        raise _damaged(path, "a coordinate that is not a finite number")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise _damaged(path, f"a face index outside of its {len(vertices)} vertices")
+    # A millionth of the mesh wide and long: such a triangle has no meaningful normal.
+    smallest = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
+    proper = face_areas(vertices, faces) > smallest
+    if not proper.any():
+        raise _damaged(path, f"{len(faces)} faces, none with an area")
+    if not proper.all():
+        logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
+    used, index = np.unique(faces[proper], return_inverse=True)
+    return Mesh(
+        vertices=vertices[used],
+        faces=index.reshape(-1, 3).astype(np.int32),
+        uv=None if uv is None else np.asarray(uv, np.float64)[used],
+        texture=texture,
+    )
+
+
+def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
+    allowed = f"a whole mesh with triangles and finite coordinates, under {MAX_BYTES / 1e6:.0f} MB"
+    return UserError(f"mesh {path} with {got}", allowed, fix)

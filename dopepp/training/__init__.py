@@ -1,0 +1,1 @@
+"""Training: the LightningModule around the network, and its callbacks."""

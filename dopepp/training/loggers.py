@@ -1,0 +1,137 @@
+"""Loggers that cannot end a run: a CSV table that is always on, and a guard around the others."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from argparse import Namespace
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import Logger
+
+from dopepp.drawing.png import write_whole
+
+_log = logging.getLogger(__name__)
+
+
+class MetricsTable(Logger):
+    """Writes everything that is logged into one CSV: a row per step, a column per metric.
+
+    The file is rewritten whole, so it is never cut in the middle, and its columns may grow. An
+    existing file is continued.
+
+    Args:
+        path: The CSV file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self._rows: dict[int, dict[str, float]] = {}
+        if path.is_file():
+            self._rows = {int(row.pop("step")): row for row in _read(path)}
+
+    @property
+    def name(self) -> str:
+        """Name for Lightning."""
+        return "csv"
+
+    @property
+    def version(self) -> str:
+        """Version for Lightning; the folder is the version."""
+        return ""
+
+    def forget_after(self, step: int) -> None:
+        """Drop the rows of steps that a resumed run will take again."""
+        self._rows = {key: row for key, row in self._rows.items() if key <= step}
+
+    def log_hyperparams(self, params: dict[str, Any] | Namespace, *_: Any, **__: Any) -> None:
+        """Do nothing: the run's config is a file of its own."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Add figures to a step's row."""
+        self._rows.setdefault(step or 0, {}).update(metrics)
+
+    def save(self) -> None:
+        """Write the file."""
+        if not self._rows:
+            return
+        columns = sorted({name for row in self._rows.values() for name in row})
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, ["step", *columns], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({"step": step, **row} for step, row in sorted(self._rows.items()))
+        write_whole(self.path, text.getvalue().encode())
+
+    def finalize(self, status: str) -> None:
+        """Write what is left."""
+        self.save()
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    with path.open(newline="") as stream:
+        return [{k: v for k, v in row.items() if v != ""} for row in csv.DictReader(stream)]
+
+
+class GuardedLogger(Logger):
+    """Passes everything on to a logger and survives its failures, reporting the first.
+
+    Args:
+        make: Builds the logger; a failure to build it is a failure too.
+    """
+
+    def __init__(self, make: Callable[[], Logger]) -> None:
+        super().__init__()
+        self.inner: Logger | None = None
+        self._failed = False
+        self.inner = self.guard(make)
+
+    def guard(self, call: Callable[[], Any]) -> Any:
+        """Run a call of the logger; None where it fails or has failed before."""
+        if self._failed:
+            return None
+        try:
+            return call()
+        except Exception as error:  # whatever a network, a disk or a service may raise
+            self._failed = True
+            _log.warning("a logger failed and is off for the rest of the run: %r", error)
+            return None
+
+    @property
+    def name(self) -> str | None:
+        """The inner logger's name."""
+        inner = self.inner
+        return None if inner is None else self.guard(lambda: inner.name)
+
+    @property
+    def version(self) -> str | int | None:
+        """The inner logger's version."""
+        inner = self.inner
+        return None if inner is None else self.guard(lambda: inner.version)
+
+    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kw: Any) -> None:
+        """Pass on."""
+        inner = self.inner
+        if inner is not None:
+            self.guard(lambda: inner.log_hyperparams(params, *args, **kw))
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Pass on."""
+        inner = self.inner
+        if inner is not None:
+            self.guard(lambda: inner.log_metrics(metrics, step))
+
+    def save(self) -> None:
+        """Pass on."""
+        inner = self.inner
+        if inner is not None:
+            self.guard(inner.save)
+
+    def finalize(self, status: str) -> None:
+        """Pass on."""
+        inner = self.inner
+        if inner is not None:
+            self.guard(lambda: inner.finalize(status))

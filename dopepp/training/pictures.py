@@ -1,0 +1,25 @@
+"""Pictures to whichever logger can take them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import UInt8
+from lightning.pytorch import Trainer
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+
+from dopepp.training.loggers import GuardedLogger
+
+
+def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
+    for logger in trainer.loggers:
+        if isinstance(logger, GuardedLogger) and logger.inner is not None:
+            inner, step = logger.inner, trainer.global_step
+            logger.guard(lambda inner=inner, step=step: _send(inner, name, image, step))
+
+
+def _send(logger: Logger, name: str, image: UInt8[np.ndarray, "height width 3"], step: int) -> None:
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_image(name, image, step, dataformats="HWC")
+    elif isinstance(logger, WandbLogger):
+        logger.log_image(name, [image], step=step)

@@ -1,0 +1,74 @@
+"""Validation in poses: recovery on the maps, then the accumulator that every evaluation uses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from dopepp.data.batch import Batch
+from dopepp.data.sample import Instance
+from dopepp.metrics.pose import PoseMetrics
+from dopepp.parts.part import Part
+from dopepp.training.system import PoseSystem, ValidationOutput
+
+LOGGED = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg", "miss_rate")
+
+
+class PoseMetricsCallback(Callback):
+    """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
+
+    The metrics stay readable on :attr:`metrics` for callbacks further down the list.
+    """
+
+    metrics: PoseMetrics
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Prepare an accumulator for the system's parts."""
+        assert isinstance(pl_module, PoseSystem)
+        self.metrics = PoseMetrics(pl_module.parts)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start counting anew, on the device that gathers across processes."""
+        self.metrics.to(pl_module.device).reset()
+
+    def on_validation_batch_end(  # type: ignore[override]
+        self,
+        trainer: Trainer,
+        pl_module: PoseSystem,
+        outputs: ValidationOutput,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Recover the batch's poses and compare them with its instances."""
+        detections = pl_module.recover(outputs, batch)
+        truths = batch_instances(batch, pl_module.parts)
+        for found, instances in zip(detections, truths, strict=True):
+            self.metrics.update(found, instances)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the mean over objects; what does not exist (nothing matched) is left out."""
+        mean = self.metrics.compute()["mean"]
+        for name in LOGGED:
+            value = getattr(mean, name)
+            # A selection needs a number even where no object was in the validation images.
+            if value is None and name != "median_rotation_deg":
+                value = math.nan
+            if value is not None:
+                on_bar = name == "add_01d"
+                pl_module.log(f"val/{name}", float(value), prog_bar=on_bar, rank_zero_only=False)
+
+
+def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
+    """Yield each image's ground truth in the form that samples have."""
+    index = batch.object_index.cpu().numpy()
+    poses, keypoints = batch.T_cam_obj.double().cpu().numpy(), batch.keypoints.cpu().numpy()
+    visible = batch.visible_fraction.cpu().numpy()
+    for row in range(len(batch)):
+        yield [
+            Instance(parts[c].name, poses[row, n], keypoints[row, n], float(visible[row, n]))
+            for n, c in enumerate(index[row])
+            if c >= 0
+        ]

@@ -1,0 +1,149 @@
+"""PoseSystem: a network, a loss and an optimiser as a LightningModule.
+
+The network knows nothing of training and this module knows nothing of backbones or files: what can
+be swapped is handed in, built. To add a callback, one class here and one entry in
+``conf/callbacks``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from dopepp.data.batch import Batch
+from dopepp.maps.encode import MapGeometry, encode
+from dopepp.models.losses import MapLoss
+from dopepp.models.network import PoseNetwork
+from dopepp.parts.part import Part
+from dopepp.recovery.detection import Detection
+from dopepp.recovery.recover import RecoveryOptions, recover_batch
+
+OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
+SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
+
+
+@dataclass
+class ValidationOutput:
+    """One validation batch's loss and maps; callbacks read poses from them.
+
+    Attributes:
+        loss: The batch's loss.
+        belief: Last stage's belief maps after the activation.
+        field: Last stage's vector field.
+    """
+
+    loss: Float[Tensor, ""]
+    belief: Float[Tensor, "batch beliefs height width"]
+    field: Float[Tensor, "batch fields height width"]
+
+
+class PoseSystem(LightningModule):
+    """Trains a network on maps and recovers poses from them.
+
+    Args:
+        network: Images to maps.
+        loss: Compares every stage with the targets.
+        parts: The objects, in the order of the network's channels.
+        geometry: Stride, peak width and disc radius of the target maps.
+        recovery: Thresholds of the way from maps to poses.
+        make_optimizer: Parameters to optimiser.
+        make_scheduler: Optimiser and number of steps to a schedule stepped once a batch; None for
+            a constant learning rate.
+        payload: The self-description stored in every checkpoint under ``dopepp``.
+        compile_network: Whether to run the network through ``torch.compile``.
+    """
+
+    def __init__(
+        self,
+        network: PoseNetwork,
+        loss: MapLoss,
+        parts: Sequence[Part],
+        geometry: MapGeometry,
+        recovery: RecoveryOptions,
+        make_optimizer: OptimizerFactory,
+        make_scheduler: SchedulerFactory | None = None,
+        payload: Mapping[str, Any] | None = None,
+        compile_network: bool = False,
+    ) -> None:
+        super().__init__()
+        # Convolutions on channels-last memory are faster on CPUs and tensor cores alike.
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.loss = loss
+        self.parts = tuple(parts)
+        self.cuboids = np.stack([part.cuboid for part in parts])
+        self.geometry, self.recovery = geometry, recovery
+        self.make_optimizer, self.make_scheduler = make_optimizer, make_scheduler
+        self.payload = dict(payload or {})
+        # In place, so that parameter names stay those of the plain network.
+        if compile_network:
+            self.network.compile()
+
+    def forward(self, images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the belief logits and fields of all stages."""
+        stages: list[tuple[Tensor, Tensor]] = self.network(
+            images.contiguous(memory_format=torch.channels_last)
+        )
+        return stages
+
+    def targets(
+        self, batch: Batch
+    ) -> tuple[
+        Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
+    ]:
+        """Draw the batch's target maps on its own device."""
+        height, width = batch.images.shape[-2:]
+        map_size = height // self.geometry.stride, width // self.geometry.stride
+        return encode(batch.keypoints, batch.object_index, len(self.parts), map_size, self.geometry)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the loss and log it with its terms."""
+        loss, terms = self.loss(self(batch.images), *self.targets(batch))
+        size = len(batch)
+        self.log("train/loss", loss.detach(), prog_bar=True, batch_size=size)
+        self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
+        return loss  # type: ignore[no-any-return]
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
+        """Log the loss and hand the maps to the callbacks."""
+        stages = self(batch.images)
+        loss, _ = self.loss(stages, *self.targets(batch))
+        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch), sync_dist=True)
+        logits, field = stages[-1]
+        return ValidationOutput(loss, self.network.activate(logits.float()), field.float())
+
+    def recover(self, output: ValidationOutput, batch: Batch) -> list[list[Detection]]:
+        """Recover the poses on every image of a validation batch."""
+        return recover_batch(
+            output.belief,
+            output.field,
+            self.cuboids,
+            batch.K.cpu().numpy(),
+            self.geometry.stride,
+            [part.name for part in self.parts],
+            **vars(self.recovery),
+        )
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """Build the optimiser, and its schedule over all steps of the run."""
+        optimizer = self.make_optimizer(self.network.parameters())
+        if self.make_scheduler is None:
+            return optimizer
+        scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Make the file self-describing: anybody can load it without this module or a config."""
+        checkpoint["dopepp"] = self.payload

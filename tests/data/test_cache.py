@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopepp.data.cache import CachedSource
+from dopepp.data.resize import resize_sample
+from dopepp.data.sample import Sample
+from dopepp.errors import UserError
+
+
+def assert_same(first: Sample, second: Sample) -> None:
+    np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_array_equal(first.K, second.K)
+    assert (first.source, first.key) == (second.source, second.key)
+    for one, other in zip(first.instances, second.instances, strict=True):
+        assert (one.label, one.visible_fraction) == (other.label, other.visible_fraction)
+        np.testing.assert_array_equal(one.T_cam_obj, other.T_cam_obj)
+        np.testing.assert_array_equal(one.keypoints, other.keypoints)
+        assert (one.mask is None) == (other.mask is None)
+        if one.mask is not None and other.mask is not None:
+            np.testing.assert_array_equal(one.mask, other.mask)
+
+
+def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source: Any) -> None:
+    source = fake_source(num_items=3)
+    cached = CachedSource(source, (64, 64))
+    for epoch in (0, 5, 2):
+        for index in range(3):
+            assert_same(cached.sample(index, epoch), fake_source().sample(index, 0))
+    assert source.calls == [(0, 0), (0, 1), (0, 2)]
+
+
+def test_without_mask_and_without_instance(fake_source: Any) -> None:
+    source = fake_source(num_items=2)
+    bare = source.sample(1)
+    bare.instances[0].mask = None
+    empty = source.sample(0)
+    empty.instances = []
+    source.sample = lambda index, epoch=0: (empty, bare)[index]
+    cached = CachedSource(source, (64, 64))
+    for _ in range(2):
+        assert_same(cached.sample(0), empty)
+        assert_same(cached.sample(1), bare)
+
+
+def test_a_returned_sample_is_a_copy(fake_source: Any) -> None:
+    cached = CachedSource(fake_source(), (64, 64))
+    sample = cached.sample(0)
+    sample.image[:] = 0
+    sample.K[:] = 0
+    sample.instances[0].keypoints[:] = 0
+    assert_same(cached.sample(0), fake_source().sample(0))
+
+
+def test_images_are_kept_at_the_input_size(fake_source: Any) -> None:
+    cached = CachedSource(fake_source(size=(640, 480)), (64, 64))
+    expected = resize_sample(fake_source(size=(640, 480)).sample(1), (64, 64))
+    assert_same(cached.sample(1), expected)
+    assert cached.num_bytes < 12 * 64 * 64 * 6
+
+
+def test_forked_processes_fill_one_cache(fake_source: Any) -> None:
+    source = fake_source(num_items=8)
+    cached = CachedSource(source, (64, 64))
+    context = multiprocessing.get_context("fork")
+
+    def fill(indices: list[int]) -> None:
+        for index in indices:
+            cached.sample(index)
+
+    # Overlapping ranges: two processes write the same bytes into the same slots.
+    children = [
+        context.Process(target=fill, args=(part,)) for part in ([1, 2, 3, 4, 5], [5, 4, 3, 6, 7])
+    ]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+        assert child.exitcode == 0
+    for index in range(8):
+        assert_same(cached.sample(index), fake_source().sample(index))
+    assert source.calls == [(0, 0)]  # this process rendered the first item only
+
+
+def test_too_large_and_too_many_instances(fake_source: Any) -> None:
+    with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
+        CachedSource(fake_source(num_items=10**9), (64, 64))
+    with pytest.raises(ValueError, match="max_instances=0"):
+        CachedSource(fake_source(), (64, 64), max_instances=0)
+
+
+def test_describes_itself_as_cached(fake_source: Any) -> None:
+    source = fake_source()
+    (info,), (plain,) = CachedSource(source, (64, 64)).describe(), source.describe()
+    assert info.identity == {**plain.identity, "cache": "memory"}
+    assert CachedSource(source, (64, 64)).contains("box")

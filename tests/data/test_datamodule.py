@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dopepp.data.augment import Photometric
+from dopepp.data.batch import Batch
+from dopepp.data.cache import CachedSource
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.loader import EpochSampler, SampleDataset
+from dopepp.data.masking import RandomMask
+from dopepp.errors import UserError
+from dopepp.virtual.backgrounds import ProceduralBackgrounds
+
+
+@pytest.fixture
+def build(fake_source: Any) -> Any:
+    def build(**changes: Any) -> PoseDataModule:
+        options: dict[str, Any] = {
+            "train": fake_source(12),
+            "val": fake_source(5),
+            "test": fake_source(3, size=(96, 72)),
+            "object_names": ["box"],
+            "input_size": (64, 64),
+            "batch_size": 4,
+            "masking": RandomMask(0.7),
+            "augment": Photometric(),
+            "backgrounds": ProceduralBackgrounds(),
+        }
+        return PoseDataModule(**(options | changes))
+
+    return build
+
+
+def batches(datamodule: PoseDataModule, epoch: int) -> list[Batch]:
+    loader = datamodule.train_dataloader()
+    loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+    return list(loader)
+
+
+def assert_same(first: list[Batch], second: list[Batch]) -> None:
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        for entry in fields(Batch):
+            a, b = getattr(one, entry.name), getattr(other, entry.name)
+            if isinstance(a, Tensor):
+                assert torch.equal(a.nan_to_num(), b.nan_to_num())
+            else:
+                assert a == b
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_workers_do_not_change_the_batches(build: Any, fake_source: Any, cached: bool) -> None:
+    def train() -> Any:
+        return CachedSource(fake_source(12), (64, 64)) if cached else fake_source(12)
+
+    alone = build(train=train())
+    together = build(train=train(), num_workers=2)
+    loader = together.train_dataloader()
+    for epoch in range(2):  # the second pass reuses the persistent workers
+        loader.sampler.set_epoch(epoch)
+        assert_same(batches(alone, epoch), list(loader))
+
+
+def test_epochs_differ_and_repeat(build: Any) -> None:
+    datamodule = build()
+    first, second = batches(datamodule, 0), batches(datamodule, 1)
+    assert_same(first, batches(datamodule, 0))
+    assert sorted(key for batch in first for key in batch.keys) == sorted(
+        f"0/{i}" for i in range(12)
+    )
+    assert all(key.startswith("1/") for batch in second for key in batch.keys)
+    orders = [[key.split("/")[1] for batch in run for key in batch.keys] for run in (first, second)]
+    assert orders[0] != orders[1]
+    reseeded = batches(build(seed=1), 0)
+    assert [batch.keys for batch in reseeded] != [batch.keys for batch in first]
+
+
+def test_cached_images_keep_their_epoch_but_not_their_augmentation(
+    build: Any, fake_source: Any
+) -> None:
+    datamodule = build(train=CachedSource(fake_source(12), (64, 64)))
+    first, second = datamodule.train_item(0, 3), datamodule.train_item(1, 3)
+    assert first.key == second.key == "0/3"
+    assert (first.image != second.image).any()
+    np.testing.assert_array_equal(first.instances[0].keypoints, second.instances[0].keypoints)
+
+
+def test_padding_is_neither_augmented_nor_masked(build: Any) -> None:
+    for index in range(12):
+        assert not build().train_item(0, index).image[48:].any()
+
+
+def test_validation_is_untouched_and_test_is_native(build: Any, fake_source: Any) -> None:
+    datamodule = build()
+    keys = []
+    for batch in datamodule.val_dataloader():
+        keys += batch.keys
+        for image, key in zip(batch.images, batch.keys, strict=True):
+            expected = fake_source(5).sample(int(key.split("/")[1]), 0).image
+            np.testing.assert_array_equal(image[:, :48].permute(1, 2, 0).numpy(), expected)
+    assert keys == [f"0/{i}" for i in range(5)]
+    assert [sample.size for sample in datamodule.test_samples()] == [(96, 72)] * 3
+
+
+@pytest.mark.parametrize("shuffle", [True, False])
+@pytest.mark.parametrize("num_items", [12, 13])
+def test_ranks_share_the_items(fake_source: Any, shuffle: bool, num_items: int) -> None:
+    dataset = SampleDataset(lambda epoch, index: fake_source().sample(index, epoch), num_items)
+    ranks = [EpochSampler(dataset, 0, shuffle, rank, 3) for rank in range(3)]
+    for sampler in ranks:
+        sampler.set_epoch(2)
+    parts = [list(sampler) for sampler in ranks]
+    assert [len(part) for part in parts] == [len(sampler) for sampler in ranks]
+    union = [item for part in parts for item in part]
+    assert len(set(union)) == len(union)
+    assert {epoch for epoch, _ in union} == {2 if shuffle else 0}
+    if shuffle:
+        assert {len(part) for part in parts} == {num_items // 3}
+    else:
+        assert sorted(index for _, index in union) == list(range(num_items))
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_users_mistake_arrives_as_one_line(
+    build: Any, fake_source: Any, num_workers: int
+) -> None:
+    error = UserError("frame 7", "complete frames", "download it again")
+    source = fake_source(12, bad=lambda index: error if index == 7 else None)
+    with pytest.raises(UserError, match=r"^got frame 7; allowed: complete frames") as caught:
+        batches(build(train=source, num_workers=num_workers), 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_loader_resumes_inside_an_epoch(build: Any) -> None:
+    full = batches(build(), 1)
+    loader = build().train_dataloader()
+    loader.sampler.set_epoch(1)
+    taken = iter(loader)
+    next(taken)
+    state = loader.state_dict()
+    resumed = build().train_dataloader()
+    resumed.load_state_dict(state)
+    resumed.sampler.set_epoch(1)
+    assert_same(list(resumed), full[1:])
+    assert len(list(resumed)) == 3  # only that one pass is shorter
+
+
+# --- with Lightning --------------------------------------------------------------------------
+
+
+class Recorder(pl.LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.train_keys: list[tuple[int, list[str]]] = []
+        self.val_keys: list[str] = []
+
+    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        assert isinstance(batch, Batch)
+        self.train_keys.append((self.current_epoch, batch.keys))
+        return self.weight * batch.images.float().mean()
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        self.val_keys += batch.keys
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.0)
+
+
+def trainer_of(path: Path, **options: Any) -> pl.Trainer:
+    defaults: dict[str, Any] = {
+        "accelerator": "cpu",
+        "devices": 1,
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "default_root_dir": path,
+        "num_sanity_val_steps": 0,
+    }
+    return pl.Trainer(**(defaults | options))
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_lightning_drives_the_epochs(build: Any, tmp_path: Path, num_workers: int) -> None:
+    model, datamodule = Recorder(), build(num_workers=num_workers)
+    trainer_of(tmp_path, max_epochs=3).fit(model, datamodule=datamodule)
+    expected = [(e, batch.keys) for e in range(3) for batch in batches(build(), e)]
+    assert model.train_keys == expected
+    assert model.val_keys == [f"0/{i}" for i in range(5)] * 3
+
+
+class SaveAt(pl.Callback):
+    """Saves at the end of one batch, like ``ModelCheckpoint(every_n_train_steps=…)``."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self.path, self.step = path, step
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        if trainer.global_step == self.step:
+            trainer.save_checkpoint(self.path)
+
+
+# An epoch has three batches: in the first, at its end, and inside the second.
+@pytest.mark.parametrize("stop", [1, 3, 4, 5])
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_lightning_resumes_where_it_stopped(
+    build: Any, tmp_path: Path, stop: int, num_workers: int
+) -> None:
+    expected = [(e, batch.keys) for e in range(3) for batch in batches(build(), e)]
+    path, first, second = tmp_path / "last.ckpt", Recorder(), Recorder()
+    trainer = trainer_of(tmp_path, max_epochs=3, callbacks=[SaveAt(path, stop)])
+    trainer.fit(first, datamodule=build(num_workers=num_workers))
+    assert first.train_keys == expected
+    resumed = build(num_workers=num_workers)
+    trainer_of(tmp_path, max_epochs=3).fit(
+        second, datamodule=resumed, ckpt_path=path, weights_only=True
+    )
+    assert second.train_keys == expected[stop:]
+
+
+# --- start-up --------------------------------------------------------------------------------
+
+
+def test_summary_and_fingerprint(build: Any, fake_source: Any) -> None:
+    rows = build().summary()
+    assert [(row.split, row.source, row.num_images) for row in rows] == [
+        ("train", "fake", 12),
+        ("val", "fake", 5),
+        ("test", "fake", 3),
+    ]
+    assert rows[0].num_instances == {"box": 1}
+    fingerprint = build().fingerprint()
+    assert len(fingerprint) == 64
+    assert build().fingerprint() == fingerprint
+    assert build(seed=1).fingerprint() != fingerprint
+    assert build(val=fake_source(6)).fingerprint() != fingerprint
+
+
+def test_an_object_without_any_instance_fails_at_start(build: Any) -> None:
+    build().check_objects()
+    with pytest.raises(UserError, match=r"no instance of can in the training data \(fake\)"):
+        build(object_names=["box", "can"]).check_objects()
+
+
+def test_wrong_options(build: Any) -> None:
+    with pytest.raises(UserError, match="12 training images for batches of 13"):
+        build(batch_size=13)
+    with pytest.raises(ValueError, match="masking needs backgrounds"):
+        build(backgrounds=None)
+    assert build(masking=None, augment=None, backgrounds=None).train_item(0, 0).size == (64, 64)

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from dopepp.data.images import read_image, read_rgb
+from dopepp.errors import UserError
+
+
+@pytest.fixture
+def image() -> np.ndarray:
+    noise = np.random.default_rng(1).integers(0, 256, (40, 60, 3), np.uint8)
+    return cv2.GaussianBlur(noise, (5, 5), 2)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_reads_what_pillow_reads(tmp_path: Path, image: np.ndarray, suffix: str) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(image).save(path)
+    expected = np.asarray(Image.open(path).convert("RGB"))
+    # Two JPEG decoders may round differently by a few levels.
+    tolerance = 0 if suffix == ".png" else 4
+    np.testing.assert_allclose(read_rgb(path).astype(int), expected.astype(int), atol=tolerance)
+
+
+def test_alpha_depth_and_grey(tmp_path: Path, image: np.ndarray) -> None:
+    rgba = np.dstack([image, image[..., 0]])
+    Image.fromarray(rgba).save(tmp_path / "rgba.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "rgba.png"), rgba)
+    depth = np.arange(2400, dtype=np.uint16).reshape(40, 60) * 27
+    cv2.imwrite(str(tmp_path / "depth.png"), depth)
+    np.testing.assert_array_equal(read_image(tmp_path / "depth.png"), depth)
+    with pytest.raises(UserError, match="uint16; allowed: 8 bits"):
+        read_rgb(tmp_path / "depth.png")
+    Image.fromarray(image[..., 0]).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_rgb(tmp_path / "grey.png"), image[..., [0, 0, 0]])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95, 0.999])
+def test_a_truncated_file_is_an_error(
+    tmp_path: Path, image: np.ndarray, suffix: str, share: float
+) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(image).save(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(UserError, match=rf"image\{suffix}.*allowed: a complete PNG or JPEG"):
+        read_image(path)
+
+
+def test_damage_missing_and_other_formats(tmp_path: Path, image: np.ndarray) -> None:
+    path = tmp_path / "image.png"
+    with pytest.raises(UserError, match=r"image\.png: No such file"):
+        read_image(path)
+    Image.fromarray(image).save(path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(UserError, match="damaged at byte"):
+        read_image(path)
+    path.write_text("not an image")
+    with pytest.raises(UserError, match="neither PNG nor JPEG"):
+        read_image(path)

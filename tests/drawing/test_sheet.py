@@ -1,0 +1,90 @@
+"""Contact sheets and map panels: every picture where it belongs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dopepp.drawing.maps import map_panel
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.drawing.text import text_coverage
+
+RED, GREY = (200, 10, 10), (90, 90, 90)
+
+
+def plain(colour: tuple[int, int, int], width: int = 40, height: int = 30) -> NDArray[np.uint8]:
+    return np.full((height, width, 3), colour, np.uint8)
+
+
+def test_tiles_stand_in_reading_order() -> None:
+    colours = [(10 * i, 100, 50) for i in range(5)]
+    sheet = contact_sheet([Tile(plain(c)) for c in colours], columns=2, tile_width=40)
+    assert sheet.shape == (3 * 30 + 4 * 6, 2 * 40 + 3 * 6, 3)
+    for i, colour in enumerate(colours):
+        row, column = divmod(i, 2)
+        top, left = 6 + 36 * row, 6 + 46 * column
+        assert (sheet[top : top + 30, left : left + 40] == colour).all()
+    assert (sheet[78:108, 52:92] == 255).all()  # the sixth place is empty
+
+
+def test_tiles_of_any_size_get_one_width_and_keep_their_shape() -> None:
+    tiles = [Tile(plain(RED, 10, 20)), Tile(plain(GREY, 400, 100))]
+    sheet = contact_sheet(tiles, columns=5, tile_width=100)
+    assert sheet.shape == (200 + 12, 2 * 100 + 18, 3)
+    assert (sheet[6:206, 6:106] == RED).all()
+    assert (sheet[6:31, 112:212] == GREY).all()
+    assert (sheet[32:206, 112:212] == 255).all()
+
+
+@pytest.mark.parametrize("caption", ["ADD 3.1 mm", "Δ = 4° · a very long caption " * 9, "$x"])
+def test_a_caption_is_written_below_its_picture(caption: str) -> None:
+    sheet = contact_sheet([Tile(plain(RED, 120, 90), caption)], tile_width=120)
+    assert sheet.shape == (90 + 18 + 12, 132, 3)
+    assert (sheet[6:96, 6:126] == RED).all()
+    assert (sheet[96:114, 6:126] < 100).any()
+    assert (sheet[114:] == 255).all()
+
+
+@pytest.mark.parametrize("arguments", [([], 2, 10), ([Tile(plain(RED))], 0, 10)])
+def test_an_empty_sheet_is_refused(arguments: tuple[list[Tile], int, int]) -> None:
+    with pytest.raises(ValueError, match="a sheet needs tiles, columns and a width"):
+        contact_sheet(*arguments)
+
+
+def test_text_fits_its_line_and_is_as_wide_as_its_letters() -> None:
+    short, long = text_coverage("i", 20), text_coverage("iiiiiiiiii", 20)
+    assert short.shape[0] == 20
+    assert 3 * short.shape[1] < long.shape[1]
+    letters = text_coverage("Ågjy|", 20)
+    assert letters.max() > 0.9
+    assert letters[0].max() < 0.1  # nothing is cut off above or below
+    assert letters[-1].max() < 0.1
+
+
+def test_a_belief_lies_over_the_pixels_its_cell_covers() -> None:
+    image = plain(GREY, 160, 96)
+    belief = np.zeros((9, 12, 20), np.float32)
+    belief[7, 4, 11] = 1
+    panel = map_panel(image, belief, tile_width=160)
+    assert panel.shape == (3 * (96 + 18) + 4 * 6, 3 * 160 + 4 * 6, 3)
+    # Corner 7 is the second tile of the third row.
+    top, left = 6 + 2 * (96 + 18 + 6), 6 + 160 + 6
+    tile = panel[top : top + 96, left : left + 160].astype(int)
+    hot = np.argwhere(np.abs(tile - 54).max(axis=2) > 100)  # 54 = the dimmed grey
+    np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
+    assert (panel[6:102, 6:166] == 54).all()  # corner 0 believes nothing
+
+
+def test_padding_of_the_maps_is_cut_off_and_bad_values_are_clipped() -> None:
+    belief = np.full((9, 12, 20), np.nan, np.float32)
+    belief[0] = 7.0
+    belief[1] = -np.inf
+    panel = map_panel(plain(GREY, 150, 90), belief, tile_width=150)
+    assert panel.shape == (3 * (90 + 18) + 24, 3 * 150 + 24, 3)
+
+
+@pytest.mark.parametrize("shape", [(8, 12, 20), (9, 11, 40), (9, 40, 19), (12, 20)])
+def test_maps_that_do_not_cover_the_image_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="do not cover a 96×160 image"):
+        map_panel(plain(GREY, 160, 96), np.zeros(shape, np.float32))

@@ -1,0 +1,113 @@
+"""Two gloo processes give the numbers of one; also where a rank has seen nothing.
+
+The ranks are this file run as a script: spawned workers could not import a test module by name.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch.distributed as dist
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dopepp.data.sample import Instance
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.metrics.pose import PoseMetrics
+from dopepp.parts.part import Part
+
+NUM_IMAGES = 13
+
+
+@dataclass
+class Detection:
+    object: str
+    score: float
+    T_cam_obj: NDArray[np.float64]
+
+
+def metric() -> PoseMetrics:
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (100, 3)) * [1, 0.6, 0.2]
+    cuboid = cuboid_keypoints(points.min(0), points.max(0))
+    return PoseMetrics([Part("box", cuboid, 0.12, points), Part("none", cuboid, 0.12, points)])
+
+
+def feed(target: PoseMetrics, images: range) -> None:
+    """Every third image is missed, every other one has a duplicate."""
+    for i in images:
+        rng = np.random.default_rng(i)
+        T = np.eye(4)
+        T[:3, :3] = Rotation.random(random_state=i).as_matrix()
+        T[:3, 3] = rng.normal([0, 0, 1], 0.1)
+        E = T.copy()
+        E[:3, 3] += rng.normal(0, 0.01, 3)
+        detections = [] if i % 3 == 0 else [Detection("box", 0.5, E)] * (1 + i % 2)
+        target.update(detections, [Instance("box", T, np.zeros((9, 2)))])
+
+
+def summary(source: PoseMetrics) -> dict[str, object]:
+    references = source.references()
+    return {
+        "rows": {name: row.to_record() for name, row in source.compute().items()},
+        "errors": sorted(source.errors("box").tolist()),
+        "references": {
+            reference: rows["box"].to_record() for reference, rows in references.items()
+        },
+    }
+
+
+def run_rank(rank: int, folder: Path, shares: list[range]) -> None:
+    store = f"file://{folder / 'store'}"
+    dist.init_process_group("gloo", init_method=store, rank=rank, world_size=len(shares))
+    target = metric()
+    feed(target, shares[rank])
+    (folder / f"{rank}.json").write_text(json.dumps(summary(target)))
+    dist.destroy_process_group()
+
+
+SPLITS = {
+    "uneven": [range(5), range(5, NUM_IMAGES)],
+    "one rank empty": [range(0), range(NUM_IMAGES)],
+}
+
+
+@pytest.mark.ddp
+@pytest.mark.parametrize("split", SPLITS)
+def test_two_processes_give_the_numbers_of_one(split: str, tmp_path: Path) -> None:
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-W", "ignore", __file__, str(rank), str(tmp_path), split],
+            env=environment,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    for process in ranks:
+        error = process.communicate(timeout=120)[1]
+        assert process.returncode == 0, error
+    alone = metric()
+    feed(alone, range(NUM_IMAGES))
+    expected = json.loads(json.dumps(summary(alone)))
+    assert expected["rows"]["box"]["num_instances"] == NUM_IMAGES
+    for rank in range(2):
+        result = json.loads((tmp_path / f"{rank}.json").read_text())
+        assert result["errors"] == expected["errors"]
+        for part in ("rows", "references"):
+            for name, row in expected[part].items():
+                for measure, value in row.items():
+                    near = pytest.approx(value, rel=1e-12) if isinstance(value, float) else value
+                    assert result[part][name][measure] == near, (part, name, measure)
+
+
+if __name__ == "__main__":
+    run_rank(int(sys.argv[1]), Path(sys.argv[2]), SPLITS[sys.argv[3]])

@@ -1,0 +1,103 @@
+"""Reference rows on parts whose chances have closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.metrics.references import BEST_CONSTANT, CHANCE_ALL, CHANCE_RANGE, reference_rows
+from dopepp.parts.part import Part
+
+Array = NDArray[np.float64]
+
+
+def dumbbell(offset: float = 0.0) -> Part:
+    """Two points ±5 cm from the centre: ADD is |Qp − p|, cos of its angle uniform in [−1, 1]."""
+    points = np.array([[0.05, 0, 0], [-0.05, 0, 0]]) + offset
+    return Part("dumbbell", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
+
+
+def plate() -> Part:
+    points = np.random.default_rng(0).uniform(-1, 1, (800, 3)) * [0.0385, 0.0385, 0.0035]
+    return Part("plate", cuboid_keypoints(points.min(0), points.max(0)), 0.109, points)
+
+
+def poses(rotations: Rotation) -> Array:
+    T = np.tile(np.eye(4), (len(rotations), 1, 1))
+    T[:, :3, :3] = rotations.as_matrix()
+    T[:, :3, 3] = [0.1, -0.1, 0.5]
+    return T
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+@pytest.mark.parametrize("reference", [CHANCE_ALL, CHANCE_RANGE])
+def test_chance_over_all_rotations_has_the_closed_form(reference: str, offset: float) -> None:
+    T = poses(Rotation.random(400, random_state=0))
+    row = reference_rows(dumbbell(offset), T)[reference]
+    # P(|Qp − p| < e) = e² / (4·r²) with r = 5 cm; four standard errors of 2,000 draws.
+    for rate, share in ((row.add_01d, 0.01), (row.pass_5cm, 0.25), (row.pass_10cm, 1.0)):
+        assert rate == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / 2000) + 1e-9)
+    assert row.auc_10cm == pytest.approx(1 / 3, abs=0.03)  # 1 − E|Qp − p| / 10 cm, E = 4r/3
+    # θ − sin θ = π/2 halves SO(3): 132.3°.
+    assert row.median_rotation_deg == pytest.approx(132.3, abs=4)
+    assert row.num_instances == 400
+
+
+def test_a_test_set_of_one_orientation_is_solved_by_a_constant() -> None:
+    T = poses(Rotation.from_rotvec(np.tile([0.3, 0.2, 0.1], (50, 1))))
+    rows = reference_rows(plate(), T)
+    for reference in (CHANCE_RANGE, BEST_CONSTANT):
+        assert rows[reference].add_01d == 1.0
+        assert rows[reference].auc_10cm == pytest.approx(1.0, abs=1e-12)
+    assert rows[CHANCE_ALL].add_01d < 0.05  # type: ignore[operator]
+
+
+def test_two_orientations_are_half_known_to_the_best_constant() -> None:
+    angles = np.array([0.0] * 30 + [np.pi / 2] * 10)
+    T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
+    rows = reference_rows(plate(), T)
+    assert rows[BEST_CONSTANT].add_01d == 0.75
+    # Another pose of the set is the same: (30·29 + 10·9) of 40·39 ordered pairs.
+    assert rows[CHANCE_RANGE].add_01d == pytest.approx(960 / 1560)
+
+
+def test_the_mean_orientation_is_tried_too() -> None:
+    # ADD of a turn by a about z is 2·sin(a/2)·mean radius (2.9 cm): ±20° is right from 0° only.
+    angles = np.radians([-20.0] * 5 + [20.0] * 5)
+    T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
+    rows = reference_rows(plate(), T)
+    assert rows[BEST_CONSTANT].add_01d == 1.0
+    assert rows[BEST_CONSTANT].median_rotation_deg == pytest.approx(20)
+
+
+def test_rows_depend_on_the_seed_only() -> None:
+    T = poses(Rotation.random(60, random_state=1))
+    assert reference_rows(plate(), T, seed=3) == reference_rows(plate(), T, seed=3)
+    assert reference_rows(plate(), T, seed=3) == reference_rows(plate(), T[::-1], seed=3)
+    assert reference_rows(plate(), T, seed=3) != reference_rows(plate(), T, seed=4)
+
+
+def test_measures_that_mean_nothing_here_are_none() -> None:
+    for row in reference_rows(plate(), poses(Rotation.random(5, random_state=0))).values():
+        assert row.median_translation is None
+        assert (row.miss_rate, row.precision, row.false_positives) == (None, None, None)
+
+
+def test_without_instances_and_with_a_single_one() -> None:
+    for row in reference_rows(plate(), np.empty((0, 4, 4))).values():
+        assert (row.num_instances, row.add_01d) == (0, None)
+    rows = reference_rows(plate(), poses(Rotation.random(1, random_state=0)))
+    assert rows[CHANCE_RANGE].add_01d is None
+    assert rows[CHANCE_RANGE].num_instances == 1
+    assert rows[BEST_CONSTANT].add_01d == 1.0
+
+
+def test_add_s_sees_the_part_symmetric_where_it_is() -> None:
+    # Half a turn maps the two points onto each other.
+    angles = np.array([0.0, np.pi])
+    T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
+    row = reference_rows(dumbbell(), T)[CHANCE_RANGE]
+    assert (row.add_01d, row.add_s_01d) == (0.0, 1.0)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import correlate2d
+
+from dopepp.errors import UserError
+from dopepp.models.attention import CBAM, SE, Identity
+
+
+def sigmoid(values: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-values))
+
+
+def weights_of(module: torch.nn.Module) -> dict[str, np.ndarray]:
+    return {name: value.detach().numpy() for name, value in module.named_parameters()}
+
+
+@pytest.mark.parametrize("kernel_size", [3, 7])
+def test_cbam_is_equations_5_and_6(kernel_size):
+    torch.manual_seed(0)
+    module = CBAM(8, reduction=2, kernel_size=kernel_size).double()
+    features = torch.randn(2, 8, 5, 6, dtype=torch.float64)
+    weights = weights_of(module)
+
+    def mlp(vector: np.ndarray) -> np.ndarray:
+        return weights["mlp.2.weight"] @ np.maximum(weights["mlp.0.weight"] @ vector, 0)
+
+    for image, result in zip(features.numpy(), module(features).detach().numpy(), strict=True):
+        channel = sigmoid(mlp(image.mean((1, 2))) + mlp(image.max((1, 2))))
+        scaled = image * channel[:, None, None]
+        planes = (scaled.mean(0), scaled.max(0))
+        spatial = sum(
+            correlate2d(plane, kernel, mode="same")
+            for plane, kernel in zip(planes, weights["spatial.weight"][0], strict=True)
+        )
+        np.testing.assert_allclose(result, scaled * sigmoid(spatial), rtol=1e-10)
+
+
+def test_cbam_defaults_to_the_paper():
+    module = CBAM(128)
+    assert module.spatial.kernel_size == (3, 3)
+    assert module.mlp[0].out_features == 128 // 16
+
+
+def test_se_weighs_channels_by_their_mean():
+    torch.manual_seed(0)
+    module = SE(8, reduction=4).double()
+    features = torch.randn(2, 8, 3, 4, dtype=torch.float64)
+    weights = weights_of(module)
+    hidden = np.maximum(features.numpy().mean((2, 3)) @ weights["mlp.0.weight"].T, 0)
+    expected = features.numpy() * sigmoid(hidden @ weights["mlp.2.weight"].T)[:, :, None, None]
+    np.testing.assert_allclose(module(features).detach().numpy(), expected, rtol=1e-10)
+
+
+def test_none_is_the_identity_without_parameters():
+    features = torch.randn(2, 8, 3, 4)
+    assert Identity(8)(features) is features
+    assert not list(Identity(8).parameters())
+
+
+@pytest.mark.parametrize("module", [Identity, SE, CBAM])
+@pytest.mark.parametrize("channels", [8, 24, 128])
+def test_shape_is_kept(module, channels):
+    features = torch.randn(2, channels, 4, 7)
+    assert module(channels)(features).shape == features.shape
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        (SE, {"reduction": 0}, "reduction=0; allowed: an integer from 1"),
+        (CBAM, {"reduction": -16}, "reduction=-16"),
+        (CBAM, {"reduction": 1.5}, "reduction=1.5"),
+        (CBAM, {"kernel_size": 4}, "kernel_size=4; allowed: an odd number"),
+        (CBAM, {"kernel_size": 10**9}, "kernel_size=1000000000"),
+    ],
+)
+def test_arguments_are_bounded(module, arguments, message):
+    with pytest.raises(UserError, match=message):
+        module(8, **arguments)

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from dopepp.errors import UserError
+from dopepp.models.backbones import DSC, VGG19, VGG19Original
+
+# torchvision's vgg19: index of each convolution under `features` and its channels.
+TORCHVISION = {
+    0: (3, 64),
+    2: (64, 64),
+    5: (64, 128),
+    7: (128, 128),
+    10: (128, 256),
+    12: (256, 256),
+    14: (256, 256),
+    16: (256, 256),
+    19: (256, 512),
+    21: (512, 512),
+}
+
+
+def num_weights(module: nn.Module) -> int:
+    return sum(layer.weight.numel() for layer in module.modules() if isinstance(layer, nn.Conv2d))
+
+
+def test_paper_counts_without_biases():
+    assert num_weights(DSC()) == 1_107_776
+    assert num_weights(VGG19Original()) == 9_696_960
+
+
+def test_dsc_with_batch_norm_has_only_weights_and_norms():
+    backbone = DSC(batch_norm=True)
+    norms = sum(
+        parameter.numel()
+        for layer in backbone.modules()
+        if isinstance(layer, nn.BatchNorm2d)
+        for parameter in layer.parameters()
+    )
+    assert sum(parameter.numel() for parameter in backbone.parameters()) == 1_107_776 + norms
+
+
+def test_dsc_is_depthwise_then_pointwise_with_relu_after_each():
+    layers = [layer for layer in DSC().modules() if isinstance(layer, (nn.Conv2d, nn.ReLU))]
+    convolutions = layers[::2]
+    assert all(isinstance(layer, nn.ReLU) for layer in layers[1::2])
+    assert len(convolutions) == 1 + 2 * 12
+    for depthwise, pointwise in zip(convolutions[1::2], convolutions[2::2], strict=True):
+        assert depthwise.groups == depthwise.in_channels == depthwise.out_channels
+        assert depthwise.kernel_size == (3, 3)
+        assert (pointwise.kernel_size, pointwise.groups) == ((1, 1), 1)
+
+
+@pytest.mark.parametrize("backbone", [DSC, VGG19, VGG19Original])
+@pytest.mark.parametrize(("width", "channels"), [(0.125, 16), (0.3, 40), (0.5, 64)])
+@pytest.mark.parametrize("batch_norm", [False, True])
+def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm):
+    backbone = backbone(width, batch_norm).eval()
+    assert (backbone.out_channels, backbone.stride) == (channels, 8)
+    with torch.no_grad():
+        assert backbone(torch.zeros(1, 3, 64, 48)).shape == (1, channels, 8, 6)
+
+
+@pytest.fixture(scope="module")
+def torchvision_weights() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    weights = {}
+    for index, (inputs, outputs) in TORCHVISION.items():
+        weights[f"features.{index}.weight"] = torch.randn(
+            outputs, inputs, 3, 3, generator=generator
+        )
+        weights[f"features.{index}.bias"] = torch.randn(outputs, generator=generator)
+    # What the file holds beyond these layers is left alone.
+    weights["classifier.6.bias"] = torch.zeros(1000)
+    return weights
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_loads_torchvision_weights(tmp_path, torchvision_weights, zipped):
+    path = tmp_path / "vgg19.pth"
+    torch.save(torchvision_weights, path, _use_new_zipfile_serialization=zipped)
+    backbone = VGG19(weights_path=str(path))
+    # torchvision's own layout, rebuilt: layers 0–22 with the file's keys.
+    reference = nn.Sequential()
+    for index in range(23):
+        if index in TORCHVISION:
+            reference.append(nn.Conv2d(*TORCHVISION[index], 3, padding=1))
+        else:
+            reference.append(nn.MaxPool2d(2) if index in (4, 9, 18) else nn.ReLU())
+    reference.load_state_dict(
+        {
+            key.removeprefix("features."): value
+            for key, value in torchvision_weights.items()
+            if key.startswith("features.")
+        }
+    )
+    images = torch.randn(1, 3, 16, 16)
+    with torch.no_grad():
+        ours = backbone.layers[:-2](images)
+        torch.testing.assert_close(ours, reference(images))
+
+
+def test_wrong_key_or_shape_is_refused(tmp_path, torchvision_weights):
+    path = tmp_path / "vgg19.pth"
+    renamed = {f"module.{key}": value for key, value in torchvision_weights.items()}
+    torch.save(renamed, path)
+    with pytest.raises(UserError, match=r"got nothing under features\.0\.weight in .*vgg19\.pth"):
+        VGG19(weights_path=str(path))
+    torch.save({**torchvision_weights, "features.5.weight": torch.zeros(128, 64, 1, 1)}, path)
+    with pytest.raises(UserError, match=r"\(128, 64, 1, 1\) under features\.5\.weight"):
+        VGG19(weights_path=str(path))
+    torch.save([1, 2], path)
+    with pytest.raises(UserError, match="with a list in it"):
+        VGG19(weights_path=str(path))
+
+
+def test_file_that_is_none_is_refused(tmp_path):
+    with pytest.raises(UserError, match="which is no file; allowed: a torchvision-format"):
+        VGG19(weights_path=str(tmp_path / "missing.pth"))
+    path = tmp_path / "page.html"
+    path.write_text("<html>404</html>")
+    with pytest.raises(UserError, match="torch refuses to load"):
+        VGG19(weights_path=str(path))
+
+
+@pytest.mark.parametrize("arguments", [{"width": 0.5}, {"batch_norm": True}, {"weights_path": 3}])
+def test_pretrained_weights_only_at_full_width(arguments):
+    with pytest.raises(UserError, match="only with width=1 and batch_norm=false"):
+        VGG19(**{"weights_path": "vgg19.pth", **arguments})
+
+
+@pytest.mark.parametrize("backbone", [DSC, VGG19])
+@pytest.mark.parametrize(
+    "arguments",
+    [{"width": 0}, {"width": -1}, {"width": 100}, {"width": "wide"}, {"batch_norm": "yes"}],
+)
+def test_arguments_are_bounded(backbone, arguments):
+    with pytest.raises(UserError, match=next(iter(arguments))):
+        backbone(**arguments)

@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from dopepp.errors import UserError
+from dopepp.models.activation import find_activation
+from dopepp.models.heads import Cascade, MultiScale
+from dopepp.models.layers import conv_block, scaled_channels
+from dopepp.models.spec import build_network
+
+
+def num_parameters(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_dope_has_the_paper_count(make_spec):
+    network = build_network(make_spec("VGG19", "Identity", "Cascade", "identity"))
+    assert num_parameters(network) == 50_267_350
+
+
+@pytest.mark.parametrize(
+    ("backbone", "attention", "head"),
+    [*itertools.product(["VGG19", "DSC"], ["Identity", "SE", "CBAM"], ["Cascade", "MultiScale"])],
+)
+@pytest.mark.parametrize("num_objects", [1, 2])
+def test_every_combination_gives_stages_of_the_right_shape(
+    make_spec, backbone, attention, head, num_objects
+):
+    spec = make_spec(
+        backbone,
+        attention,
+        head,
+        num_objects=num_objects,
+        backbone_width=0.125,
+        head_width=0.125,
+        head_stages=2,
+        head_batch_norm=True,
+    )
+    network = build_network(spec).eval()
+    for height, width in ((32, 32), (64, 96)):
+        images = torch.randint(0, 256, (2, 3, height, width), dtype=torch.uint8)
+        stages = network(images)
+        assert len(stages) == 2
+        for belief, field in stages:
+            assert belief.shape == (2, 9 * num_objects, height // 8, width // 8)
+            assert field.shape == (2, 16 * num_objects, height // 8, width // 8)
+            assert torch.isfinite(belief).all()
+            assert torch.isfinite(field).all()
+
+
+def test_full_size_input_gives_52_by_52_cells(make_spec):
+    network = build_network(make_spec(backbone_width=0.125, head_width=0.125)).eval()
+    with torch.no_grad():
+        belief, field = network.maps(torch.zeros(1, 3, 416, 416, dtype=torch.uint8))
+    assert belief.shape == (1, 9, 52, 52)
+    assert field.shape == (1, 16, 52, 52)
+
+
+def test_uint8_and_float_images_are_the_same_input(small_spec):
+    network = build_network(small_spec).eval()
+    images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
+    with torch.no_grad():
+        for a, b in zip(network(images)[0], network(images.float())[0], strict=True):
+            assert torch.equal(a, b)
+
+
+def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
+    network = build_network(small_spec)
+    seen = []
+    network.backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
+    network.eval()(images)
+    mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
+    std = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+    torch.testing.assert_close(seen[0], (images / 255 - mean) / std)
+    assert not {"mean", "std"} & network.state_dict().keys()
+
+
+def test_channels_last_and_bf16_give_the_same_maps(small_spec):
+    torch.manual_seed(0)
+    network = build_network(small_spec).eval()
+    images = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
+    with torch.no_grad():
+        expected = network.maps(images)[0]
+        network = network.to(memory_format=torch.channels_last)
+        images = images.to(memory_format=torch.channels_last)
+        torch.testing.assert_close(network.maps(images)[0], expected)
+        with torch.autocast("cpu", torch.bfloat16):
+            belief = network.maps(images)[0]
+    assert belief.dtype == torch.float32
+    torch.testing.assert_close(belief, expected, atol=5e-3, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 3, 40, 32), (1, 3, 32, 33), (1, 1, 32, 32), (1, 4, 32, 32), (3, 32, 32)]
+)
+def test_images_of_another_shape_are_refused(small_spec, shape):
+    with pytest.raises(UserError, match=r"images of shape .* multiples of 32; fix: pad"):
+        build_network(small_spec)(torch.zeros(shape))
+
+
+def test_cascade_alone_takes_multiples_of_its_stride(make_spec):
+    network = build_network(make_spec(head="Cascade", backbone_width=0.125, head_width=0.125))
+    assert network.size_multiple == 8
+    assert network(torch.zeros(1, 3, 40, 24))[-1][0].shape == (1, 9, 5, 3)
+
+
+def test_state_dict_round_trip(small_spec):
+    first, second = build_network(small_spec).eval(), build_network(small_spec).eval()
+    images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
+    with torch.no_grad():
+        assert not torch.equal(first(images)[0][0], second(images)[0][0])
+        second.load_state_dict(first.state_dict())
+        for a, b in zip(first(images)[0], second(images)[0], strict=True):
+            assert torch.equal(a, b)
+
+
+def test_activations():
+    logits = torch.tensor([-30.0, math.log(0.25), 0.0, 3.0])
+    torch.testing.assert_close(
+        find_activation("exp")(logits), torch.tensor([math.exp(-30), 0.25, 1.0, 1.0])
+    )
+    assert torch.equal(find_activation("identity")(logits), logits)
+    assert find_activation("exp")(logits.bfloat16()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", ["relu", None, 3, ["exp"]])
+def test_unknown_activation_is_refused(name):
+    with pytest.raises(UserError, match=r"activation .* allowed: identity, exp"):
+        find_activation(name)
+
+
+@pytest.mark.parametrize(("activation", "expected"), [("identity", 0.0), ("exp", 0.01)])
+@pytest.mark.parametrize("head", [Cascade, MultiScale])
+def test_an_untrained_head_answers_nearly_nothing(head, activation, expected):
+    torch.manual_seed(0)
+    head = head(128, 1, activation, stages=2)
+    with torch.no_grad():
+        stages = head(torch.randn(2, 128, 16, 16).relu())
+    for belief, field in stages:
+        difference = find_activation(activation)(belief) - expected
+        # Under exp a logit off by 1.5 is a factor of 4.5 on a belief of 0.01.
+        assert difference.abs().max() < (1.5 if activation == "identity" else 0.05)
+        assert field.abs().max() < 1.5
+
+
+def test_later_stages_read_activated_beliefs_and_the_field():
+    head = Cascade(8, 1, "exp", stages=2, width=0.0625)
+    seen = []
+    head.belief_branches[1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    features = torch.randn(1, 8, 4, 4)
+    belief, field = head(features)[0]
+    expected = torch.cat([features, belief.clamp(max=0).exp(), field], dim=1)
+    torch.testing.assert_close(seen[0], expected)
+
+
+def test_belief_and_field_branches_share_no_parameter():
+    head = MultiScale(8, 1, width=0.0625)
+    belief, _ = head(torch.randn(1, 8, 8, 8))[0]
+    belief.sum().backward()
+    assert all(parameter.grad is None for parameter in head.field_branches.parameters())
+    assert all(parameter.grad is not None for parameter in head.belief_branches.parameters())
+
+
+def test_multiscale_has_the_paper_convolutions():
+    # Per branch at width 128, biases included: 11 convs 3×3 down, then three convsets of 3 1×1 and
+    # 2 3×3 (two of them begin at 256 channels), two more 1×1, and the output.
+    three, one = 9 * 128 * 128 + 128, 128 * 128 + 128
+    down = 11 * three
+    convset = 3 * one + 2 * three
+    up = 3 * convset + 2 * one + 2 * 128 * 128  # two convsets read 256 channels
+    expected = sum(down + up + outputs * 129 for outputs in (9, 16))
+    assert num_parameters(MultiScale(128, 1)) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stages": 0}, "stages=0; allowed: an integer from 1 to 12"),
+        ({"stages": 13}, "stages=13"),
+        ({"stages": True}, "stages=True"),
+        ({"stages": 2.0}, "stages=2.0"),
+        ({"width": 0}, "width=0; allowed: a number from"),
+        ({"width": 4.1}, "width=4.1"),
+        ({"width": float("nan")}, "width=nan"),
+        ({"width": "1"}, "width='1'"),
+        ({"batch_norm": 1}, "batch_norm=1; allowed: true or false"),
+    ],
+)
+@pytest.mark.parametrize("head", [Cascade, MultiScale])
+def test_head_arguments_are_bounded(head, arguments, message):
+    with pytest.raises(UserError, match=message):
+        head(8, 1, **arguments)
+
+
+@pytest.mark.parametrize("num_objects", [0, 65, -1, True, "1"])
+def test_number_of_objects_is_bounded(num_objects):
+    with pytest.raises(UserError, match="num_objects"):
+        MultiScale(8, num_objects, width=0.0625)
+
+
+@pytest.mark.parametrize(
+    ("channels", "width", "expected"),
+    [(128, 1, 128), (128, 0.5, 64), (64, 0.3, 16), (64, 1 / 64, 8), (512, 4, 2048)],
+)
+def test_scaled_channels(channels, width, expected):
+    assert scaled_channels(channels, width) == expected
+
+
+def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
+    torch.manual_seed(0)
+    network = build_network(make_spec(attention="Identity"))
+    features = []
+    network.backbone.register_forward_hook(lambda *arguments: features.append(arguments[-1]))
+    with torch.no_grad():
+        network(torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8))
+    assert 0.05 < features[0].std() < 20
+
+
+def test_batch_norm_takes_the_place_of_the_bias():
+    with_norm, without = conv_block(4, 8, 3, batch_norm=True), conv_block(4, 8, 3)
+    assert [type(layer) for layer in with_norm] == [nn.Conv2d, nn.BatchNorm2d, nn.ReLU]
+    assert with_norm[0].bias is None
+    assert without[0].bias is not None

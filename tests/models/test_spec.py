@@ -1,0 +1,310 @@
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from dopepp.errors import UserError
+from dopepp.models import backbones
+from dopepp.models.gate import Gate
+from dopepp.models.losses import MapMSE, SpatialCrossEntropy
+from dopepp.models.network import PoseNetwork
+from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES, architecture, build_network
+
+OPTIMIZERS = Gate("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
+DSC = "dopepp.models.backbones.DSC"
+
+
+def test_allow_lists_hold_the_public_classes():
+    assert BACKBONES.targets == tuple(
+        f"dopepp.models.backbones.{name}" for name in ("DSC", "VGG19", "VGG19Original")
+    )
+    assert ATTENTIONS.targets == tuple(
+        f"dopepp.models.attention.{name}" for name in ("CBAM", "Identity", "SE")
+    )
+    assert HEADS.targets == tuple(f"dopepp.models.heads.{n}" for n in ("Cascade", "MultiScale"))
+    assert {name.rpartition(".")[2] for name in LOSSES.targets} == {"MapMSE", "SpatialCrossEntropy"}
+
+
+def test_builds_a_network_from_plain_values(make_spec):
+    network = build_network(
+        make_spec("DSC", "SE", "Cascade", "identity", 3, backbone_width=0.25, head_width=0.125)
+    )
+    assert isinstance(network, PoseNetwork)
+    assert (network.num_objects, network.stride, network.activation) == (3, 8, "identity")
+    assert network.attention.mlp[0].in_features == network.backbone.out_channels == 32
+
+
+def test_a_spec_is_left_as_it_was(small_spec):
+    before = repr(small_spec)
+    build_network(small_spec)
+    assert repr(small_spec) == before
+
+
+HOSTILE = [
+    "os.system",
+    "torch.load",
+    "torch.utils.collect_env.run",
+    "sympy.sympify",
+    "builtins.eval",
+    "dopepp.models.spec.os.system",
+    "dopepp.models.backbones.Backbone",
+    "dopepp.models.backbones.Path",
+    "dopepp.models.backbones.nn.Sequential",
+    "dopepp.models.backbones.conv_block",
+    "dopepp.models.spec.backbones.DSC",
+    "dopepp.models.heads.MultiScale",
+    "dopepp.models.backbones.DSC.__init__",
+    " dopepp.models.backbones.DSC",
+    "DSC",
+    "",
+    ".",
+    None,
+    7,
+    ["dopepp.models.backbones.DSC"],
+    {"_target_": DSC},
+    nn.Identity,
+    b"os.system",
+]
+
+
+@pytest.mark.parametrize("target", HOSTILE)
+def test_other_targets_are_refused(make_spec, target):
+    spec = make_spec()
+    spec["backbone"] = {"_target_": target}
+    with pytest.raises(
+        UserError, match=r"backbone _target_ .* allowed: dopepp.models.backbones.DSC"
+    ):
+        build_network(spec)
+
+
+@pytest.mark.parametrize("part", ["backbone", "attention", "head"])
+def test_every_part_stands_behind_the_gate(make_spec, part):
+    spec = make_spec()
+    spec[part] = {"_target_": "os.system", "command": "true"}
+    with pytest.raises(UserError, match=rf"got {part} _target_ 'os.system'"):
+        build_network(spec)
+
+
+def test_a_refused_target_is_not_even_imported(make_spec):
+    """In a process of its own: importing the module would be visible in sys.modules."""
+    code = """
+import sys
+from dopepp.errors import UserError
+from dopepp.models.spec import BACKBONES
+for module in ("antigravity", "this"):
+    try:
+        BACKBONES.build({"_target_": module + ".x"})
+    except UserError:
+        assert module not in sys.modules
+    else:
+        raise SystemExit("built")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_rebound_name_is_refused(monkeypatch):
+    """The allow-list names a class, not whatever somebody put in its place."""
+    monkeypatch.setattr(backbones, "DSC", nn.Identity)
+    with pytest.raises(UserError, match=r"which is <class .*Identity.*itself defines"):
+        BACKBONES.build({"_target_": DSC})
+    monkeypatch.setattr(backbones, "DSC", backbones.VGG19)
+    with pytest.raises(UserError, match=r"which is <class .*VGG19.*itself defines"):
+        BACKBONES.build({"_target_": DSC})
+
+
+class Tiny(backbones.Backbone):
+    """A user's own backbone."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.out_channels = channels
+        self.conv = nn.Conv2d(3, channels, 8, stride=8)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.conv(images)
+
+
+@pytest.fixture
+def tiny_module(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Make this file's Tiny importable the way a user's installed package is."""
+    module = type(sys)("somebodys_package")
+    monkeypatch.setattr(Tiny, "__module__", "somebodys_package")
+    module.Tiny, module.Stolen, module.run = Tiny, subprocess.Popen, subprocess.run
+    monkeypatch.setitem(sys.modules, "somebodys_package", module)
+    return "somebodys_package"
+
+
+def test_a_registered_class_can_be_built(make_spec, tiny_module):
+    gate = Gate("backbone", backbones.Backbone)
+    with pytest.raises(UserError, match="allowed: nothing"):
+        gate.build({"_target_": f"{tiny_module}.Tiny", "channels": 8})
+    gate.register(f"{tiny_module}.Tiny")
+    assert gate.build({"_target_": f"{tiny_module}.Tiny", "channels": 8}).out_channels == 8
+
+
+@pytest.mark.parametrize("name", ["Stolen", "run", "missing"])
+def test_registering_anything_else_fails_at_once(tiny_module, name):
+    with pytest.raises(UserError, match=rf"{tiny_module}.{name}"):
+        BACKBONES.register(f"{tiny_module}.{name}")
+    with pytest.raises(UserError, match="cannot be imported"):
+        BACKBONES.register("no_such_package.Backbone")
+    with pytest.raises(UserError, match="cannot be imported"):
+        BACKBONES.register("Backbone")
+    assert all(target.startswith("dopepp.") for target in BACKBONES.targets)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wdth": 1}, "argument 'wdth' of dopepp.*DSC; allowed: width, batch_norm; fix"),
+        ({"_args_": [1]}, "argument '_args_'"),
+        ({"_partial_": True}, "argument '_partial_'"),
+        ({"_convert_": "all"}, "argument '_convert_'"),
+        ({3: 1}, "argument 3"),
+        ({"width": {"_target_": "os.getcwd"}}, "key '_target_' in .*argument width.*plain values"),
+        ({"width": [{"a": {"_target_": DSC}}]}, "key '_target_'"),
+        ({"width": [{"a": {"_target_": DSC, "width": 1}}]}, "nested targets are not built"),
+        ({"width": object()}, "a object in .*argument width"),
+        ({"width": torch.ones(1)}, "a Tensor in"),
+        ({"width": 1e9}, "width=1000000000.0; allowed: a number"),
+        ({"width": [1]}, r"width=\[1\]"),
+        ({"width": None}, "width=None"),
+    ],
+)
+def test_arguments_are_named_and_plain(arguments, message):
+    with pytest.raises(UserError, match=message):
+        BACKBONES.build({"_target_": DSC, **arguments})
+
+
+def test_what_the_composer_provides_cannot_be_set(make_spec):
+    spec = make_spec()
+    spec["attention"]["channels"] = 7
+    with pytest.raises(
+        UserError, match=r"argument 'channels' of .*CBAM; allowed: reduction, kernel"
+    ):
+        build_network(spec)
+    spec = make_spec(head_num_objects=2)
+    with pytest.raises(UserError, match=r"argument 'num_objects' of .*MultiScale"):
+        build_network(spec)
+
+
+@pytest.mark.parametrize("node", [None, "DSC", [DSC], DSC, 3])
+def test_a_node_is_a_mapping(node):
+    with pytest.raises(UserError, match=r"got backbone .* allowed: a mapping with _target_"):
+        BACKBONES.build(node)
+
+
+def change(key: str, value: object) -> Callable[[dict[str, Any]], object]:
+    return lambda spec: spec.update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (
+            lambda spec: spec.pop("head"),
+            "a model spec with .* allowed: exactly backbone, attention",
+        ),
+        (change("stride", 4), "'stride'.* allowed: exactly"),
+        (change("activation", "softmax"), "activation 'softmax'; allowed: identity, exp"),
+        (change("num_objects", 0), "num_objects=0; allowed: an integer from 1 to 64"),
+        (change("num_objects", 10**9), "num_objects=1000000000"),
+        (change("num_objects", True), "num_objects=True"),
+        (lambda spec: spec["head"].update(stages=100), "stages=100"),
+        (lambda spec: spec["head"].update(width=1e6), "width=1000000.0"),
+        (lambda spec: spec["attention"].update(reduction=0), "reduction=0"),
+    ],
+)
+def test_a_spec_is_checked_and_bounded(make_spec, edit, message):
+    spec = make_spec()
+    edit(spec)
+    with pytest.raises(UserError, match=message):
+        build_network(spec)
+
+
+def test_a_spec_is_a_mapping():
+    with pytest.raises(UserError, match="a model spec with"):
+        build_network(["backbone"])
+
+
+def test_the_gate_takes_classes_that_a_package_re_exports():
+    """torch.optim.AdamW is defined in torch.optim.adamw: below the module that the list names."""
+    parameters = [nn.Parameter(torch.zeros(1))]
+    optimizer = OPTIMIZERS.build(
+        {"_target_": "torch.optim.AdamW", "lr": 1e-3, "betas": [0.9, 0.99]}, params=parameters
+    )
+    assert type(optimizer) is torch.optim.AdamW
+    assert optimizer.param_groups[0]["lr"] == 1e-3
+    with pytest.raises(UserError, match="argument 'params'"):
+        OPTIMIZERS.build({"_target_": "torch.optim.AdamW", "params": []}, params=parameters)
+    with pytest.raises(UserError, match=r"got optimizer _target_ 'torch.optim.Adam'"):
+        OPTIMIZERS.build({"_target_": "torch.optim.Adam"}, params=parameters)
+
+
+def test_what_a_class_refuses_itself_is_a_user_error():
+    parameters = [nn.Parameter(torch.zeros(1))]
+    with pytest.raises(UserError, match=r"which it refuses: Invalid learning rate: -1"):
+        OPTIMIZERS.build({"_target_": "torch.optim.SGD", "lr": -1}, params=parameters)
+
+
+def test_missing_arguments_are_named():
+    with pytest.raises(UserError, match=r"SpatialCrossEntropy without sigma"):
+        LOSSES.build({"_target_": "dopepp.models.losses.SpatialCrossEntropy"})
+
+
+class Logger:
+    """Takes more than it lists, as Lightning's loggers do."""
+
+    def __init__(self, path: str, **more: object) -> None:
+        self.path, self.more = path, more
+
+
+def test_keywords_that_a_class_hands_on(monkeypatch, tiny_module):
+    monkeypatch.setattr(Logger, "__module__", tiny_module)
+    sys.modules[tiny_module].Logger = Logger
+    gate = Gate("logger", Logger, [f"{tiny_module}.Logger"])
+    node = {"_target_": f"{tiny_module}.Logger", "project": "parts"}
+    assert gate.build(node, path="here").more == {"project": "parts"}
+    with pytest.raises(UserError, match="argument 'path'"):
+        gate.build({**node, "path": "there"}, path="here")
+    with pytest.raises(UserError, match="argument '_partial_'"):
+        gate.build({**node, "_partial_": True}, path="here")
+
+
+def test_losses_stand_behind_a_gate():
+    node = {"_target_": "dopepp.models.losses.SpatialCrossEntropy", "count_weight": 0.5}
+    loss = LOSSES.build(node, sigma=1.0)
+    assert isinstance(loss, SpatialCrossEntropy)
+    assert loss.count_weight == 0.5
+    assert isinstance(LOSSES.build({"_target_": "dopepp.models.losses.MapMSE"}), MapMSE)
+
+
+def test_architecture_drops_the_pretrained_weights(make_spec):
+    spec = make_spec("VGG19", backbone_weights_path="/home/somebody/vgg19.pth")
+    plain = architecture(spec)
+    assert "weights_path" not in plain["backbone"]
+    assert spec["backbone"]["weights_path"] == "/home/somebody/vgg19.pth"
+    plain["head"]["width"] = 2
+    assert "width" not in spec["head"]
+
+
+def test_the_documented_backbone_works(monkeypatch, make_spec):
+    """docs/adding-a-backbone.md, read and run."""
+    guide = Path(__file__).parents[2] / "docs" / "adding-a-backbone.md"
+    code = guide.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    # The guide puts the class into backbones.py, so it sees that module's names and one import.
+    monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
+    monkeypatch.setattr(backbones, "Strided", None, raising=False)
+    exec(code, vars(backbones))
+    gate = Gate.of_module("backbone", backbones.Backbone, backbones)
+    assert "dopepp.models.backbones.Strided" in gate.targets
+    backbone = gate.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
+    assert backbone(torch.zeros(1, 3, 64, 32)).shape == (1, backbone.out_channels, 8, 4)

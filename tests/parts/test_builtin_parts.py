@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import Error, Manifold, Mesh64
+from scipy.spatial.transform import Rotation
+
+from dopepp.parts import Part, pivconnector, servoholder
+
+SIZES = {servoholder: (0.077, 0.077, 0.007), pivconnector: (0.105, 0.052, 0.007)}
+PARTS = pytest.mark.parametrize("build", SIZES, ids=lambda build: build.__name__)
+Build = Callable[[], Part]
+
+
+def to_trimesh(part: Part) -> trimesh.Trimesh:
+    assert part.mesh is not None
+    return trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
+
+
+def to_solid(part: Part, centre: np.ndarray) -> Manifold:
+    """Millimetres about ``centre`` (metres)."""
+    assert part.mesh is not None
+    vertices = np.ascontiguousarray(1000 * (part.mesh.vertices - centre))
+    solid = Manifold(Mesh64(vertices, part.mesh.faces.astype(np.uint64)))
+    assert solid.status() == Error.NoError
+    return solid
+
+
+def share_moved(solid: Manifold, rotation: np.ndarray) -> float:
+    """Volume of the symmetric difference with the rotated solid, over the solid's own."""
+    rotated = solid.transform(np.column_stack([rotation, np.zeros(3)]))
+    return float(((solid - rotated).volume() + (rotated - solid).volume()) / solid.volume())
+
+
+@PARTS
+def test_has_the_papers_size_about_the_origin(build: Build) -> None:
+    part = build()
+    half = np.array(SIZES[build]) / 2
+    assert part.name == build.__name__
+    assert part.mesh is not None
+    np.testing.assert_allclose(part.mesh.vertices.max(axis=0), half, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(part.mesh.vertices.min(axis=0), -half, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(part.cuboid[0], half * [1, -1, 1], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(part.cuboid[8], 0, rtol=0, atol=1e-15)
+    assert np.linalg.norm(half) * 1.8 < part.diameter <= np.linalg.norm(2 * half)
+
+
+@PARTS
+def test_is_one_printable_solid(build: Build) -> None:
+    mesh = to_trimesh(build())
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.body_count == 1
+    assert mesh.euler_number <= 2 - 2 * 5  # at least five through holes
+    assert 0.3 < mesh.volume / mesh.bounding_box.volume < 0.7
+    assert mesh.area_faces.min() > 1e-11  # no slivers under 10 µm²
+    assert 1000 < len(mesh.faces) < 6000
+
+
+@PARTS
+@pytest.mark.parametrize("about", ["bounding box", "centre of mass"])
+def test_no_rotation_of_the_box_group_maps_it_onto_itself(build: Build, about: str) -> None:
+    part = build()
+    centre = part.cuboid[8] if about == "bounding box" else to_trimesh(part).center_mass
+    solid = to_solid(part, centre)
+    group = Rotation.create_group("O").as_matrix()
+    shares = [share_moved(solid, R) for R in group if np.trace(R) < 2.9]
+    assert len(shares) == 23
+    assert min(shares) > 0.8
+
+
+@PARTS
+def test_no_other_rotation_maps_it_onto_itself(build: Build) -> None:
+    # A symmetry fixes the centre of mass and the axes of the inertia tensor where its moments
+    # differ, which leaves rotations about z and flips about axes in the plane.
+    part = build()
+    solid = to_solid(part, to_trimesh(part).center_mass)
+    turns = Rotation.from_rotvec([[0, 0, angle] for angle in np.radians(np.arange(10, 360, 25))])
+    flips = turns * Rotation.from_rotvec([np.pi, 0, 0])
+    anything = Rotation.random(10, rng=np.random.default_rng(0))
+    tried = Rotation.concatenate([turns, flips, anything])
+    far = tried[tried.magnitude() > np.radians(9)]
+    assert min(share_moved(solid, R) for R in far.as_matrix()) > 0.1
+
+
+@PARTS
+def test_front_and_back_differ_where_both_are_solid(build: Build) -> None:
+    # Depth maps of both faces over one grid: raised features in front, recesses behind.
+    part = build()
+    solid = to_solid(part, part.cuboid[8])
+    areas = {z: solid.slice(z).area() for z in (-3.4, -2.0, 0.0, 1.0, 3.4)}
+    assert areas[3.4] < areas[1.0] < 0.6 * areas[0.0]
+    assert areas[-3.4] < 0.95 * areas[0.0]
+
+
+@PARTS
+def test_walls_of_features_are_visible_from_straight_above_and_below(build: Build) -> None:
+    mesh = to_trimesh(build())
+    tilt = mesh.face_normals[:, 2]
+    sloping = (np.abs(tilt) > 0.2) & (np.abs(tilt) < 0.98)
+    assert mesh.area_faces[sloping & (tilt > 0)].sum() > 2e-4  # square metres
+    assert mesh.area_faces[sloping & (tilt < 0)].sum() > 5e-5
+
+
+@PARTS
+def test_is_made_once(build: Build) -> None:
+    assert build() is build()
+
+
+def test_has_one_hash_in_every_process() -> None:
+    code = (
+        "from dopepp.parts import *; print(servoholder().mesh_hash, pivconnector().mesh_hash);"
+        "import sys; print([m for m in ('torch', 'lightning', 'trimesh') if m in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    hashes, heavy = run.stdout.splitlines()
+    assert hashes == f"{servoholder().mesh_hash} {pivconnector().mesh_hash}"
+    assert heavy == "[]"

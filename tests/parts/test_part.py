@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.errors import UserError
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.parts import Mesh, make_part, servoholder
+
+
+def box(size: tuple[float, float, float]) -> Mesh:
+    mesh = trimesh.creation.box(size)
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+
+
+def test_measures_a_box() -> None:
+    part = make_part("box", box((0.03, 0.04, 0.12)))
+    assert part.name == "box"
+    assert part.diameter == pytest.approx(0.13, rel=1e-15)
+    half = np.array([0.015, 0.02, 0.06])
+    np.testing.assert_allclose(part.cuboid, cuboid_keypoints(-half, half), atol=1e-18)
+    assert part.points.shape == (2000, 3)
+    assert part.symmetries_discrete is None
+    assert part.symmetries_continuous == ()
+
+
+def test_takes_given_points_as_they_are() -> None:
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    part = make_part("box", box((0.1, 0.1, 0.1)), points)
+    np.testing.assert_array_equal(part.points, points)
+
+
+def test_points_alone_make_a_part_without_mesh() -> None:
+    points = np.array([[0, 0, 0], [0.03, 0, 0], [0.03, 0.04, 0], [0.0, 0.04, 0.1]])
+    part = make_part("cloud", None, points)
+    assert part.mesh is None
+    assert part.mesh_hash == ""
+    assert part.diameter == pytest.approx(np.linalg.norm([0.03, 0.04, 0.1]))
+    np.testing.assert_allclose(part.cuboid[8], [0.015, 0.02, 0.05])
+
+
+def test_neither_mesh_nor_points_is_refused() -> None:
+    with pytest.raises(ValueError, match="a mesh or points"):
+        make_part("nothing", None)
+
+
+def test_hash_tells_meshes_apart() -> None:
+    mesh = box((0.1, 0.1, 0.1))
+    moved = Mesh(np.nextafter(mesh.vertices, 1), mesh.faces)
+    turned = Mesh(mesh.vertices, mesh.faces[:, [1, 2, 0]])
+    hashes = {make_part("box", m).mesh_hash for m in (mesh, moved, turned)}
+    assert len(hashes) == 3
+    assert all(len(h) == 64 for h in hashes)
+    assert make_part("other", box((0.1, 0.1, 0.1))).mesh_hash in hashes
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit", "message"),
+    [
+        (1000, "m", r"'holder' with a diameter of 104\.8 m, .* unit=m; .*5 mm – 5 m; .*unit=mm"),
+        (0.001, "mm", r"diameter of 0\.0001048 m, .* unit=mm; .* fix: .*unit=m$"),
+        (0.01, "mm", r"diameter of 0\.001048 m, .* fix: .*unit=cm"),
+        (0.0, "mm", r"diameter of 0 m, .* fix: check the file's size"),
+    ],
+)
+def test_an_unlikely_size_names_the_unit_and_suggests_one(
+    scale: float, unit: str, message: str
+) -> None:
+    mesh = servoholder().mesh
+    assert mesh is not None
+    with pytest.raises(UserError, match=message):
+        make_part("holder", Mesh(scale * mesh.vertices, mesh.faces), unit=unit)
+
+
+@pytest.mark.parametrize("diameter", [0.005, 5.0])
+def test_the_allowed_sizes_include_their_ends(diameter: float) -> None:
+    points = np.array([[0.0, 0, 0], [diameter, 0, 0]])
+    assert make_part("rod", None, points).diameter == diameter
+
+
+@pytest.mark.parametrize("name", ["", "x" * 201, "two\nlines"])
+def test_a_name_must_be_printable(name: str) -> None:
+    with pytest.raises(UserError, match=r"part name .* printable characters"):
+        make_part(name, box((0.1, 0.1, 0.1)))

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.distance import pdist
+
+from dopepp.errors import UserError
+from dopepp.parts import load_part, ycb_part
+
+TEXTURED = (
+    "003_cracker_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+)
+
+
+def test_somebody_elses_stl_parts_load_as_they_are(shared_data: Path) -> None:
+    paths = sorted(p for p in (shared_data / "parts").rglob("*") if p.suffix.lower() == ".stl")
+    assert len(paths) == 6
+    for path in paths:
+        part = load_part(path)
+        assert part.mesh is not None
+        reference = trimesh.load_mesh(path)
+        assert 0.05 < part.diameter < 0.1
+        assert part.diameter == pytest.approx(
+            pdist(np.asarray(reference.convex_hull.vertices) / 1000).max()
+        )
+        solid = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
+        assert solid.is_watertight == reference.is_watertight
+        assert solid.volume == pytest.approx(reference.volume / 1e9)
+        assert part.points.shape == (2000, 3)
+
+
+@pytest.mark.parametrize("name", TEXTURED)
+def test_a_textured_model_agrees_with_trimesh(ycb_root: Path, name: str) -> None:
+    part = ycb_part(ycb_root, name)
+    folder = ycb_root / "models" / name
+    reference = trimesh.load_mesh(folder / "textured.obj", process=False)
+    assert part.mesh is not None
+    assert part.mesh.uv is not None
+    assert part.mesh.texture is not None
+    assert part.mesh.texture.shape == (1024, 1024, 3)
+    image = np.asarray(reference.visual.material.image.convert("RGB"))
+    np.testing.assert_array_equal(part.mesh.texture, image)
+    np.testing.assert_allclose(np.ptp(part.mesh.vertices, axis=0), reference.extents, atol=1e-9)
+    ours = np.concatenate([part.mesh.vertices, part.mesh.uv], axis=1)[part.mesh.faces]
+    area = reference.area_faces > 1e-12 * np.square(reference.extents).sum()
+    theirs = np.concatenate([reference.vertices, reference.visual.uv], axis=1)[reference.faces]
+    np.testing.assert_allclose(_sorted(ours), _sorted(theirs[area]), atol=1e-9)
+
+
+def _sorted(triangles: np.ndarray) -> np.ndarray:
+    rows = np.round(triangles.reshape(len(triangles), -1), 9)
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+def test_every_ycb_object_has_all_its_points_and_a_sane_size(ycb_root: Path) -> None:
+    names = sorted(path.name for path in (ycb_root / "models").iterdir() if path.is_dir())
+    assert len(names) == 21
+    for name in names:
+        part = ycb_part(ycb_root, name)
+        points = np.loadtxt(ycb_root / "models" / name / "points.xyz")
+        np.testing.assert_array_equal(part.points, points)
+        assert (part.mesh is not None) == (name in TEXTURED)
+        assert 0.08 < part.diameter < 0.3
+        # The points were drawn from the model, so both have about the same box.
+        assert (points.min(axis=0) > part.cuboid.min(axis=0) - 0.004).all()
+        assert (points.max(axis=0) < part.cuboid.max(axis=0) + 0.004).all()
+        # The model frame's origin lies near the middle, but is not the box centre.
+        assert np.abs(part.cuboid[8]).max() < 0.15 * part.diameter
+
+
+@pytest.fixture
+def copied_root(ycb_root: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "models" / "009_gelatin_box"
+    folder.mkdir(parents=True)
+    for path in (ycb_root / "models" / "009_gelatin_box").iterdir():
+        shutil.copyfile(path, folder / path.name)
+    return tmp_path
+
+
+def test_an_unknown_object_lists_the_known_ones(copied_root: Path) -> None:
+    for name in ("009_gelatin", "../models/009_gelatin_box", "", "*"):
+        with pytest.raises(UserError, match=r"unknown object .*; allowed: 009_gelatin_box; "):
+            ycb_part(copied_root, name)
+
+
+def test_a_folder_that_is_no_ycb_video_is_refused(tmp_path: Path) -> None:
+    for root in (tmp_path, tmp_path / "gone"):
+        with pytest.raises(UserError, match=r"no models/NAME/points\.xyz; .*data\.root"):
+            ycb_part(root, "009_gelatin_box")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 x\n", "1 2 nan\n"], ids=repr
+)
+def test_damaged_points_are_refused(copied_root: Path, text: str) -> None:
+    path = copied_root / "models" / "009_gelatin_box" / "points.xyz"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"points\.xyz.*; allowed: lines of three finite numbers"):
+        ycb_part(copied_root, "009_gelatin_box")
+
+
+def test_a_broken_mesh_is_no_missing_mesh(copied_root: Path) -> None:
+    mesh_path = copied_root / "models" / "009_gelatin_box" / "textured.obj"
+    mesh_path.write_bytes(mesh_path.read_bytes()[:500_000])
+    with pytest.raises(UserError, match=r"textured\.obj"):
+        ycb_part(copied_root, "009_gelatin_box")
+    mesh_path.unlink()
+    assert ycb_part(copied_root, "009_gelatin_box").mesh is None

@@ -1,0 +1,169 @@
+"""The factory: a pure function of (seed, epoch, index), in any process and order, without torch."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.errors import UserError
+from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.parts.part import Part
+from dopepp.virtual import (
+    PRESETS,
+    Factory,
+    PhotoBackgrounds,
+    Preset,
+    ProceduralBackgrounds,
+    Rendered,
+)
+
+DIGEST = """
+import sys
+sys.path.insert(0, {folder!r})
+from test_factory import digest, make_factory
+factory = make_factory()
+print([digest(factory.render(epoch, index)) for epoch, index in {items!r}])
+"""
+
+
+def make_factory(seed: int = 7, preset: Preset | None = None) -> Factory:
+    return Factory([servoholder(), pivconnector()], preset or PRESETS["quickstart"], seed)
+
+
+def digest(rendered: Rendered) -> str:
+    content = hashlib.sha256()
+    for array in (
+        rendered.image, rendered.depth, rendered.instances, rendered.visible_fractions,
+        rendered.scene.K, *(item.T_cam_obj for item in rendered.scene.objects),
+    ):  # fmt: skip
+        content.update(np.ascontiguousarray(array).tobytes())
+    return content.hexdigest()
+
+
+def test_shapes_and_types() -> None:
+    rendered = make_factory().render(0, 0)
+    assert rendered.image.shape == (128, 128, 3)
+    assert rendered.image.dtype == np.uint8
+    assert rendered.depth.dtype == np.float32
+    assert rendered.instances.dtype == np.int16
+    assert rendered.visible_fractions.shape == (len(rendered.scene.objects),)
+    assert rendered.scene.objects[0].label in ("servoholder", "pivconnector")
+    np.testing.assert_array_equal(rendered.depth > 0, rendered.instances >= 0)
+    assert rendered.scene.keypoints(0).shape == (9, 2)
+    assert rendered.scene.targets == (0,)
+
+
+def test_a_distractor_has_no_keypoints() -> None:
+    factory = make_factory()
+    scene = next(s for s in (factory.scene(0, i) for i in range(20)) if len(s.objects) > 1)
+    assert scene.objects[1].label == "distractor"
+    with pytest.raises(ValueError, match="distractor"):
+        scene.keypoints(1)
+
+
+def test_same_bytes_in_another_process_and_order() -> None:
+    items = [(0, 0), (0, 1), (3, 1), (0, 12)]
+    factory = make_factory()
+    expected = [digest(factory.render(*item)) for item in reversed(items)][::-1]
+    script = DIGEST.format(folder=str(Path(__file__).parent), items=items)
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == str(expected)
+    assert len(set(expected)) == len(items)
+
+
+def test_a_pickled_factory_renders_the_same() -> None:
+    factory = make_factory()
+    copy = pickle.loads(pickle.dumps(factory))
+    assert digest(copy.render(2, 5)) == digest(factory.render(2, 5))
+
+
+def test_seed_epoch_and_index_all_matter() -> None:
+    digests = {
+        digest(make_factory(seed).render(epoch, index))
+        for seed in (0, 1) for epoch in (0, 1) for index in (0, 1)
+    }  # fmt: skip
+    assert len(digests) == 8
+
+
+def test_import_is_free_of_torch() -> None:
+    script = (
+        "import sys, dopepp.virtual; print([m for m in ('torch', 'lightning') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_wrong_factories_are_refused(box_part: Part) -> None:
+    preset = PRESETS["quickstart"]
+    with pytest.raises(UserError, match="at least one part"):
+        Factory([], preset, 0)
+    with pytest.raises(UserError, match="each with a name of its own"):
+        Factory([box_part, box_part], preset, 0)
+    with pytest.raises(UserError, match="part box without a mesh"):
+        Factory([replace(box_part, mesh=None)], preset, 0)
+    with pytest.raises(UserError, match="seed -1"):
+        Factory([box_part], preset, -1)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (33, 20), (128, 128), (640, 480), (97, 301)])
+def test_procedural_backgrounds_have_any_size(size: tuple[int, int]) -> None:
+    backgrounds = ProceduralBackgrounds()
+    for seed in range(12):
+        image = backgrounds.draw(np.random.default_rng(seed), *size)
+        assert image.shape == (size[1], size[0], 3)
+        assert image.dtype == np.uint8
+
+
+def test_procedural_backgrounds_are_varied() -> None:
+    backgrounds = ProceduralBackgrounds()
+    images = [backgrounds.draw(np.random.default_rng(seed), 64, 64) for seed in range(60)]
+    means = np.array([image.mean(axis=(0, 1)) for image in images])
+    assert means.std(axis=0).min() > 20
+    assert np.median([image.std() for image in images]) > 15
+
+
+def test_photo_backgrounds(tmp_path: Path) -> None:
+    # A photo that is red on the left and blue on the right, stored in OpenCV's BGR.
+    photo = np.zeros((60, 200, 3), np.uint8)
+    photo[:, :100, 2] = 200
+    photo[:, 100:, 0] = 200
+    (tmp_path / "deep").mkdir()
+    cv2.imwrite(str(tmp_path / "deep" / "a.png"), photo)
+    (tmp_path / "notes.txt").write_text("not a photo")
+    backgrounds = PhotoBackgrounds(tmp_path)
+    images = [backgrounds.draw(np.random.default_rng(seed), 32, 24) for seed in range(30)]
+    assert all(image.shape == (24, 32, 3) for image in images)
+    colours = {int(image[12, 16].argmax()) for image in images}
+    assert colours == {0, 2}
+    again = PhotoBackgrounds(tmp_path).draw(np.random.default_rng(3), 32, 24)
+    np.testing.assert_array_equal(again, images[3])
+
+
+def test_folders_without_photos_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no photo in the background folder"):
+        PhotoBackgrounds(tmp_path)
+    with pytest.raises(UserError, match="no photo in the background folder"):
+        PhotoBackgrounds(tmp_path / "missing")
+    (tmp_path / "broken.png").write_bytes(b"not an image")
+    with pytest.raises(UserError, match=r"broken\.png"):
+        PhotoBackgrounds(tmp_path).draw(np.random.default_rng(0), 32, 24)
+
+
+def test_real_photos(shared_data: Path) -> None:
+    factory = Factory(
+        [servoholder()], PRESETS["quickstart"], 0, PhotoBackgrounds(shared_data / "backgrounds")
+    )
+    rendered = factory.render(0, 1)
+    assert rendered.image[rendered.instances < 0].std() > 5

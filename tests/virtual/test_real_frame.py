@@ -1,0 +1,90 @@
+"""Rendering YCB models at a real frame's ground truth reproduces that frame's masks and depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from dopepp.geometry.camera import make_transform
+from dopepp.parts.mesh import ycb_part
+from dopepp.virtual import Material, Rendered, Scene, SceneObject, make_surface, render
+
+CLASSES = {2: "003_cracker_box", 4: "005_tomato_soup_can", 5: "006_mustard_bottle"}
+Frame = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def frame(ycb_root: Path) -> Frame:
+    stem = ycb_root / "data" / "0050" / "000003"
+    meta = loadmat(f"{stem}-meta.mat")
+    return {
+        "label": cv2.imread(f"{stem}-label.png", cv2.IMREAD_UNCHANGED),
+        "depth": cv2.imread(f"{stem}-depth.png", cv2.IMREAD_UNCHANGED)
+        / float(meta["factor_depth"].item()),
+        "colour": cv2.cvtColor(cv2.imread(f"{stem}-color.png"), cv2.COLOR_BGR2RGB),
+        "K": meta["intrinsic_matrix"].astype(np.float64),
+        "poses": meta["poses"].astype(np.float64),
+        "classes": meta["cls_indexes"].ravel(),
+    }
+
+
+@pytest.fixture(scope="module")
+def rendered(ycb_root: Path, frame: Frame) -> Rendered:
+    objects = []
+    for class_index, name in CLASSES.items():
+        part = ycb_part(ycb_root, name)
+        assert part.mesh is not None
+        pose = frame["poses"][..., frame["classes"].tolist().index(class_index)]
+        objects.append(
+            SceneObject(
+                make_surface(part.mesh), make_transform(pose[:, :3], pose[:, 3]),
+                Material((1.0, 1.0, 1.0), 0.8), part,
+            )
+        )  # fmt: skip
+    return render(Scene(frame["K"], np.zeros_like(frame["colour"]), tuple(objects)))
+
+
+@pytest.mark.parametrize(("index", "class_index"), list(enumerate(CLASSES)))
+def test_mask_and_depth(rendered: Rendered, frame: Frame, index: int, class_index: int) -> None:
+    mask, real = rendered.instances == index, frame["label"] == class_index
+    assert (mask & real).sum() / (mask | real).sum() > 0.85
+    known = mask & real & (frame["depth"] > 0)
+    assert np.median(np.abs(rendered.depth - frame["depth"])[known]) < 0.01
+
+
+def test_occlusion_order(rendered: Rendered) -> None:
+    # The bottle stands before the can and the box.
+    assert rendered.visible_fractions[2] > 0.99
+    assert (rendered.visible_fractions[:2] < 0.9).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_texture_is_upright(ycb_root: Path, rendered: Rendered, frame: Frame, axis: int) -> None:
+    scene = rendered.scene
+    part = scene.objects[0].part
+    assert part is not None
+    assert part.mesh is not None
+    assert part.mesh.uv is not None
+    uv = part.mesh.uv.copy()
+    uv[:, axis] = 1 - uv[:, axis]
+    flipped = replace(scene.objects[0], surface=make_surface(replace(part.mesh, uv=uv)))
+    wrong = render(replace(scene, objects=(flipped, *scene.objects[1:])))
+    box = (rendered.instances == 0) & (frame["label"] == 2)
+
+    def likeness(image: np.ndarray) -> float:
+        # Green tells the red box's print from its ground.
+        return float(np.corrcoef(image[box][:, 1], frame["colour"][box][:, 1])[0, 1])
+
+    assert likeness(rendered.image) > likeness(wrong.image) + 0.2
+
+
+def test_texture_is_rgb(rendered: Rendered, frame: Frame) -> None:
+    box = (rendered.instances == 0) & (frame["label"] == 2)
+    for image in (rendered.image, frame["colour"]):
+        red, _, blue = image[box].mean(axis=0)
+        assert red > 1.5 * blue
