@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Shaped
@@ -16,6 +16,10 @@ from jaxtyping import Shaped
 from dopepp.data.resize import resize_sample
 from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo
 from dopepp.errors import UserError
+
+_TEXT_LENGTH: Final = 64
+_LAST_LABEL: Final = 255
+"""Masks are kept as one uint8 map: 0 background, i + 1 instance i."""
 
 
 def _shared(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
@@ -33,27 +37,30 @@ class CachedSource:
     Args:
         source: The source to keep, of images of one size.
         input_size: (width, height) the images are shrunk to fit in, so no more than that is kept.
-        max_instances: Instances a slot has room for.
+        max_instances: Instances a slot has room for, at most 255.
 
     Raises:
+        ValueError: ``max_instances`` is too large, or an item does not fit into its slot.
         UserError: The cache would take more than half of the machine's memory.
     """
 
     def __init__(
         self, source: DescribedSource, input_size: tuple[int, int], max_instances: int = 8
     ) -> None:
+        if max_instances > _LAST_LABEL:
+            raise ValueError(f"max_instances={max_instances} is more than {_LAST_LABEL}")
         self._source, self._input_size, self._max_instances = source, input_size, max_instances
         self.name = source.name
         first = resize_sample(source.sample(0, 0), input_size)
         self._source_name = first.source
-        shape = first.image.shape[:2]
+        self._shape = shape = first.image.shape[:2]
         instance = np.dtype(
             [
                 ("T_cam_obj", "f8", (4, 4)),
                 ("keypoints", "f8", (9, 2)),
                 ("visible_fraction", "f8"),
                 ("has_mask", "?"),
-                ("label", "U64"),
+                ("label", f"U{_TEXT_LENGTH}"),
             ]
         )
         slot = np.dtype(
@@ -61,7 +68,7 @@ class CachedSource:
                 ("image", "u1", (*shape, 3)),
                 ("labels", "u1", shape),
                 ("K", "f8", (3, 3)),
-                ("key", "U64"),
+                ("key", f"U{_TEXT_LENGTH}"),
                 ("num_instances", "i4"),
                 ("instances", instance, (max_instances,)),
             ]
@@ -96,11 +103,8 @@ class CachedSource:
         ]
 
     def _store(self, index: int, sample: Sample) -> None:
+        self._check(sample)
         slot = self._slots[index]
-        if len(sample.instances) > self._max_instances:
-            raise ValueError(
-                f"{len(sample.instances)} instances; max_instances={self._max_instances}"
-            )
         slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
         labels = np.zeros(sample.image.shape[:2], np.uint8)
         for number, instance in enumerate(sample.instances):
@@ -112,6 +116,20 @@ class CachedSource:
                 labels[instance.mask] = number + 1
         slot["labels"], slot["num_instances"] = labels, len(sample.instances)
         self._ready[index] = True
+
+    def _check(self, sample: Sample) -> None:
+        """Refuse what a slot would cut off or mix up without a word."""
+        if len(sample.instances) > self._max_instances:
+            raise ValueError(
+                f"{len(sample.instances)} instances; max_instances={self._max_instances}"
+            )
+        if sample.image.shape[:2] != self._shape or sample.source != self._source_name:
+            raise ValueError(
+                f"a {sample.size} image of {sample.source}; a cache keeps one size and one source"
+            )
+        texts = [sample.key, *(instance.label for instance in sample.instances)]
+        if max(map(len, texts)) > _TEXT_LENGTH:
+            raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")
 
     def _load(self, index: int) -> Sample:
         slot = self._slots[index]

@@ -130,9 +130,15 @@ class PoseLoader(DataLoader[Any]):
         self._epoch_sampler.skip_once(self._num_batches * self.batch_size)
         for batch in super().__iter__():
             if isinstance(batch, UserError):
-                raise batch
+                break
             self._num_batches += 1
             yield batch
+        else:
+            return
+        # The workers end here, in order. Left to the exception's traceback, which holds them in a
+        # reference cycle, the collector would close their queues first and then wait for them.
+        self._iterator = None
+        raise batch
 
     def state_dict(self) -> dict[str, int]:
         """Return how many batches of this pass were handed out; Lightning stores it."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,12 +37,9 @@ def resize_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample
-    shrinks = box.scale_x < 1
-    # INTER_AREA averages all source pixels when shrinking and would repeat them when enlarging.
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return replace(
         sample,
-        image=cv2.resize(sample.image, (box.width, box.height), interpolation=method),
+        image=box.image(sample.image),
         K=box.camera(sample.K),
         depth=None if sample.depth is None else nearest(sample.depth, box.width, box.height),
         instances=[_resize_instance(instance, box) for instance in sample.instances],

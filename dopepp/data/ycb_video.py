@@ -16,31 +16,18 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
 from dopepp.data.draws import Purpose, item_rng
-from dopepp.data.images import read_image
 from dopepp.data.rendered import background_identity
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.silhouette import hull_areas
+from dopepp.data.ycb_frame import read_frame
 from dopepp.data.ycb_layout import FOLDERS, Subset, read_classes, read_image_set
-from dopepp.data.ycb_meta import FrameMeta, read_meta
+from dopepp.data.ycb_meta import read_meta
 from dopepp.errors import UserError
-from dopepp.geometry.camera import (
-    camera_matrix,
-    check_camera,
-    project,
-    project_keypoints,
-    transform,
-)
+from dopepp.geometry.camera import project, project_keypoints, transform
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
-
-_FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
-_CAMERAS: Final = (
-    camera_matrix(1066.778, 1067.487, 312.9869, 241.3109),
-    camera_matrix(1077.836, 1078.189, 323.7872, 279.6921),
-)
-"""The data set's two colour cameras: scenes 0000–0059 and data_syn, scenes 0060–0091."""
 
 _MAX_COUNTED_FRAMES: Final = 1000
 """Reading this many meta.mat files takes about a second."""
@@ -134,57 +121,17 @@ class YcbVideoSource:
             UserError: A file is missing or damaged, sizes differ, or a pose or K is impossible.
         """
         frame = self.frames[index]
-        image, label = self._image(frame, "color.png"), self._image(frame, "label.png")
-        meta = read_meta(self._path(frame, "meta.mat"))
-        depth = self._depth(frame, meta, image) if self._read_depth else None
-        self._check_size(frame, image, "label.png", label)
-        size = (image.shape[1], image.shape[0])
-        K = check_camera(self._camera(frame, meta), size, f"{self.name}/{frame}")
+        raw = read_frame(self.root, self.subset, frame, self._read_depth)
         instances = [
-            self._instance(part, meta.poses[class_index], K, label == class_index)
+            self._instance(part, raw.poses[class_index], raw.K, raw.label == class_index)
             for class_index, part in self._parts.items()
-            if class_index in meta.poses
+            if class_index in raw.poses
         ]
-        return Sample(self._rgb(image, frame, epoch), K, instances, depth, self.name, frame)
+        image = self._rgb(raw.image, frame, epoch)
+        return Sample(image, raw.K, instances, raw.depth, self.name, frame)
 
     def _path(self, frame: str, what: str) -> Path:
         return self.root / FOLDERS[self.subset] / f"{frame}-{what}"
-
-    def _image(self, frame: str, what: str) -> NDArray[Any]:
-        path = self._path(frame, what)
-        image = read_image(path)
-        if what == "color.png":
-            alpha = self.subset == "synthetic"
-            fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 + alpha
-            allowed = f"8 bits and {3 + alpha} channels"
-        else:
-            fits, allowed = image.ndim == 2, "one channel"
-        if not fits:
-            got = f"image {path} of shape {image.shape}, {image.dtype}"
-            raise UserError(got, allowed, "copy or download the file again")
-        return image
-
-    def _check_size(self, frame: str, image: NDArray[Any], what: str, other: NDArray[Any]) -> None:
-        if other.shape[:2] != image.shape[:2]:
-            raise UserError(
-                f"{self._path(frame, what)} of {other.shape[1]}×{other.shape[0]} for a colour "
-                f"image of {image.shape[1]}×{image.shape[0]}",
-                "images of one frame of the same size",
-                "copy or download the frame again",
-            )
-
-    def _depth(
-        self, frame: str, meta: FrameMeta, image: NDArray[Any]
-    ) -> Float[np.ndarray, "height width"]:
-        depth = self._image(frame, "depth.png")
-        self._check_size(frame, image, "depth.png", depth)
-        return np.asarray(depth / np.float32(meta.factor_depth), np.float32)
-
-    def _camera(self, frame: str, meta: FrameMeta) -> Float[np.ndarray, "3 3"]:
-        if meta.K is not None:
-            return meta.K
-        scene = 0 if self.subset == "synthetic" else int(frame.partition("/")[0])
-        return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]
 
     def _rgb(
         self, image: NDArray[Any], frame: str, epoch: int

@@ -6,14 +6,17 @@ Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted.
 from __future__ import annotations
 
 import difflib
+import inspect
 import logging
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import yaml
+from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -41,7 +44,12 @@ def run_job(config: DictConfig, job: Job) -> None:
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
-        job(_plain(config), run_dir)
+        try:
+            job(_plain(config), run_dir)
+        except UserError as error:  # here, because Hydra would print a stack before handing it on
+            _exit(str(error), USERS_MISTAKE)
+        except OmegaConfBaseException as error:
+            _exit(_explain(error, None), USERS_MISTAKE)
         return
     try:
         plain = _plain(config)
@@ -77,16 +85,17 @@ def entry(main: Callable[[], None]) -> None:
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    logging.getLogger("dopepp").setLevel(logging.INFO)
+    # Lightning's own lines say again, and less exactly, what this package says.
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     sys.argv = [sys.argv[0], *_resumed(sys.argv[1:])]
     try:
         main()
     except KeyboardInterrupt:
         _exit("interrupted", INTERRUPTED)
-    except UserError as error:
-        _exit(str(error), USERS_MISTAKE)
     except (HydraException, OmegaConfBaseException) as error:
-        _exit(_explain(error), USERS_MISTAKE)
+        config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
+        _exit(_explain(error, config_dir), USERS_MISTAKE)
 
 
 def _exit(line: str, code: int) -> None:
@@ -104,21 +113,21 @@ def _resumed(arguments: list[str]) -> list[str]:
     stored = run / ".hydra" / "overrides.yaml"
     if not stored.is_file():
         return arguments  # the run itself says what is wrong with the folder
-    overrides = [str(text) for text in OmegaConf.load(stored)]
+    overrides = [str(text) for text in yaml.safe_load(stored.read_text())]
     kept = [text for text in overrides if not text.startswith(("resume=", "hydra.run.dir="))]
     return [*kept, *arguments, f"hydra.run.dir={run}"]
 
 
-def _explain(error: Exception) -> str:
+def _explain(error: Exception, config_dir: Path | None) -> str:
     """Turn Hydra's or OmegaConf's message into one line with got, allowed and fix."""
-    text = " ".join(" ".join(str(part) for part in (error, error.__cause__ or "")).split())
+    text = " ".join(f"{error} {error.__cause__ or ''}".split())
     missing_key = re.search(r"Could not override '([^']+)'", text)
     if missing_key:
         key = missing_key.group(1)
         return str(
             UserError(
                 f"override {key!r}, which names no option",
-                "the options of `--cfg job`" + _nearest(key),
+                "the options of `--cfg job`" + _nearest(key, config_dir),
                 "check the spelling",
             )
         )
@@ -135,11 +144,18 @@ def _explain(error: Exception) -> str:
     return str(UserError(text, "overrides as `key=value`", "see `--help`"))
 
 
-def _nearest(key: str) -> str:
+def _nearest(key: str, config_dir: Path) -> str:
     """Name the option that was probably meant."""
-    options = [text.partition("=")[0] for text in _KNOWN_OPTIONS]
-    close = difflib.get_close_matches(key, options, n=1)
+    with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
+        names = [*_flat(compose("train")), *_flat(compose("evaluate"))]
+    close = difflib.get_close_matches(key, names, n=1)
     return f", nearest {close[0]}" if close else ""
 
 
-_KNOWN_OPTIONS: Final = ()
+def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    """Yield every option of a config in dotted form, groups included."""
+    for key in node:
+        yield f"{prefix}{key}"
+        child = node._get_node(key)
+        if isinstance(child, DictConfig) and not child._is_none():
+            yield from _flat(child, f"{prefix}{key}.")

@@ -44,17 +44,18 @@ def show_sources(rows: Sequence[SourceRow]) -> None:
 
 
 def show_report(report: Report) -> None:
-    """Print a row per object, each with its reference rows below it."""
-    headings = [column.heading for column in COLUMNS]
-    table = Table("object", "poses from", *headings, title=f"{report.num_images} test images")
-    names = [name for name in report.rows if name != MEAN or len(report.rows) > 2]
-    for name in names:
-        table.add_section()
-        for row in (report.rows[name], *(rows[name] for rows in report.references.values())):
-            own = row is report.rows[name]
-            cells = [column.text(row) for column in COLUMNS]
-            table.add_row(name if own else "", row.method, *cells, style="bold" if own else "dim")
-    console.print(table)
+    """Print a table per object: a line per measure, the reference rows beside the estimate."""
+    for name, row in report.rows.items():
+        if name == MEAN and len(report.rows) == 2:
+            continue
+        rows = [row, *(rows[name] for rows in report.references.values())]
+        table = Table("", title=f"{name}: {report.num_images} test images")
+        for number, one in enumerate(rows):
+            style = "bold" if number == 0 else "dim"
+            table.add_column(one.method, justify="right", style=style)
+        for column in COLUMNS:
+            table.add_row(column.heading, *(column.text(one) for one in rows))
+        console.print(table)
 
 
 def show_comparison(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
+import ctypes
+import sys
 import time
+from pathlib import Path
 from typing import Any, Final
 
 import torch
@@ -11,16 +13,19 @@ import torch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.models.network import PoseNetwork
 
-_PROBE_CHANNELS: Final = 64
-_PROBE_SIZE: Final = 64
-_PROBE_REPEATS: Final = 4
+# From glibc's malloc.h.
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_MAX: Final = -4
+
+_BF16_FLAGS: Final = frozenset({"amx_bf16", "avx512_bf16", "bf16"})
+"""x86's and Arm's names of the instruction sets."""
 
 
 def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
     """Return Lightning's precision and the reason for it.
 
-    ``auto`` takes bf16 where it is fast: on GPUs that have it and on CPUs where a probe convolution
-    runs faster in it than in float32.
+    ``auto`` takes bf16 where the hardware computes in it: elsewhere it is emulated and slower. The
+    choice depends on the hardware alone, not on a timing, so that a run can be repeated.
     """
     if asked != "auto":
         return asked, "as asked"
@@ -29,26 +34,30 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
         return ("bf16-mixed", "this GPU has bf16") if fast else ("32-true", "this GPU has no bf16")
     if accelerator != "cpu":
         return "32-true", f"bf16 is not probed on {accelerator}"
-    full, half = _probe(torch.float32), _probe(torch.bfloat16)
-    ratio = full / half
-    if ratio > 1:
-        return "bf16-mixed", f"bf16 is {ratio:.1f}× as fast as float32 on this CPU"
-    return "32-true", f"this CPU has no fast bf16 ({ratio:.1f}× float32): expect a longer run"
+    fast = _BF16_FLAGS & _cpu_flags()
+    if fast:
+        return "bf16-mixed", f"this CPU has bf16 arithmetic ({', '.join(sorted(fast))})"
+    return "32-true", "this CPU has no bf16 arithmetic: training takes about twice as long"
 
 
-def _probe(dtype: torch.dtype) -> float:
-    """Time a convolution, forward and backward; the fastest of a few, seconds."""
-    conv = torch.nn.Conv2d(_PROBE_CHANNELS, _PROBE_CHANNELS, 3, padding=1)
-    conv = conv.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    size = (4, _PROBE_CHANNELS, _PROBE_SIZE, _PROBE_SIZE)
-    images = torch.ones(size).to(memory_format=torch.channels_last)
-    fastest = float("inf")
-    for _ in range(_PROBE_REPEATS):
-        start = time.perf_counter()
-        with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
-            conv(images).float().square().mean().backward()
-        fastest = min(fastest, time.perf_counter() - start)
-    return fastest
+def keep_freed_memory() -> None:
+    """Let glibc reuse large blocks instead of returning them to the system after each operation.
+
+    By default every large tensor is mapped afresh, and on a CPU the page faults cost about a third
+    of a training step (see ``benchmarks/train_step.py``).
+    """
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_MMAP_MAX, 0)
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def _cpu_flags() -> set[str]:
+    """Return the instruction sets that Linux reports; nothing elsewhere."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    flags = [line.partition(":")[2] for line in lines if line.startswith(("flags", "Features"))]
+    return set(flags[0].split()) if flags else set()
 
 
 def estimate_training_s(
@@ -65,18 +74,16 @@ def estimate_training_s(
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
             stages = network(images)
-        torch.stack(
-            [tensor.float().mean() for stage in stages for tensor in stage]
-        ).sum().backward()
+        means = [tensor.float().mean() for stage in stages for tensor in stage]
+        torch.autograd.backward(torch.stack(means).sum())
         durations.append((time.perf_counter() - start) / len(images))
     network.zero_grad(set_to_none=True)
     start = time.perf_counter()
     items = min(3, len(datamodule.train_source))
-    for index in itertools.islice(range(items), items):
+    for index in range(items):
         datamodule.train_item(0, index)
     loading = (time.perf_counter() - start) / items / max(1, torch.get_num_threads())
-    per_epoch = len(datamodule.train_source)
-    num_images = per_epoch * trainer_config["max_epochs"]
+    num_images: int = len(datamodule.train_source) * trainer_config["max_epochs"]
     if trainer_config["max_steps"] > 0:
         num_images = min(num_images, trainer_config["max_steps"] * datamodule.batch_size)
     return (min(durations) + loading) * num_images

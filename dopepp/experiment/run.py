@@ -26,7 +26,7 @@ from dopepp.experiment.gates import (
     optimizer_factory,
     scheduler_factory,
 )
-from dopepp.experiment.hardware import choose_precision, estimate_training_s
+from dopepp.experiment.hardware import choose_precision, estimate_training_s, keep_freed_memory
 from dopepp.experiment.report import Report, measure
 from dopepp.experiment.sources import build_datamodule, build_parts, build_test_source
 from dopepp.inference.estimator import PoseEstimator
@@ -56,10 +56,11 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     """
     seed = int(config["seed"])
     seed_everything(seed, verbose=False)
-    display.show_config(config)
+    keep_freed_memory()
     parts = build_parts(config["data"])
     datamodule = build_datamodule(config["data"], parts, seed)
     datamodule.check_objects()
+    display.show_config(config)
     fingerprint = datamodule.fingerprint()
     record.write_config(run_dir, config)
     environment = record.environment(seed, fingerprint)
@@ -136,7 +137,7 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     loggers: list[Logger] = [MetricsTable(run_dir / "metrics.csv")]
     loggers += [
         GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir)))
-        for node in (config["logger"] or {}).values()
+        for node in config.get("logger", {}).values()
     ]
     return Trainer(
         **{**options, "accelerator": accelerator},

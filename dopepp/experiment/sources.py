@@ -48,14 +48,14 @@ def build_parts(data: Mapping[str, Any]) -> list[Part]:
             root.
     """
     if data["root"] is None:
-        if data["objects"] is not None:
-            raise UserError(
-                f"data.objects={data['objects']} without data.root",
-                "data.objects names objects of a YCB-Video folder, data.parts meshes",
-                "set data.root, or use data.parts",
-            )
-        return [load_part(name, data["unit"]) if _is_file(name) else load_part(name)
-                for name in data["parts"]]  # fmt: skip
+        for option in ("objects", "frames"):
+            if data[option] is not None:
+                raise UserError(
+                    f"data.{option}={data[option]} without data.root",
+                    f"data.{option} names {option} of a YCB-Video folder; data.parts names meshes",
+                    "set data.root, or use data.parts",
+                )
+        return [load_part(name, data["unit"]) for name in data["parts"]]
     root = Path(data["root"])
     classes = read_classes(root)
     names = PAPER_OBJECTS if data["objects"] is None else data["objects"]
@@ -65,10 +65,6 @@ def build_parts(data: Mapping[str, Any]) -> list[Part]:
             f"data.objects with {unknown[0]!r}", ", ".join(classes), "choose from this list"
         )
     return [ycb_part(root, name) for name in names]
-
-
-def _is_file(name: str) -> bool:
-    return bool(Path(name).suffix)
 
 
 def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> PoseDataModule:
@@ -112,8 +108,8 @@ def _train_source(
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
     if data["root"] is not None and data["real_fraction"] > 0:
-        image_set = data["image_sets"]["train"]
-        real = YcbVideoSource(Path(data["root"]), parts, image_set, seed=seed, read_depth=False)
+        real = _real_source(data, parts, seed, "train")
+        real = CachedSource(real, input_size) if _cached(data) else real
     elif data["real_fraction"] > 0:
         if data["real_fraction"] == 1:
             raise UserError(
@@ -157,13 +153,31 @@ def _virtual_train(
     data: Mapping[str, Any], parts: Sequence[Part], seed: int, input_size: tuple[int, int]
 ) -> DescribedSource:
     """Render at the size the network sees, which costs a fraction of the native one."""
-    if data["cache"] not in CACHES:
-        raise UserError(f"data.cache={data['cache']}", " or ".join(CACHES), "choose one of them")
     preset = _preset(data)
     box = Letterbox.fit((preset.width, preset.height), input_size)
     factory = Factory(parts, preset.resized(box.width, box.height), seed, _backgrounds(data))
     source = RenderedSource(factory, data["samples_per_epoch"])
-    return CachedSource(source, input_size) if data["cache"] == "memory" else source
+    return CachedSource(source, input_size) if _cached(data) else source
+
+
+def _cached(data: Mapping[str, Any]) -> bool:
+    if data["cache"] not in CACHES:
+        raise UserError(f"data.cache={data['cache']}", " or ".join(CACHES), "choose one of them")
+    return bool(data["cache"] == "memory")
+
+
+def _real_source(
+    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+) -> DescribedSource:
+    """Open an image set of real frames, or the listed frames, the same for every split."""
+    chosen = (
+        {"image_set": data["image_sets"][split]}
+        if data["frames"] is None
+        else {"frames": data["frames"]}
+    )
+    return YcbVideoSource(
+        Path(data["root"]), parts, seed=seed, read_depth=split == "test", **chosen
+    )
 
 
 def _held_out_source(
@@ -171,8 +185,7 @@ def _held_out_source(
 ) -> DescribedSource:
     """Open a real image set where there is a root, else a range of renders that no other uses."""
     if data["root"] is not None:
-        image_set = data["image_sets"][split]
-        return YcbVideoSource(Path(data["root"]), parts, image_set, seed=seed)
+        return _real_source(data, parts, seed, split)
     factory = Factory(parts, _preset(data), seed, _backgrounds(data))
     return RenderedSource(factory, data[f"num_{split}"], split)
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from dopepp.errors import UserError
 
@@ -38,9 +39,9 @@ def project(
     """Project camera-frame points (metres) to pixels; points at or behind the camera become NaN."""
     points_cam = np.asarray(points_cam, np.float64)
     depth = points_cam[..., 2:]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         rays = np.where(depth > 0, points_cam / depth, np.nan)
-    return np.asarray((rays @ np.asarray(K, np.float64).T)[..., :2])
+        return np.asarray((rays @ np.asarray(K, np.float64).T)[..., :2])
 
 
 def project_keypoints(
@@ -105,6 +106,16 @@ class Letterbox:
         height = min(input_size[1], max(1, round(image_size[1] * scale)))
         return cls(width, height, width / image_size[0], height / image_size[1])
 
+    def image(
+        self, image: UInt8[np.ndarray, "rows columns 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Resize an RGB image into the letterbox, without the padding."""
+        if (image.shape[1], image.shape[0]) == (self.width, self.height):
+            return image
+        # INTER_AREA averages all source pixels when shrinking and would repeat them when enlarging.
+        method = cv2.INTER_AREA if self.scale_x < 1 else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(image, (self.width, self.height), interpolation=method))
+
     def camera(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
         """Return K for the letterboxed image."""
         return resize_camera(K, self.scale_x, self.scale_y)
@@ -129,11 +140,15 @@ def check_camera(
         UserError: K is not a finite pinhole matrix, its principal point lies outside the image, or
             its focal length gives a field of view outside 5° – 150°.
     """
-    K = np.asarray(K, np.float64)
     width, height = image_size
     pinhole = "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-    if K.shape != (3, 3) or not np.isfinite(K).all() or np.abs(K[2] - [0, 0, 1]).max() > 1e-6:
-        raise UserError(f"K {K.tolist()} of {source}", pinhole, "pass the camera's own K")
+    try:
+        matrix = np.array(K, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not _is_pinhole(matrix):
+        raise UserError(f"K {K!r:.200} of {source}", pinhole, "pass the camera's own K")
+    K = matrix
     fits = 0 <= K[0, 2] < width and 0 <= K[1, 2] < height
     # 5° and 150° of view are focal lengths of 11.5 and 0.13 image widths.
     longest = max(width, height)
@@ -145,3 +160,9 @@ def check_camera(
             "pass the K of this image size (K scales with the image)",
         )
     return K
+
+
+def _is_pinhole(K: Float[np.ndarray, "3 3"]) -> bool:
+    """Tell whether what must be 0 or 1 is so, within the digits of a calibration file."""
+    fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])
+    return bool(np.nanmax(np.abs(K - fixed)) <= 1e-6)

@@ -7,7 +7,7 @@ pose is NaN, behind the camera or at a wild distance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
 
@@ -15,18 +15,27 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.geometry.camera import make_transform, project, transform
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.refine import GATE, Correspondences, refine
 from dopepp.geometry.rotation import is_rotation, rotation_vector_to_matrix
 
 MIN_POINTS: Final = 4
-GATE: Final = 3.0
-"""Points beyond this many standard deviations are outliers (99.7 % of a Gaussian lies within)."""
 
 NUM_SUBSET_STARTS: Final = 3
 """How many of the poses from subsets are worth refining."""
 
 MAX_DISTANCE: Final = 500.0
 """Farthest believable pose in object sizes: with a focal length of 1,000 px that is 2 px wide."""
+
+MAX_TANGENT: Final = 1000.0
+"""Distance from the principal point in focal lengths: 89.9° off the axis, where no pixel is."""
+
+PLATE: Final = 0.3
+"""Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
+
+_NO_CAMERA: Final = np.eye(3)
+
+Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,8 @@ class PnPResult:
     Attributes:
         T_cam_obj: Object-to-camera transform in metres; None when there is no trustworthy pose.
         reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
-        inliers: Which of the given points agree with the pose within :data:`GATE`.
+        inliers: Which of the given points agree with the pose within
+            :data:`~dopepp.geometry.refine.GATE` standard deviations.
         reason: Why there is no pose; empty when there is one.
     """
 
@@ -57,198 +67,162 @@ def solve_pnp(
     Args:
         object_points: Points in the object frame, metres.
         image_points: Their pixels; a row with NaN is a missing point.
-        K: Camera matrix, pixels.
-        sigma_px: Standard deviation of each pixel position (isotropic), pixels.
+        K: Camera matrix, pixels; it may have skew.
+        sigma_px: Standard deviation of each pixel position (isotropic), pixels; a point whose
+            deviation is not finite and positive is missing.
 
     Returns:
         The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
-        mirror image and, where outliers show, SQPnP on all but one and all but two points.
-    """
-    object_points = np.asarray(object_points, np.float64)
-    image_points = np.asarray(image_points, np.float64)
-    sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), len(object_points))
-    usable = np.isfinite(object_points).all(1) & np.isfinite(image_points).all(1)
-    usable &= np.isfinite(sigma) & (sigma > 0)
-    none = np.zeros(len(object_points), bool)
-    reason = _degenerate(object_points[usable], image_points[usable])
-    if reason:
-        return PnPResult(None, np.inf, none, reason)
+        mirror image for a plate and, where outliers show, SQPnP on all but one and all but two.
 
-    points = _Correspondences(object_points[usable], image_points[usable], K, sigma[usable])
-    refined = [points.refine(start) for start in _starts(points)]
-    candidates = [T for T in refined if not points.implausible(T)]
-    if not candidates:
-        return PnPResult(None, np.inf, none, "no start led to a pose in front of the camera")
-    best = min(candidates, key=points.cost)
-    residuals = points.residuals_px(best)
-    agree = residuals <= GATE * points.sigma
+    Raises:
+        ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
+    """
+    object_points = np.asarray(object_points, np.float64).reshape(-1, 3)
+    image_points = np.asarray(image_points, np.float64).reshape(-1, 2)
+    if len(object_points) != len(image_points):
+        raise ValueError(
+            f"got {len(object_points)} object points, {len(image_points)} image points"
+        )
+    sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), len(object_points))
+    K = _checked_pinhole(K)
+    # Any number may come in and squares may overflow: what comes of it is looked at instead.
+    with np.errstate(all="ignore"):
+        rays = (image_points - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        usable = np.isfinite(object_points).all(1) & (np.abs(rays) < MAX_TANGENT).all(1)
+        usable &= np.isfinite(sigma) & (sigma > 0)
+        result = _solve(object_points[usable], rays[usable], K[:2, :2], sigma[usable])
+    inliers = np.zeros(len(usable), bool)
+    inliers[usable] = result.inliers
+    return replace(result, inliers=inliers)
+
+
+def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    K = np.asarray(K, np.float64)
+    proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and bool((K[2] == (0, 0, 1)).all())
+    if not proper or np.linalg.det(K) == 0:
+        raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
+    return K
+
+
+def _solve(
+    object_points: Float[np.ndarray, "n 3"],
+    rays: Float[np.ndarray, "n 2"],
+    to_px: Float[np.ndarray, "2 2"],
+    sigma: Float[np.ndarray, "n"],
+) -> PnPResult:
+    """Solve for points that are all there; rays are their (x/z, y/z)."""
+    nothing = PnPResult(None, np.inf, np.zeros(len(rays), bool))
+    reason = _degenerate(object_points, rays @ to_px.T, sigma)
+    if reason:
+        return replace(nothing, reason=reason)
+    centre, size = object_points.mean(0), float(np.linalg.norm(np.ptp(object_points, axis=0)))
+    points = Correspondences((object_points - centre) / size, rays, to_px, sigma)
+    best = _best_pose(points)
+    if best is None:
+        return replace(nothing, reason="no start led to a pose in front of the camera")
+    rotation, translation = best
+    residuals = np.linalg.norm(points.residuals(rotation[None], translation[None])[0], axis=-1)
+    agree = residuals <= GATE
     if agree.sum() < MIN_POINTS:
         reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
-        return PnPResult(None, np.inf, none, reason)
-    inliers = none.copy()
-    inliers[np.flatnonzero(usable)[agree]] = True
-    return PnPResult(best, float(np.sqrt(np.mean(residuals[agree] ** 2))), inliers)
+        return replace(nothing, reason=reason)
+    T = make_transform(rotation, size * translation - rotation @ centre)
+    return PnPResult(T, float(np.sqrt(np.mean((residuals * sigma)[agree] ** 2))), agree)
 
 
 def _degenerate(
-    object_points: Float[np.ndarray, "n 3"], image_points: Float[np.ndarray, "n 2"]
+    object_points: Float[np.ndarray, "n 3"],
+    image_points: Float[np.ndarray, "n 2"],
+    sigma: Float[np.ndarray, "n"],
 ) -> str:
     """Say why these points cannot fix a pose, or return an empty string."""
     if len(object_points) < MIN_POINTS:
-        return f"only {len(object_points)} points, {MIN_POINTS} are needed"
-    object_spread = np.linalg.svd(object_points - object_points.mean(0), compute_uv=False)
-    if object_spread[1] < 1e-6 * max(object_spread[0], 1e-12):
+        return f"only {len(object_points)} usable points, {MIN_POINTS} are needed"
+    extent = np.ptp(object_points, axis=0).max()
+    if not 1e-9 < extent < 1e9:
+        return f"the object points extend over {extent:.3g} m"
+    spread = np.linalg.svd((object_points - object_points.mean(0)) / extent, compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
         return "the object points lie on one line"
-    distinct = len(np.unique(np.round(image_points, 3), axis=0))
+    distinct = len({(x, y) for x, y in np.round(image_points, 3).tolist()})
     if distinct < MIN_POINTS:
         return f"only {distinct} distinct pixels, {MIN_POINTS} are needed"
-    image_spread = np.linalg.svd(image_points - image_points.mean(0), compute_uv=False)
-    if image_spread[1] < 1e-3 * image_spread[0]:
+    spread = np.linalg.svd(image_points - image_points.mean(0), compute_uv=False)
+    if spread[1] < 1e-3 * spread[0]:
         return "the pixels lie on one line"
+    if np.hypot(*spread) < np.median(sigma) * np.sqrt(len(image_points)):
+        return "the pixels spread no wider than their own noise"
     return ""
 
 
-class _Correspondences:
-    """Weighted correspondences with the robust cost that all candidate poses are judged by."""
+def _best_pose(points: Correspondences) -> Pose | None:
+    """Refine starts and return the plausible pose of the smallest truncated cost.
 
-    def __init__(
-        self,
-        object_points: Float[np.ndarray, "n 3"],
-        image_points: Float[np.ndarray, "n 2"],
-        K: Float[np.ndarray, "3 3"],
-        sigma: Float[np.ndarray, "n"],
-    ) -> None:
-        self.object_points, self.image_points = object_points, image_points
-        self.K, self.sigma = np.asarray(K, np.float64), sigma
-        self.size = float(np.linalg.norm(np.ptp(object_points, axis=0)))
-
-    def residuals_px(self, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n"]:
-        """Reprojection distance per point; infinite behind the camera."""
-        difference = project(transform(T, self.object_points), self.K) - self.image_points
-        distance = np.hypot(difference[:, 0], difference[:, 1])
-        return np.where(np.isfinite(distance), distance, np.inf)
-
-    def cost(self, T: Float[np.ndarray, "4 4"]) -> float:
-        """Truncated squared error in units of sigma (MSAC): an outlier costs the gate."""
-        return float(np.minimum((self.residuals_px(T) / self.sigma) ** 2, GATE**2).sum())
-
-    def implausible(self, T: Float[np.ndarray, "4 4"]) -> bool:
-        """Tell a broken pose: not finite, not a rotation, behind the camera or far too far."""
-        if not np.isfinite(T).all() or not is_rotation(T[:3, :3]):
-            return True
-        depth = transform(T, self.object_points)[:, 2]
-        return bool(depth.min() <= 0 or np.linalg.norm(T[:3, 3]) > MAX_DISTANCE * self.size)
-
-    def refine(self, T: Float[np.ndarray, "4 4"], steps: int = 15) -> Float[np.ndarray, "4 4"]:
-        """Minimise the Geman–McClure cost by damped Gauss–Newton on SE(3)."""
-        damping, value = 1e-4, self._robust_cost(T)
-        for _ in range(steps):
-            hessian, gradient = self._normal_equations(T)
-            if not np.isfinite(hessian).all():
-                return T
-            scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
-            step = -np.linalg.lstsq(scaled, gradient, rcond=None)[0]
-            moved = _exp(step, T)
-            new_value = self._robust_cost(moved)
-            if new_value < value:
-                converged = value - new_value < 1e-9 * value
-                T, value, damping = moved, new_value, damping / 10
-                if converged:
-                    break
-            elif damping > 1e6:
-                break
-            else:
-                damping *= 10
-        return T
-
-    def _robust_cost(self, T: Float[np.ndarray, "4 4"]) -> float:
-        squared = (self.residuals_px(T) / self.sigma) ** 2
-        with np.errstate(invalid="ignore"):
-            return float(np.where(np.isinf(squared), 1.0, squared / (squared + GATE**2)).sum())
-
-    def _normal_equations(
-        self, T: Float[np.ndarray, "4 4"]
-    ) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-        """Gauss–Newton system for a left increment (rotation vector, translation)."""
-        rotated = self.object_points @ T[:3, :3].T
-        x, y, z = (rotated + T[:3, 3]).T
-        fx, fy = self.K[0, 0], self.K[1, 1]
-        zero = np.zeros_like(z)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            by_point = np.stack(
-                [
-                    np.stack(
-                        [fx / z, zero + self.K[0, 1] / z, -(fx * x + self.K[0, 1] * y) / z**2], 1
-                    ),
-                    np.stack([zero, fy / z, -fy * y / z**2], 1),
-                ],
-                1,
-            )
-        # d(Exp(ω) p)/dω = −[p]×, so a row a of the Jacobian becomes −a [p]× = p × a.
-        by_rotation = np.cross(rotated[:, None, :], by_point)
-        jacobian = np.concatenate([by_rotation, by_point], axis=2)
-        residual = project(rotated + T[:3, 3], self.K) - self.image_points
-        squared = (residual**2).sum(1) / self.sigma**2
-        # Geman–McClure's weight: the derivative of r²/(r² + g²) with respect to r².
-        weight = GATE**2 / (squared + GATE**2) ** 2 / self.sigma**2
-        weighted = jacobian * weight[:, None, None]
-        return (
-            np.einsum("nij,nik->jk", weighted, jacobian),
-            np.einsum("nij,ni->j", weighted, residual),
-        )
-
-
-def _exp(
-    increment: Float[np.ndarray, "6"], T: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Rotate a pose about its own origin and shift it: the update of the normal equations."""
-    rotation = rotation_vector_to_matrix(increment[:3]) @ T[:3, :3]
-    return make_transform(rotation, T[:3, 3] + increment[3:])
-
-
-def _starts(points: _Correspondences) -> list[Float[np.ndarray, "4 4"]]:
-    """Return start poses: from all points, its mirror, and the best ones that leave outliers out.
-
-    Solving a subset costs a tenth of refining it, so all subsets are solved and few are refined.
+    All points are tried first; where not all of them agree on that pose, subsets are.
     """
-    everything = np.arange(len(points.object_points))
-    whole = _sqpnp(points, everything)
-    starts = [] if whole is None else [whole, _mirrored(whole)]
-    if whole is not None and (points.residuals_px(whole) <= GATE * points.sigma).all():
-        return starts
-    subsets = [
-        start
-        for left_out in (1, 2)
-        if len(everything) - left_out >= MIN_POINTS
-        for kept in combinations(everything, len(everything) - left_out)
-        for start in (_sqpnp(points, np.array(kept)),)
-        if start is not None
-    ]
-    return starts + sorted(subsets, key=points.cost)[:NUM_SUBSET_STARTS]
+    everything = list(range(len(points.rays)))
+    whole = _sqpnp(points, [everything])
+    normal = _thin_axis(points.object_points)
+    starts = [*whole, *(_mirrored(pose, normal) for pose in whole if normal is not None)]
+    best = _refined(points, starts)
+    if best and _costs(points, best)[1][0] == len(everything):
+        return best[0]
+    best += _refined(points, _subset_starts(points, everything))
+    return best[int(_costs(points, best)[0].argmin())] if best else None
 
 
-def _sqpnp(points: _Correspondences, kept: np.ndarray) -> Float[np.ndarray, "4 4"] | None:
-    """Solve a subset with OpenCV's SQPnP; None where it raises or returns no finite pose."""
-    object_points, image_points = points.object_points[kept], points.image_points[kept]
-    try:
-        found, rotation_vector, translation = cv2.solvePnP(
-            object_points, image_points, points.K, None, flags=cv2.SOLVEPNP_SQPNP
-        )
-    except cv2.error:  # OpenCV 5 raises on coincident points
-        return None
-    if not found or not np.isfinite(rotation_vector).all() or not np.isfinite(translation).all():
-        return None
-    rotation = rotation_vector_to_matrix(rotation_vector.ravel())
-    return make_transform(rotation, translation.ravel())
+def _refined(points: Correspondences, starts: list[Pose]) -> list[Pose]:
+    """Refine all starts together; return the plausible results, best first."""
+    if not starts:
+        return []
+    rotations, translations = (np.stack(block) for block in zip(*starts, strict=True))
+    refined = list(zip(*refine(points, rotations, translations), strict=True))
+    cost, _ = _costs(points, refined)
+    return [refined[k] for k in np.argsort(cost) if _plausible(points, refined[k])]
 
 
-def _mirrored(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def _subset_starts(points: Correspondences, everything: list[int]) -> list[Pose]:
+    """Return the best poses from all points but one and all points but two.
+
+    The second point to leave out is looked for only beside the best first ones: a pose without one
+    of two outliers is closer to the truth than a pose without neither.
+    """
+    singles = _solve_without(points, [{k} for k in everything])
+    pairs = {frozenset(out | {k}) for out, _ in singles[:NUM_SUBSET_STARTS] for k in everything}
+    doubles = _solve_without(points, sorted((pair for pair in pairs if len(pair) == 2), key=sorted))
+    solved = [pose for _, pose in singles + doubles]
+    if not solved:
+        return []
+    return [solved[k] for k in _costs(points, solved)[0].argsort()[:NUM_SUBSET_STARTS]]
+
+
+def _plausible(
+    points: Correspondences,
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, "3"],
+) -> bool:
+    """Tell a sound pose: finite, a rotation, all points in front and at a believable distance."""
+    if not is_rotation(rotation, tolerance=1e-6):
+        return False
+    depth = points.object_points @ rotation[2] + translation[2]
+    return bool((depth > 0).all() and np.linalg.norm(translation) <= MAX_DISTANCE)
+
+
+def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+    """Return the unit normal of a plate; None for a thicker part, which has no second tilt."""
+    _, extents, axes = np.linalg.svd(object_points - object_points.mean(0))
+    return axes[2] if extents[2] < PLATE * extents[0] else None
+
+
+def _mirrored(pose: Pose, normal: Float[np.ndarray, "3"]) -> Pose:
     """Return the other tilt under which a plate looks almost the same.
 
     Seen from far away, a plate tilted by +θ and by −θ about the same axis have the same image. The
-    second is the first reflected in the plane across the viewing ray, R' = S R diag(1, 1, −1) with
-    S = I − 2rrᵀ: two reflections, so a rotation. The plate's normal is the object's z axis.
+    second is the first reflected in the plane across the viewing ray r and, since a reflection is
+    no rotation, also in the plate's own plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
     """
-    ray = T[:3, 3] / np.linalg.norm(T[:3, 3])
-    reflection = np.eye(3) - 2 * np.outer(ray, ray)
-    return make_transform(reflection @ T[:3, :3] @ np.diag([1.0, 1.0, -1.0]), T[:3, 3])
+    rotation, translation = pose
+    ray = translation / np.linalg.norm(translation)
+    across = np.eye(3) - 2 * np.outer(ray, ray)
+    return across @ rotation @ (np.eye(3) - 2 * np.outer(normal, normal)), translation

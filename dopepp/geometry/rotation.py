@@ -13,10 +13,11 @@ def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> Float[np.nd
         ValueError: The quaternion is zero or not finite.
     """
     quaternion = np.asarray(quaternion_wxyz, np.float64)
-    norm = np.linalg.norm(quaternion)
-    if not np.isfinite(norm) or norm == 0.0:
+    largest = np.abs(quaternion).max()
+    if not np.isfinite(largest) or largest == 0.0:
         raise ValueError(f"a quaternion must be finite and non-zero, got {quaternion.tolist()}")
-    w, x, y, z = quaternion / norm
+    quaternion = quaternion / largest  # the square of a tiny or huge number is none
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -45,11 +46,16 @@ def matrix_to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray
     return quaternion if quaternion[0] >= 0 else -quaternion
 
 
-def rotation_vector_to_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_vector_to_matrix(
+    vector: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3 3"]:
     """Exponential map: rotate by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
-    x, y, z = vector
-    angle = float(np.sqrt(x * x + y * y + z * z))
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    vector = np.asarray(vector, np.float64)
+    x, y, z = np.moveaxis(vector, -1, 0)
+    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
+    skew = np.zeros((*vector.shape, 3))
+    skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0] = x, y, z
+    skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1] = -x, -y, -z
     # sinc(x/π) = sin(x)/x is exact at 0; (1 − cos)/x² = sinc²(x/2)/2 loses no digits near 0.
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2

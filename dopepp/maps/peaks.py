@@ -16,7 +16,8 @@ WINDOW: Final = 2
 """Half-width of the neighbourhood a peak is fitted to, cells."""
 
 FLOOR: Final = 1e-6
-"""Belief below which a cell says nothing; a peak of σ = 0.5 on the border needs its third column."""
+"""Belief below which a cell says nothing; a peak of σ = 0.5 at the border needs its
+third column."""
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,12 @@ class MetricsTable(Logger):
 
     @property
     def name(self) -> str:
-        """Name for Lightning."""
-        return "csv"
+        """Nothing, so that Lightning puts checkpoints into the run folder itself."""
+        return ""
 
     @property
     def version(self) -> str:
-        """Version for Lightning; the folder is the version."""
+        """Nothing, likewise."""
         return ""
 
     def forget_after(self, step: int) -> None:

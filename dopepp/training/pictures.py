@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import UInt8
 from lightning.pytorch import Trainer
@@ -14,8 +16,7 @@ def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height wi
     """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger) and logger.inner is not None:
-            inner, step = logger.inner, trainer.global_step
-            logger.guard(lambda inner=inner, step=step: _send(inner, name, image, step))
+            logger.guard(partial(_send, logger.inner, name, image, trainer.global_step))
 
 
 def _send(logger: Logger, name: str, image: UInt8[np.ndarray, "height width 3"], step: int) -> None:

@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from dopepp.data.batch import Batch
+from dopepp.data.batch import PADDING, Batch
 from dopepp.maps.encode import MapGeometry, encode
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
@@ -100,10 +101,15 @@ class PoseSystem(LightningModule):
     ) -> tuple[
         Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
     ]:
-        """Draw the batch's target maps on its own device."""
+        """Draw the batch's target maps on its own device.
+
+        What no metric counts, because it is hardly visible, is not asked of the network either.
+        """
         height, width = batch.images.shape[-2:]
         map_size = height // self.geometry.stride, width // self.geometry.stride
-        return encode(batch.keypoints, batch.object_index, len(self.parts), map_size, self.geometry)
+        seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
+        index = torch.where(seen, batch.object_index, PADDING)
+        return encode(batch.keypoints, index, len(self.parts), map_size, self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss and log it with its terms."""
@@ -113,7 +119,9 @@ class PoseSystem(LightningModule):
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         return loss  # type: ignore[no-any-return]
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
+    def validation_step(  # type: ignore[override]
+        self, batch: Batch, batch_idx: int
+    ) -> ValidationOutput:
         """Log the loss and hand the maps to the callbacks."""
         stages = self(batch.images)
         loss, _ = self.loss(stages, *self.targets(batch))

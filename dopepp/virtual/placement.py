@@ -16,8 +16,8 @@ from dopepp.errors import UserError
 from dopepp.geometry.camera import project
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 
-_CENTRING_STEPS: Final = 3
-"""Perspective moves a tilted part's box off its centre's image; so many tries bring it back."""
+_CENTRING_STEPS: Final = 4
+"""Perspective moves a tilted part's box off its centre's image; so many steps bring it back."""
 
 _MAX_STEPS: Final = 80
 _SHARE_TOLERANCE: Final = 1e-4
@@ -167,7 +167,7 @@ class DistancePlacement:
 
 @dataclass(frozen=True)
 class FillPlacement:
-    """The part fills a drawn share of the image and lies inside it, to a pixel or two.
+    """The part fills a drawn share of the image and lies inside it.
 
     The share is the larger of bounding-box width over image width and bounding-box height over
     image height. The distance follows from it by iteration.
@@ -199,18 +199,16 @@ class FillPlacement:
         """Return the object's origin in the camera frame, metres."""
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)
-        lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
-        centre, extent = (lower + upper) / 2, upper - lower
-        # The bounding box's image is placed; one that fills the image cannot move.
-        stretched = extent[:2] * (K[0, 0] / size[0], K[1, 1] / size[1])
-        room = 1 - share * stretched / stretched.max()
-        wanted = (0.5 + offset * room) * size - 0.5
-        pixel, hull = wanted, rotated_hull - centre
+        centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
+        pixel, hull = np.array(size) / 2 - 0.5, rotated_hull - centre
         for _ in range(_CENTRING_STEPS):
             ray = np.linalg.solve(K, [*pixel, 1.0])
             depth = _depth_that_fills(share, ray, K, size, hull)
             image = project(hull + depth * ray, K)
-            pixel = pixel + wanted - (image.min(axis=0) + image.max(axis=0)) / 2
+            lower, upper = image.min(axis=0), image.max(axis=0)
+            # The bounding box moves as far as it has room; one that fills the image cannot move.
+            wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
+            pixel = pixel + wanted - (lower + upper) / 2
         return np.asarray(depth * ray - centre)
 
 

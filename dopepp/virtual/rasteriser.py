@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int16, UInt8
 from dopepp.geometry.camera import resize_camera
 from dopepp.virtual.compiled import Array
 from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
-from dopepp.virtual.shading import LINEAR_TO_SRGB, SRGB_TO_LINEAR, shade
+from dopepp.virtual.shading import SRGB_TO_LINEAR, TONE_CURVE, shade
 from dopepp.virtual.visibility import (
     CENTRE_SAMPLE,
     PIXEL_SAMPLES,
@@ -195,7 +195,7 @@ def _shade_all(
             np.array([*material.colour, material.roughness, material.specular, material.noise,
                       1 / material.noise_pitch]),
             lights, ambient, light_map, K_light, T_light_cam, 1.5 * texel,
-            PIXEL_SAMPLES, SRGB_TO_LINEAR, LINEAR_TO_SRGB, colour,
+            PIXEL_SAMPLES, SRGB_TO_LINEAR, TONE_CURVE, colour,
         )  # fmt: skip
 
 

@@ -14,17 +14,29 @@ from numpy.typing import NDArray
 from dopepp.virtual.compiled import Array, compiled
 from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES
 
-SHOULDER = 0.5
-"""Radiance up to which the tone curve is linear; above, it bends smoothly towards 1."""
-
 _codes = np.arange(256) / 255.0
 SRGB_TO_LINEAR: NDArray[np.float32] = np.where(
     _codes <= 0.04045, _codes / 12.92, ((_codes + 0.055) / 1.055) ** 2.4
 ).astype(np.float32)
-_linear = np.arange(4097) / 4096.0
-LINEAR_TO_SRGB: NDArray[np.float32] = (
-    255 * np.where(_linear <= 0.0031308, 12.92 * _linear, 1.055 * _linear ** (1 / 2.4) - 0.055)
+TONE_STEPS = 4096
+"""Steps of the tone curve per unit of radiance."""
+
+TONE_LIMIT = 4.0
+"""Radiance at which the tone curve ends, white to 1/1000."""
+
+_SHOULDER = 0.5
+_radiance = np.arange(int(TONE_LIMIT) * TONE_STEPS + 1) / TONE_STEPS
+# Linear up to the shoulder; above, it bends smoothly towards 1, as a camera's curve does, so that
+# bright white parts keep their shading.
+_exposed = np.where(
+    _radiance <= _SHOULDER,
+    _radiance,
+    1 - (1 - _SHOULDER) * np.exp((_SHOULDER - _radiance) / (1 - _SHOULDER)),
+)
+TONE_CURVE: NDArray[np.float32] = (
+    255 * np.where(_exposed <= 0.0031308, 12.92 * _exposed, 1.055 * _exposed ** (1 / 2.4) - 0.055)
 ).astype(np.float32)
+"""Radiance in steps of 1/4096 to an sRGB value of 0–255."""
 
 
 @compiled(fastmath=True, inline="always")
@@ -140,7 +152,7 @@ def shade(
     shadow_bias: float,
     samples: Array,
     decode: Array,
-    encode: Array,
+    tone_curve: Array,
     colour: Array,
 ) -> None:
     """Add one object's light to the window's colour, weighted by the samples it covers.
@@ -172,8 +184,8 @@ def shade(
         T_light_cam: Camera frame to the first light's frame.
         shadow_bias: Metres by which a point is lifted along its normal before the shadow test.
         samples: Sample offsets, shape (S, 2).
-        decode: sRGB codes to linear light.
-        encode: Linear light in 1/4096 steps to sRGB 0–255.
+        decode: :data:`SRGB_TO_LINEAR`.
+        tone_curve: :data:`TONE_CURVE`.
         colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
     """
     last_id = first_id + faces.shape[0]
@@ -264,9 +276,5 @@ def shade(
                         light[3 + r] = share * lights[k, 3 + r]
                     _reflect(n, view, light, albedo, material[3], material[4], radiance)
                 for r in range(3):
-                    level = radiance[r]
-                    if level > SHOULDER:
-                        # A camera's shoulder: bright white parts keep their shading.
-                        rest = 1.0 - SHOULDER
-                        level = 1.0 - rest * math.exp((SHOULDER - level) / rest)
-                    colour[j, i, r] += count * encode[int(level * 4096.0 + 0.5)]
+                    step = int(min(radiance[r], TONE_LIMIT) * TONE_STEPS + 0.5)
+                    colour[j, i, r] += count * tone_curve[step]

@@ -91,6 +91,21 @@ def test_too_large_and_too_many_instances(fake_source: Any) -> None:
         CachedSource(fake_source(num_items=10**9), (64, 64))
     with pytest.raises(ValueError, match="max_instances=0"):
         CachedSource(fake_source(), (64, 64), max_instances=0)
+    with pytest.raises(ValueError, match="max_instances=256"):
+        CachedSource(fake_source(), (64, 64), max_instances=256)
+
+
+def test_what_does_not_fit_a_slot_is_refused(fake_source: Any) -> None:
+    with pytest.raises(ValueError, match="more than 64 characters"):
+        CachedSource(fake_source(label="x" * 65), (64, 64))
+    source = fake_source()
+    cached = CachedSource(source, (64, 64))
+    source.size = (48, 64)
+    with pytest.raises(ValueError, match="one size and one source"):
+        cached.sample(1)
+    source.size, source.name = (64, 48), "another"
+    with pytest.raises(ValueError, match="one size and one source"):
+        cached.sample(1)
 
 
 def test_describes_itself_as_cached(fake_source: Any) -> None:
