@@ -144,8 +144,10 @@ def _explain(error: Exception, config_dir: Path | None) -> str:
     return str(UserError(text, "overrides as `key=value`", "see `--help`"))
 
 
-def _nearest(key: str, config_dir: Path) -> str:
+def _nearest(key: str, config_dir: Path | None) -> str:
     """Name the option that was probably meant."""
+    if config_dir is None:
+        return ""
     with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
         names = [*_flat(compose("train")), *_flat(compose("evaluate"))]
     close = difflib.get_close_matches(key, names, n=1)
@@ -155,7 +157,7 @@ def _nearest(key: str, config_dir: Path) -> str:
 def _flat(node: DictConfig, prefix: str = "") -> Iterator[str]:
     """Yield every option of a config in dotted form, groups included."""
     for key in node:
-        yield f"{prefix}{key}"
+        yield f"{prefix}{key!s}"
         child = node._get_node(key)
         if isinstance(child, DictConfig) and not child._is_none():
-            yield from _flat(child, f"{prefix}{key}.")
+            yield from _flat(child, f"{prefix}{key!s}.")

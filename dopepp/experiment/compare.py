@@ -13,15 +13,21 @@ import numpy as np
 
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.png import write_whole
-from dopepp.experiment.display import show_comparison
-from dopepp.experiment.report import Report
+from dopepp.experiment import display
+from dopepp.experiment.report import FULL_SIZE_COST, Cost, Report
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, PoseRow
 
 BASELINE: Final = "dope"
 """A method of this name stands first, and every other one's Δ is against it."""
 
-_DELTAS: Final = ("add_01d", "auc_10cm")
+_WITH_DELTA: Final = ("add_01d", "auc_10cm")
+
+_SHOWN: Final = (
+    "method", "object", "ADD-0.1d %", "Δ ADD-0.1d %", "ADD<5cm %", "ADD<10cm %", "AUC[0,10cm] %",
+    "Δ AUC[0,10cm] %", "rotation °", "missed %", "parameters", "GMACs", "ms/frame",
+)  # fmt: skip
+"""What the terminal has room for; the files hold everything."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +52,10 @@ def compare(results: Sequence[Report | Failure], folder: Path, note: str = "") -
         note: A line below the table, e.g. that both networks were narrowed.
     """
     ordered = sorted(results, key=lambda result: result.name.split(" ")[0] != BASELINE)
-    header, rows = comparison_table(ordered)
-    show_comparison(header, rows)
-    write_whole(folder / "compare.csv", _csv(header, rows).encode())
-    write_whole(folder / "compare.md", _markdown(header, rows, note).encode())
+    table = comparison_table(ordered)
+    display.show_comparison([{key: row[key] for key in _SHOWN if key in row} for row in table])
+    write_whole(folder / "compare.csv", _csv(table).encode())
+    write_whole(folder / "compare.md", _markdown(table, note).encode())
     curves = {
         result.name: np.concatenate(list(result.errors.values()))
         for result in ordered
@@ -59,68 +65,88 @@ def compare(results: Sequence[Report | Failure], folder: Path, note: str = "") -
         save_accuracy_curves(folder / "compare_auc", curves, title="ADD, all objects")
 
 
-def comparison_table(
-    results: Sequence[Report | Failure],
-) -> tuple[list[str], list[list[str]]]:
-    """Return the header and a row per method and object; the first result is the baseline."""
-    measures = [column.heading for column in COLUMNS]
-    deltas = [f"Δ {column.heading}" for column in COLUMNS if column.field in _DELTAS]
-    header = ["method", "object", *deltas, *measures, "parameters", "GMACs", "ms/frame"]
+def comparison_table(results: Sequence[Report | Failure]) -> list[dict[str, str]]:
+    """Return a row per method and object, heading to text; the first result is the baseline.
+
+    The reference rows of the test set stand at the end.
+    """
     baseline = next((result for result in results if isinstance(result, Report)), None)
-    rows: list[list[str]] = []
+    table: list[dict[str, str]] = []
     for result in results:
         if isinstance(result, Failure):
-            rows.append([result.name, f"failed: {result.reason}", *[""] * (len(header) - 2)])
+            table.append({"method": result.name, "object": f"failed: {result.reason}"})
             continue
         for name, row in result.rows.items():
             if name == MEAN and len(result.rows) == 2:
                 continue
             other = None if result is baseline or baseline is None else baseline.rows.get(name)
-            rows.append([result.name, name, *_deltas(row, other), *_cells(row), *_cost(result)])
+            measures = _measures(row, other)
+            table.append({"method": result.name, "object": name, **measures, **_costs(result)})
     if baseline is not None:
         for reference, by_object in baseline.references.items():
             row = by_object[MEAN] if len(by_object) > 2 else next(iter(by_object.values()))
-            rows.append([reference, row.object, *[""] * len(deltas), *_cells(row), "", "", ""])
-    return header, rows
+            table.append({"method": reference, "object": row.object, **_measures(row, None)})
+    return table
 
 
-def _cells(row: PoseRow) -> list[str]:
-    return [column.text(row) for column in COLUMNS]
-
-
-def _deltas(row: PoseRow, other: PoseRow | None) -> list[str]:
-    """Return the differences to the baseline in percentage points; empty for itself."""
-    texts = []
+def _measures(row: PoseRow, baseline: PoseRow | None) -> dict[str, str]:
+    """Return a row's measures, the headline ones followed by their difference to the baseline."""
+    texts = {}
     for column in COLUMNS:
-        if column.field not in _DELTAS:
+        texts[column.heading] = column.text(row)
+        if column.field not in _WITH_DELTA:
             continue
         mine = getattr(row, column.field)
-        base = None if other is None else getattr(other, column.field)
-        if other is None:
-            texts.append("")
+        base = None if baseline is None else getattr(baseline, column.field)
+        if baseline is None:
+            difference = ""
         elif mine is None or base is None:
-            texts.append(NOT_AVAILABLE)
+            difference = NOT_AVAILABLE
         else:
-            texts.append(f"{(mine - base) * column.scale:+.{column.decimals}f}")
+            difference = f"{(mine - base) * column.scale:+.{column.decimals}f}"
+        texts[f"Δ {column.heading}"] = difference
     return texts
 
 
-def _cost(report: Report) -> list[str]:
-    cost = report.cost
+def _costs(report: Report) -> dict[str, str]:
+    """Return the cost in this run and, of a narrowed network, at full size beside it."""
+    texts = _cost(report.cost, "")
+    full = report.details.get(FULL_SIZE_COST)
+    return texts if full is None else {**texts, **_cost(Cost(**full), "full-size ")}
+
+
+def _cost(cost: Cost, prefix: str) -> dict[str, str]:
     ms = NOT_AVAILABLE if cost.ms_per_frame is None else f"{cost.ms_per_frame:.1f}"
-    return [f"{cost.parameters:,}", f"{cost.gmacs:.3f}", ms]
+    return {
+        f"{prefix}parameters": f"{cost.parameters:,}",
+        f"{prefix}GMACs": f"{cost.gmacs:.3f}",
+        f"{prefix}ms/frame": ms,
+    }
 
 
-def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _header(table: Sequence[dict[str, str]]) -> list[str]:
+    """Return all headings in the order of the fullest row."""
+    fullest = max(table, key=len)
+    return list(fullest)
+
+
+def _csv(table: Sequence[dict[str, str]]) -> str:
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    writer = csv.DictWriter(text, _header(table), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
     return text.getvalue()
 
 
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    table = "\n".join("| " + " | ".join(_escaped(cell) for cell in line) + " |" for line in lines)
-    return f"{table}\n\n{note}\n" if note else f"{table}\n"
+def _markdown(table: Sequence[dict[str, str]], note: str) -> str:
+    header = _header(table)
+    lines = [
+        header,
+        ["---"] * len(header),
+        *([row.get(key, "") for key in header] for row in table),
+    ]
+    text = "\n".join("| " + " | ".join(_escaped(cell) for cell in line) + " |" for line in lines)
+    return f"{text}\n\n{note}\n" if note else f"{text}\n"
 
 
 def _escaped(cell: str) -> str:

@@ -58,19 +58,24 @@ def show_report(report: Report) -> None:
         console.print(table)
 
 
-def show_comparison(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a comparison table."""
-    table = Table(*header, title="comparison")
+def show_comparison(rows: Sequence[Mapping[str, str]]) -> None:
+    """Print a comparison table of rows by heading; a row may lack columns."""
+    table = Table(title="comparison")
+    fullest = max(rows, key=len)
+    header = list(fullest)
+    for number, heading in enumerate(header):
+        table.add_column(heading, justify="left" if number < 2 else "right", overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(row.get(heading, "") for heading in header))
     console.print(table)
 
 
 def show_files(run_dir: Path) -> None:
     """Print what a run folder holds."""
-    table = Table("file", "bytes", title=f"run folder {run_dir}")
+    table = Table("file", "bytes")
     for path in sorted(run_dir.rglob("*")):
         hidden = any(part.startswith(".") for part in path.relative_to(run_dir).parts)
         if path.is_file() and not hidden:
             table.add_row(str(path.relative_to(run_dir)), f"{path.stat().st_size:,}")
+    console.print(f"run folder {run_dir}", soft_wrap=True)
     console.print(table)

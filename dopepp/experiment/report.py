@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from dopepp.data.sample import Sample
@@ -18,6 +19,10 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow
 from dopepp.models.cost import network_cost
+from dopepp.models.spec import build_network
+
+FULL_SIZE_COST: Final = "full_size_cost"
+"""Key of the details that holds what a narrowed network costs at full width and size."""
 
 _WARM_UP_FRAMES: Final = 3
 """The first frames allocate memory and choose kernels; they are not timed."""
@@ -153,3 +158,26 @@ def cost_of(estimator: PoseEstimator, times_ms: Sequence[float] = ()) -> Cost:
     parameters, gmacs = network_cost(estimator.network, estimator.checkpoint.input_size)
     timed = times_ms[_WARM_UP_FRAMES:] or times_ms
     return Cost(parameters, gmacs, statistics.median(timed) if timed else None)
+
+
+def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:
+    """Measure the untrained network of a spec at width 1: what narrowing has saved.
+
+    Args:
+        spec: The narrowed network's spec.
+        input_size: Input (width, height), pixels; the paper's is 416×416.
+        repeats: Timed forward passes after one that is not; the median counts.
+    """
+    widened = {
+        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
+        for key, node in spec.items()
+    }
+    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
+    times = []
+    with torch.inference_mode():
+        for _ in range(1 + repeats):
+            start = time.perf_counter()
+            network.maps(images)
+            times.append(1000 * (time.perf_counter() - start))
+    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))

@@ -27,7 +27,7 @@ from dopepp.experiment.gates import (
     scheduler_factory,
 )
 from dopepp.experiment.hardware import choose_precision, estimate_training_s, keep_freed_memory
-from dopepp.experiment.report import Report, measure
+from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost, measure
 from dopepp.experiment.sources import build_datamodule, build_parts, build_test_source
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.maps.encode import MapGeometry
@@ -41,6 +41,7 @@ from dopepp.training.system import PoseSystem
 
 _log = logging.getLogger(__name__)
 
+PAPER_INPUT_SIZE: Final = (416, 416)
 QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
 
 
@@ -188,9 +189,17 @@ def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> 
         path = run_dir / record.LAST_CHECKPOINT
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
-    name = str(config["model"]["name"])
+    details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
+    if config["model"]["width"] != 1.0:
+        cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
+        details[FULL_SIZE_COST] = vars(cost)
     return measure_and_record(
-        {name: estimator}, config["data"], int(config["seed"]), run_dir, num_pictures=12
+        {str(config["model"]["name"]): estimator},
+        config["data"],
+        int(config["seed"]),
+        run_dir,
+        num_pictures=12,
+        details=details,
     )[0]
 
 
@@ -200,6 +209,7 @@ def measure_and_record(
     seed: int,
     run_dir: Path,
     num_pictures: int,
+    details: Mapping[str, Any] | None = None,
 ) -> list[Report]:
     """Measure estimators on a test set; show and write tables, curves and pictures."""
     last = list(estimators.values())[-1]
@@ -207,6 +217,7 @@ def measure_and_record(
     source = build_test_source(data, parts, seed)
     samples = (source.sample(index, 0) for index in range(len(source)))
     reports, tiles = measure(estimators, samples, num_pictures)
+    reports[-1].details.update(details or {})
     for report in reports:
         display.show_report(report)
     record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
@@ -257,22 +268,22 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     loaded = [PoseEstimator.load(path, device) for path in paths]
     own = loaded[-1].checkpoint
     stored = own.data
-    data = stored.get("config") if config["data"] is None else config["data"]
+    data = config.get("data") or stored.get("config")
     if not isinstance(data, dict):
         raise UserError(
             f"{config['ckpt_path']}, which names no data", "data=… on the command line", "add it"
         )
-    names = _unique([str(one.checkpoint.data.get("name", "estimate")) for one in loaded], paths)
     record.write_config(run_dir, config)
     environment = record.environment(int(config["seed"]), own.data_fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     seed = int(stored.get("seed", config["seed"]))
-    estimators = dict(zip(names, loaded, strict=True))
+    estimators = dict(zip(_names(loaded), loaded, strict=True))
     return measure_and_record(estimators, data, seed, run_dir, config["num_pictures"])
 
 
-def _unique(names: list[str], paths: list[str]) -> list[str]:
-    """Tell two checkpoints of one model apart by their files."""
-    if len(set(names)) == len(names):
-        return names
-    return [f"{name} ({path})" for name, path in zip(names, paths, strict=True)]
+def _names(loaded: list[PoseEstimator]) -> list[str]:
+    """Return the models' names; of two with one name, the first is called the baseline."""
+    names = [str(one.checkpoint.data.get("name", "estimate")) for one in loaded]
+    if len(set(names)) < len(names):
+        names[0] += " (baseline)"
+    return names

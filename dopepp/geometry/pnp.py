@@ -7,8 +7,9 @@ pose is NaN, behind the camera or at a wild distance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Final
 
 import cv2
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.refine import GATE, Correspondences, refine
+from dopepp.geometry.refine import GATE, Correspondences, Poses, refine
 from dopepp.geometry.rotation import is_rotation, rotation_vector_to_matrix
 
 MIN_POINTS: Final = 4
@@ -27,6 +28,10 @@ NUM_SUBSET_STARTS: Final = 3
 MAX_DISTANCE: Final = 500.0
 """Farthest believable pose in object sizes: with a focal length of 1,000 px that is 2 px wide."""
 
+SMALLEST: Final = 1e-9
+LARGEST: Final = 1e9
+"""Extent of the object points, metres, outside of which they are no object."""
+
 MAX_TANGENT: Final = 1000.0
 """Distance from the principal point in focal lengths: 89.9° off the axis, where no pixel is."""
 
@@ -34,8 +39,6 @@ PLATE: Final = 0.3
 """Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
 
 _NO_CAMERA: Final = np.eye(3)
-
-Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
 @dataclass(frozen=True)
@@ -118,17 +121,17 @@ def _solve(
         return replace(nothing, reason=reason)
     centre, size = object_points.mean(0), float(np.linalg.norm(np.ptp(object_points, axis=0)))
     points = Correspondences((object_points - centre) / size, rays, to_px, sigma)
-    best = _best_pose(points)
-    if best is None:
+    poses = _best_first(points)
+    if not len(poses):
         return replace(nothing, reason="no start led to a pose in front of the camera")
-    rotation, translation = best
-    residuals = np.linalg.norm(points.residuals(rotation[None], translation[None])[0], axis=-1)
-    agree = residuals <= GATE
+    distance = np.linalg.norm(points.residuals(poses[:1])[0], axis=-1)
+    agree = distance <= GATE
     if agree.sum() < MIN_POINTS:
         reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
         return replace(nothing, reason=reason)
+    rotation, translation = poses.rotations[0], poses.translations[0]
     T = make_transform(rotation, size * translation - rotation @ centre)
-    return PnPResult(T, float(np.sqrt(np.mean((residuals * sigma)[agree] ** 2))), agree)
+    return PnPResult(T, float(np.sqrt(np.mean((distance * sigma)[agree] ** 2))), agree)
 
 
 def _degenerate(
@@ -139,8 +142,8 @@ def _degenerate(
     """Say why these points cannot fix a pose, or return an empty string."""
     if len(object_points) < MIN_POINTS:
         return f"only {len(object_points)} usable points, {MIN_POINTS} are needed"
-    extent = np.ptp(object_points, axis=0).max()
-    if not 1e-9 < extent < 1e9:
+    extent = float(np.ptp(object_points, axis=0).max())
+    if not SMALLEST < extent < LARGEST:
         return f"the object points extend over {extent:.3g} m"
     spread = np.linalg.svd((object_points - object_points.mean(0)) / extent, compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
@@ -156,73 +159,92 @@ def _degenerate(
     return ""
 
 
-def _best_pose(points: Correspondences) -> Pose | None:
-    """Refine starts and return the plausible pose of the smallest truncated cost.
+def _best_first(points: Correspondences) -> Poses:
+    """Return the plausible refined poses, the smallest truncated cost first.
 
-    All points are tried first; where not all of them agree on that pose, subsets are.
+    All points are tried together; only where they do not all agree on a pose, subsets are.
     """
-    everything = list(range(len(points.rays)))
-    whole = _sqpnp(points, [everything])
+    whole = _sqpnp(points, [()])
     normal = _thin_axis(points.object_points)
-    starts = [*whole, *(_mirrored(pose, normal) for pose in whole if normal is not None)]
-    best = _refined(points, starts)
-    if best and _costs(points, best)[1][0] == len(everything):
-        return best[0]
-    best += _refined(points, _subset_starts(points, everything))
-    return best[int(_costs(points, best)[0].argmin())] if best else None
+    if normal is not None:
+        whole += _mirrored(whole, normal)
+    poses = _refined(points, whole)
+    if len(poses) and (np.linalg.norm(points.residuals(poses[:1]), axis=-1) <= GATE).all():
+        return poses
+    poses += _refined(points, _subset_starts(points))
+    return poses[_truncated_cost(points, poses).argsort()]
 
 
-def _refined(points: Correspondences, starts: list[Pose]) -> list[Pose]:
+def _refined(points: Correspondences, starts: Poses) -> Poses:
     """Refine all starts together; return the plausible results, best first."""
-    if not starts:
-        return []
-    rotations, translations = (np.stack(block) for block in zip(*starts, strict=True))
-    refined = list(zip(*refine(points, rotations, translations), strict=True))
-    cost, _ = _costs(points, refined)
-    return [refined[k] for k in np.argsort(cost) if _plausible(points, refined[k])]
+    poses = refine(points, starts)
+    poses = poses[_plausible(points, poses)]
+    return poses[_truncated_cost(points, poses).argsort()]
 
 
-def _subset_starts(points: Correspondences, everything: list[int]) -> list[Pose]:
+def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, "s"]:
+    """Return the MSAC cost that poses are compared by: an outlier costs the gate."""
+    squared = (points.residuals(poses) ** 2).sum(-1)
+    return np.asarray(np.fmin(squared, GATE**2).sum(-1))
+
+
+def _plausible(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "s"]:
+    """Tell sound poses: rotations, all points in front of the camera, at a believable distance."""
+    depth = points.object_points @ poses.rotations[:, 2, :, None] + poses.translations[:, None, 2:]
+    near = np.linalg.norm(poses.translations, axis=-1) <= MAX_DISTANCE
+    proper = [is_rotation(rotation, tolerance=1e-6) for rotation in poses.rotations]
+    return np.asarray((depth > 0).all((1, 2)) & near & np.array(proper, bool))
+
+
+def _subset_starts(points: Correspondences) -> Poses:
     """Return the best poses from all points but one and all points but two.
 
-    The second point to leave out is looked for only beside the best first ones: a pose without one
-    of two outliers is closer to the truth than a pose without neither.
+    The second point to leave out is looked for beside the best first ones only: without one of two
+    outliers a pose is nearer to the truth than with both.
     """
-    singles = _solve_without(points, [{k} for k in everything])
-    pairs = {frozenset(out | {k}) for out, _ in singles[:NUM_SUBSET_STARTS] for k in everything}
-    doubles = _solve_without(points, sorted((pair for pair in pairs if len(pair) == 2), key=sorted))
-    solved = [pose for _, pose in singles + doubles]
-    if not solved:
-        return []
-    return [solved[k] for k in _costs(points, solved)[0].argsort()[:NUM_SUBSET_STARTS]]
+    count = len(points.rays)
+    singles = [(k,) for k in range(count)] if count > MIN_POINTS else []
+    poses = _sqpnp(points, singles)
+    if count > MIN_POINTS + 1:
+        first = _truncated_cost(points, poses).argsort()[:NUM_SUBSET_STARTS]
+        pairs = {(min(a, b), max(a, b)) for a in first.tolist() for b in range(count) if a != b}
+        poses += _sqpnp(points, sorted(pairs))
+    return poses[_truncated_cost(points, poses).argsort()[:NUM_SUBSET_STARTS]]
 
 
-def _plausible(
-    points: Correspondences,
-    rotation: Float[np.ndarray, "3 3"],
-    translation: Float[np.ndarray, "3"],
-) -> bool:
-    """Tell a sound pose: finite, a rotation, all points in front and at a believable distance."""
-    if not is_rotation(rotation, tolerance=1e-6):
-        return False
-    depth = points.object_points @ rotation[2] + translation[2]
-    return bool((depth > 0).all() and np.linalg.norm(translation) <= MAX_DISTANCE)
+def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Poses:
+    """Solve all points but some with OpenCV's SQPnP; NaN where it raises or finds no pose."""
+    solved = np.full((len(left_out), 2, 3), np.nan)
+    for pose, missing in zip(solved, left_out, strict=True):
+        kept = [k for k in range(len(points.rays)) if k not in missing]
+        with suppress(cv2.error):  # OpenCV 5 raises on coincident points
+            found, *vectors = cv2.solvePnP(
+                points.object_points[kept],
+                points.rays[kept],
+                _NO_CAMERA,
+                None,
+                flags=cv2.SOLVEPNP_SQPNP,
+            )
+            if found:
+                pose[:] = np.hstack(vectors).T
+    return Poses(rotation_vector_to_matrix(solved[:, 0]), solved[:, 1])
 
 
 def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """Return the unit normal of a plate; None for a thicker part, which has no second tilt."""
     _, extents, axes = np.linalg.svd(object_points - object_points.mean(0))
-    return axes[2] if extents[2] < PLATE * extents[0] else None
+    return np.asarray(axes[2]) if extents[2] < PLATE * extents[0] else None
 
 
-def _mirrored(pose: Pose, normal: Float[np.ndarray, "3"]) -> Pose:
+def _mirrored(poses: Poses, normal: Float[np.ndarray, "3"]) -> Poses:
     """Return the other tilt under which a plate looks almost the same.
 
     Seen from far away, a plate tilted by +θ and by −θ about the same axis have the same image. The
     second is the first reflected in the plane across the viewing ray r and, since a reflection is
     no rotation, also in the plate's own plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
     """
-    rotation, translation = pose
-    ray = translation / np.linalg.norm(translation)
-    across = np.eye(3) - 2 * np.outer(ray, ray)
-    return across @ rotation @ (np.eye(3) - 2 * np.outer(normal, normal)), translation
+    rays = poses.translations / np.linalg.norm(poses.translations, axis=-1, keepdims=True)
+    across = np.eye(3) - 2 * rays[:, :, None] * rays[:, None, :]
+    return Poses(
+        across @ poses.rotations @ (np.eye(3) - 2 * np.outer(normal, normal)), poses.translations
+    )
