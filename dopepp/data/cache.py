@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 import os
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -96,9 +97,7 @@ class CachedSource:
     def describe(self) -> list[SourceInfo]:
         """Return what the kept source describes, marked as cached: its epochs are all the same."""
         return [
-            SourceInfo(
-                info.name, info.num_images, {**info.identity, "cache": "memory"}, info.num_instances
-            )
+            replace(info, identity={**info.identity, "cache": "memory"})
             for info in self._source.describe()
         ]
 

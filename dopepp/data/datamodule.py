@@ -28,12 +28,14 @@ class SourceRow:
         split: ``train``, ``val`` or ``test``.
         source: The source's name.
         num_images: Images it holds.
+        num_per_epoch: Images it gives to an epoch.
         num_instances: Instances per object; empty where counting is not cheap.
     """
 
     split: str
     source: str
     num_images: int
+    num_per_epoch: int
     num_instances: dict[str, int]
 
 
@@ -151,7 +153,13 @@ class PoseDataModule(LightningDataModule):
     def summary(self) -> list[SourceRow]:
         """Return the sources of every split, for the start-up print."""
         return [
-            SourceRow(split, info.name, info.num_images, dict(info.num_instances))
+            SourceRow(
+                split,
+                info.name,
+                info.num_images,
+                info.num_images if info.num_per_epoch is None else info.num_per_epoch,
+                dict(info.num_instances),
+            )
             for split, source in self._splits().items()
             for info in source.describe()
         ]

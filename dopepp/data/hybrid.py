@@ -7,7 +7,7 @@ frames of a data set, e.g. YCB-Video's ``data_syn``, count as virtual.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -165,5 +165,5 @@ class HybridSource:
                 continue
             for info in source.describe():
                 identity = {**info.identity, "hybrid": {**mix, "role": role, "count": count}}
-                entries.append(SourceInfo(info.name, info.num_images, identity, info.num_instances))
+                entries.append(replace(info, identity=identity, num_per_epoch=count))
         return entries

@@ -85,12 +85,14 @@ class SourceInfo:
         identity: Everything that decides the items (file list, seed, preset, part hashes, …), as
             plain values that JSON can write.
         num_instances: Instances of each object, empty where counting them is not cheap.
+        num_per_epoch: Images it gives to an epoch; all of them unless a mix says otherwise.
     """
 
     name: str
     num_images: int
     identity: Mapping[str, object] = field(default_factory=dict)
     num_instances: Mapping[str, int] = field(default_factory=dict)
+    num_per_epoch: int | None = None
 
 
 class DescribedSource(Source, Protocol):

@@ -91,8 +91,8 @@ def entry(main: Callable[[], None]) -> None:
     sys.argv = [sys.argv[0], *_resumed(sys.argv[1:])]
     try:
         main()
-    except KeyboardInterrupt:
-        _exit("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as interrupt:
+        _exit(": ".join(["interrupted", *map(str, interrupt.args)]), INTERRUPTED)
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)

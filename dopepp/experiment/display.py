@@ -36,10 +36,11 @@ def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
 
 def show_sources(rows: Sequence[SourceRow]) -> None:
     """Print where the images come from and how many each source gives."""
-    table = Table("split", "source", "images", "instances", title="data")
+    table = Table("split", "source", "images", "per epoch", "instances", title="data")
     for row in rows:
         instances = ", ".join(f"{name} {count:,}" for name, count in row.num_instances.items())
-        table.add_row(row.split, row.source, f"{row.num_images:,}", instances or "one per render")
+        counts = (f"{row.num_images:,}", f"{row.num_per_epoch:,}")
+        table.add_row(row.split, row.source, *counts, instances or "in every render")
     console.print(table)
 
 
@@ -47,6 +48,12 @@ def show_report(report: Report) -> None:
     """Print a table per object: a line per measure, the reference rows beside the estimate."""
     for name, row in report.rows.items():
         if name == MEAN and len(report.rows) == 2:
+            continue
+        if row.num_instances == 0:
+            console.print(
+                f"{name}: n/a, no ground truth in the test set; "
+                f"{row.false_positives} false positives"
+            )
             continue
         rows = [row, *(rows[name] for rows in report.references.values())]
         table = Table("", title=f"{name}: {report.num_images} test images")

@@ -70,6 +70,7 @@ def estimate_training_s(
     width, height = datamodule.input_size
     images = torch.zeros(2, 3, height, width).to(memory_format=torch.channels_last)
     durations = []
+    network.eval()  # batch norm must not learn from these empty images
     for _ in range(2):
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
@@ -78,6 +79,7 @@ def estimate_training_s(
         torch.autograd.backward(torch.stack(means).sum())
         durations.append((time.perf_counter() - start) / len(images))
     network.zero_grad(set_to_none=True)
+    network.train()
     start = time.perf_counter()
     items = min(3, len(datamodule.train_source))
     for index in range(items):

@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import save_accuracy_curves
@@ -31,7 +32,7 @@ from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost, mea
 from dopepp.experiment.sources import build_datamodule, build_parts, build_test_source
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.checkpoint import Checkpoint, load_network, read
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.recovery.recover import RecoveryOptions
@@ -61,18 +62,23 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     parts = build_parts(config["data"])
     datamodule = build_datamodule(config["data"], parts, seed)
     datamodule.check_objects()
-    display.show_config(config)
     fingerprint = datamodule.fingerprint()
+    system = build_system(config, parts, fingerprint)
+    resume_from = _resume_path(config["resume"], system)
+    display.show_config(config)
     record.write_config(run_dir, config)
     environment = record.environment(seed, fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     display.show_sources(datamodule.summary())
 
-    system = build_system(config, parts, fingerprint)
     trainer = build_trainer(config, run_dir)
     _announce_duration(config, system, datamodule, trainer)
-    resume_from = _resume_path(config["resume"])
-    trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+    try:
+        trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+    except SystemExit as end:
+        if isinstance(end.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt(f"go on with resume={run_dir}") from end
+        raise
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
     return _measure_run(config, run_dir, trainer)
@@ -132,6 +138,8 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     accelerator = options["accelerator"]
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    elif accelerator == "gpu" and torch.cuda.is_available():
+        accelerator = "cuda"
     options["precision"], reason = choose_precision(options["precision"], accelerator)
     display.console.print(f"precision {options['precision']}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
@@ -140,17 +148,24 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
         GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir)))
         for node in config.get("logger", {}).values()
     ]
-    return Trainer(
-        **{**options, "accelerator": accelerator},
-        default_root_dir=run_dir,
-        logger=loggers,
-        callbacks=[*callbacks, TQDMProgressBar(refresh_rate=10)],
-        plugins=[AtomicCheckpointIO()],
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        # The DataModule's own sampler knows rank and epoch.
-        use_distributed_sampler=False,
-    )
+    try:
+        return Trainer(
+            **{**options, "accelerator": accelerator},
+            default_root_dir=run_dir,
+            logger=loggers,
+            callbacks=[*callbacks, TQDMProgressBar(refresh_rate=10)],
+            plugins=[AtomicCheckpointIO()],
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            # The DataModule's own sampler knows rank and epoch.
+            use_distributed_sampler=False,
+        )
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        raise UserError(
+            f"trainer {config['trainer']}, which Lightning refuses: {error}",
+            "values of Lightning's Trainer that this machine can run",
+            "correct the trainer's options",
+        ) from error
 
 
 def _announce_duration(
@@ -168,7 +183,8 @@ def _announce_duration(
     display.console.print(f"no accelerator: about {duration} to finish{advice}")
 
 
-def _resume_path(resume: str | None) -> Path | None:
+def _resume_path(resume: str | None, system: PoseSystem) -> Path | None:
+    """Return the interrupted run's checkpoint after checking that this run continues it."""
     if resume is None:
         return None
     path = Path(resume) / record.LAST_CHECKPOINT
@@ -177,6 +193,12 @@ def _resume_path(resume: str | None) -> Path | None:
             f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
+        )
+    if read(path).spec != system.payload["spec"]:
+        raise UserError(
+            f"resume={resume}, whose network differs from the chosen one",
+            "the model and the number of objects of that run",
+            "leave the model as it was, or start anew with init_from",
         )
     return path
 

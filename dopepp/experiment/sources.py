@@ -11,13 +11,14 @@ from typing import Any, Final
 from dopepp.data.cache import CachedSource
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.hybrid import HybridSource
-from dopepp.data.rendered import RenderedSource, Split
+from dopepp.data.rendered import MAX_ITEMS, RenderedSource, Split
 from dopepp.data.sample import DescribedSource
 from dopepp.data.ycb_layout import read_classes, read_image_set
 from dopepp.data.ycb_video import YcbVideoSource
 from dopepp.errors import UserError
 from dopepp.experiment.gates import AUGMENTATIONS, MASKINGS, build_optional
 from dopepp.geometry.camera import Letterbox
+from dopepp.models.gate import check_integer, check_number
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh import ycb_part
 from dopepp.parts.part import Part
@@ -39,6 +40,9 @@ PAPER_OBJECTS: Final = (
 
 CACHES: Final = ("none", "memory")
 
+MAX_WORKERS: Final = 1024
+"""More loader processes than any machine here has cores: a slip of the keyboard."""
+
 
 def build_parts(data: Mapping[str, Any]) -> list[Part]:
     """Build the objects to learn: YCB objects with a ``root``, else the listed parts.
@@ -47,6 +51,7 @@ def build_parts(data: Mapping[str, Any]) -> list[Part]:
         UserError: The root, an object or a part is wrong, or real frames are asked for without a
             root.
     """
+    _check_options(data)
     if data["root"] is None:
         for option in ("objects", "frames"):
             if data[option] is not None:
@@ -74,8 +79,7 @@ def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) 
         UserError: An option or a file is wrong.
     """
     backgrounds = _backgrounds(data)
-    input_size = (int(data["input_size"][0]), int(data["input_size"][1]))
-    _check_input_size(input_size)
+    input_size = (data["input_size"][0], data["input_size"][1])
     workers = data["num_workers"]
 
     return PoseDataModule(
@@ -200,10 +204,25 @@ def _backgrounds(data: Mapping[str, Any]) -> Backgrounds:
     return ProceduralBackgrounds() if folder is None else PhotoBackgrounds(Path(folder))
 
 
-def _check_input_size(input_size: tuple[int, int]) -> None:
-    if any(side < 32 or side % 32 for side in input_size):
+def _check_options(data: Mapping[str, Any]) -> None:
+    """Refuse lists and numbers of the wrong kind before anything is read or rendered."""
+    for name in ("objects", "parts", "frames"):
+        value = data[name]
+        if value is not None and not isinstance(value, list):
+            raise UserError(
+                f"data.{name}={value}", "a list, also of a single one", f"data.{name}=[{value}]"
+            )
+    for name in ("samples_per_epoch", "num_val", "num_test", "batch_size"):
+        check_integer(f"data.{name}", data[name], 1, MAX_ITEMS)
+    for name in ("real_fraction", "synthetic_fraction"):
+        check_number(f"data.{name}", data[name], 0, 1)
+    if data["num_workers"] is not None:
+        check_integer("data.num_workers", data["num_workers"], 0, MAX_WORKERS)
+    size = data["input_size"]
+    sides = size if isinstance(size, list) and len(size) == 2 else [0]
+    if not all(type(side) is int and side >= 32 and side % 32 == 0 for side in sides):
         raise UserError(
-            f"data.input_size={list(input_size)}",
+            f"data.input_size={size}",
             "[width, height], each a multiple of 32",
             "round up; images are letterboxed into it",
         )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Final
 
 import cv2
@@ -22,7 +23,10 @@ from dopepp.geometry.rotation import is_rotation, rotation_vector_to_matrix
 
 MIN_POINTS: Final = 4
 
-NUM_SUBSET_STARTS: Final = 3
+MOST_LEFT_OUT: Final = 2
+"""Outliers looked for by leaving points out; the robust cost bears more where these are mild."""
+
+NUM_STARTS: Final = 3
 """How many of the poses from subsets are worth refining."""
 
 MAX_DISTANCE: Final = 500.0
@@ -162,24 +166,23 @@ def _degenerate(
 def _best_first(points: Correspondences) -> Poses:
     """Return the plausible refined poses, the smallest truncated cost first.
 
-    All points are tried together; only where they do not all agree on a pose, subsets are.
+    All points are tried together, then all but one, then all but two, until as many agree.
     """
-    whole = _sqpnp(points, [()])
+    count = len(points.rays)
     normal = _thin_axis(points.object_points)
-    if normal is not None:
-        whole += _mirrored(whole, normal)
-    poses = _refined(points, whole)
-    if len(poses) and (np.linalg.norm(points.residuals(poses[:1]), axis=-1) <= GATE).all():
-        return poses
-    poses += _refined(points, _subset_starts(points))
-    return poses[_truncated_cost(points, poses).argsort()]
-
-
-def _refined(points: Correspondences, starts: Poses) -> Poses:
-    """Refine all starts together; return the plausible results, best first."""
-    poses = refine(points, starts)
-    poses = poses[_plausible(points, poses)]
-    return poses[_truncated_cost(points, poses).argsort()]
+    poses = _sqpnp(points, [])
+    for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
+        starts = _sqpnp(points, list(combinations(range(count), left_out)))
+        starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]
+        if normal is not None:
+            starts += _mirrored(starts, normal)
+        poses += refine(points, starts)
+        poses = poses[_plausible(points, poses)]
+        poses = poses[_truncated_cost(points, poses).argsort()]
+        distance = np.linalg.norm(points.residuals(poses[:1]), axis=-1)
+        if (distance <= GATE).sum() >= count - left_out:
+            break
+    return poses
 
 
 def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, "s"]:
@@ -194,22 +197,6 @@ def _plausible(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "s"]:
     near = np.linalg.norm(poses.translations, axis=-1) <= MAX_DISTANCE
     proper = [is_rotation(rotation, tolerance=1e-6) for rotation in poses.rotations]
     return np.asarray((depth > 0).all((1, 2)) & near & np.array(proper, bool))
-
-
-def _subset_starts(points: Correspondences) -> Poses:
-    """Return the best poses from all points but one and all points but two.
-
-    The second point to leave out is looked for beside the best first ones only: without one of two
-    outliers a pose is nearer to the truth than with both.
-    """
-    count = len(points.rays)
-    singles = [(k,) for k in range(count)] if count > MIN_POINTS else []
-    poses = _sqpnp(points, singles)
-    if count > MIN_POINTS + 1:
-        first = _truncated_cost(points, poses).argsort()[:NUM_SUBSET_STARTS]
-        pairs = {(min(a, b), max(a, b)) for a in first.tolist() for b in range(count) if a != b}
-        poses += _sqpnp(points, sorted(pairs))
-    return poses[_truncated_cost(points, poses).argsort()[:NUM_SUBSET_STARTS]]
 
 
 def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Poses:

@@ -19,8 +19,11 @@ GATE: Final = 3.0
 """Points beyond this many standard deviations are outliers (99.7 % of a Gaussian lies within)."""
 
 MAX_STEPS: Final = 15
-CONVERGED: Final = 1e-6
+CONVERGED: Final = 1e-4
 """Relative fall of the cost below which a pose has arrived: far less than one point's noise."""
+
+ROUNDING: Final = 1e-12
+"""Fall of the cost that is none: a point that moves by a millionth of its deviation."""
 
 FIRST_DAMPING: Final = 1e-4
 
@@ -99,7 +102,7 @@ def refine(points: Correspondences, poses: Poses) -> Poses:
         moved_residuals = points.residuals(moved)
         moved_cost = _robust_cost(moved_residuals)
         better = active & (moved_cost < cost)
-        arrived = better & (cost - moved_cost <= CONVERGED * cost)
+        arrived = better & (cost - moved_cost <= CONVERGED * cost + ROUNDING)
         poses.rotations[better] = moved.rotations[better]
         poses.translations[better] = moved.translations[better]
         residuals[better], cost[better] = moved_residuals[better], moved_cost[better]

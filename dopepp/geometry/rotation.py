@@ -51,15 +51,16 @@ def rotation_vector_to_matrix(
 ) -> Float[np.ndarray, "*batch 3 3"]:
     """Exponential map: rotate by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
     vector = np.asarray(vector, np.float64)
-    x, y, z = np.moveaxis(vector, -1, 0)
-    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)[..., None, None]
+    # sin(x)/x is exact however small x is; (1 − cos)/x² = (sin(x/2)/x)²·2 loses no digits near 0.
+    half = np.where(half == 0, np.finfo(np.float64).tiny, half)
+    sinc_half = np.sin(half) / half
     skew = np.zeros((*vector.shape, 3))
     skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0] = x, y, z
     skew[..., 1, 2], skew[..., 2, 0], skew[..., 0, 1] = -x, -y, -z
-    # sinc(x/π) = sin(x)/x is exact at 0; (1 − cos)/x² = sinc²(x/2)/2 loses no digits near 0.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + first * skew + second * skew @ skew)
+    linear = sinc_half * np.cos(half)
+    return np.asarray(np.eye(3) + linear * skew + 0.5 * sinc_half**2 * skew @ skew)
 
 
 def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:

@@ -80,7 +80,8 @@ def _assign(
     )
     along = (offset * corners.toward[:, None]).sum(-1)
     angle = np.abs(np.arctan2(cross, along))
-    angle = np.where(distance < coincident_px, 0.0, angle)
+    # A vector that is no number, as of a network that diverged, points nowhere.
+    angle = np.where(distance < coincident_px, 0.0, np.where(np.isfinite(angle), angle, np.pi))
     allowed = angle <= max_angle
     cost = (angle / max_angle) ** 2 - np.log(corners.score)[:, None]
     # A forbidden pair costs more than any set of allowed ones, so it never displaces one.

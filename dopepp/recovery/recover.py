@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dopepp.errors import UserError
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.maps.encode import MapGeometry
@@ -39,6 +40,22 @@ class RecoveryOptions:
     max_angle_deg: float = 45.0
     max_peaks: int = 16
     min_score: float = 0.0
+
+    def __post_init__(self) -> None:
+        limits = {
+            "sigma": (0.1, 100.0),
+            "peak_threshold": (1e-6, 1.0),
+            "centroid_threshold": (1e-6, 1.0),
+            "max_angle_deg": (1e-3, 180.0),
+            "max_peaks": (1, 1000),
+            "min_score": (0.0, 1.0),
+        }
+        for name, (lowest, highest) in limits.items():
+            value = getattr(self, name)
+            if not lowest <= value <= highest:
+                raise UserError(
+                    f"recovery option {name}={value}", f"{lowest:g} to {highest:g}", "change it"
+                )
 
 
 def recover(
@@ -83,23 +100,22 @@ def recover_batch(
     Peaks are found and read on the maps' device; only they come to the host.
 
     Raises:
-        ValueError: The channels do not match the number of cuboids, or maps differ in size.
+        ValueError: The channels do not match the number of cuboids, maps differ in size, or there
+            are not as many cameras as images or names as objects.
+        UserError: An option is out of range.
     """
     chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
-    cuboids = np.asarray(cuboids, np.float64)
+    cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
     num_objects = len(cuboids)
-    expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
-    if (belief.shape[1], field.shape[1]) != expected or belief.shape[2:] != field.shape[2:]:
-        raise ValueError(
-            f"{num_objects} objects need {expected} belief and field channels of one size, "
-            f"got {tuple(belief.shape)} and {tuple(field.shape)}"
-        )
+    _check_shapes(belief, field, num_objects, K)
     geometry = MapGeometry(stride, chosen.sigma)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks))
     channels = _read_channels(peaks, field, geometry)
     labels = [str(c) for c in range(num_objects)] if names is None else list(names)
+    if len(labels) != num_objects:
+        raise ValueError(f"{num_objects} objects need as many names, got {labels}")
     batch = []
-    for image_channels, camera in zip(channels, np.asarray(K, np.float64), strict=True):
+    for image_channels, camera in zip(channels, K, strict=True):
         detections = [
             detection
             for c in range(num_objects)
@@ -114,6 +130,23 @@ def recover_batch(
         ]
         batch.append(sorted(detections, key=lambda detection: -detection.score))
     return batch
+
+
+def _check_shapes(
+    belief: Float[Tensor, "batch beliefs height width"],
+    field: Float[Tensor, "batch fields height width"],
+    num_objects: int,
+    K: Float[np.ndarray, "batch 3 3"],
+) -> None:
+    expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
+    got = (belief.shape[1], field.shape[1])
+    if got != expected or belief.shape[2:] != field.shape[2:] or len(belief) != len(field):
+        raise ValueError(
+            f"{num_objects} objects need {expected} belief and field channels of one size, "
+            f"got {tuple(belief.shape)} and {tuple(field.shape)}"
+        )
+    if K.shape != (len(belief), 3, 3):
+        raise ValueError(f"{len(belief)} images need as many camera matrices, got {K.shape}")
 
 
 def _recover_object(

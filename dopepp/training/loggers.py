@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.drawing.png import write_whole
 
@@ -21,7 +22,7 @@ class MetricsTable(Logger):
     """Writes everything that is logged into one CSV: a row per step, a column per metric.
 
     The file is rewritten whole, so it is never cut in the middle, and its columns may grow. An
-    existing file is continued.
+    existing file is continued. Of several processes only the first one writes.
 
     Args:
         path: The CSV file.
@@ -51,10 +52,12 @@ class MetricsTable(Logger):
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *_: Any, **__: Any) -> None:
         """Do nothing: the run's config is a file of its own."""
 
+    @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Add figures to a step's row."""
         self._rows.setdefault(step or 0, {}).update(metrics)
 
+    @rank_zero_only
     def save(self) -> None:
         """Write the file."""
         if not self._rows:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -28,9 +28,13 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
+from dopepp.training.loggers import MetricsTable
 
 OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
+
+_SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
+"""What torch's schedulers call how far they are; the rest of their state is the run's length."""
 
 
 @dataclass
@@ -151,6 +155,26 @@ class PoseSystem(LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
         }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep only how far the schedule was: a run resumed for longer has a longer schedule."""
+        checkpoint["lr_schedulers"] = [
+            {name: value for name, value in state.items() if name in _SCHEDULE_PROGRESS}
+            for state in checkpoint["lr_schedulers"]
+        ]
+
+    def on_train_start(self) -> None:
+        """Go to the resumed step's place in the table and on the schedule."""
+        for logger in self.loggers:
+            if isinstance(logger, MetricsTable):
+                logger.forget_after(self.global_step - 1)
+        for config in self.trainer.lr_scheduler_configs:
+            # Schedules that multiply the last rate would stay at zero where a shorter one ended.
+            closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
+            if closed_form is not None:
+                groups = config.scheduler.optimizer.param_groups
+                for group, rate in zip(groups, closed_form(), strict=True):
+                    group["lr"] = rate
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Make the file self-describing: anybody can load it without this module or a config."""
