@@ -30,7 +30,7 @@ _SHOWN: Final = (
 """What the terminal has room for; the files hold everything."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Failure:
     """A job that gave no result.
 

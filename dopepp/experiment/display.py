@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from rich.tree import Tree
 
 from dopepp.data.datamodule import SourceRow
@@ -15,13 +16,14 @@ from dopepp.experiment.report import Report
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
 
-# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width.
-console = Console(highlight=False, width=None if Console().is_terminal else 180)
+# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
+# overrides, paths and messages hold square brackets of their own.
+console = Console(highlight=False, markup=False, width=None if Console().is_terminal else 180)
 
 
 def show_config(config: Mapping[str, Any]) -> None:
     """Print the composed config as a tree."""
-    tree = Tree("[bold]config")
+    tree = Tree(Text("config", style="bold"))
     _branch(tree, config)
     console.print(tree)
 
@@ -29,7 +31,7 @@ def show_config(config: Mapping[str, Any]) -> None:
 def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
-            _branch(tree.add(f"[bold]{key}"), value)
+            _branch(tree.add(Text(str(key), style="bold")), value)
         else:
             tree.add(f"{key}: {value!r}", style="default")
 

@@ -17,6 +17,10 @@ from dopepp.models.network import PoseNetwork
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_MAX: Final = -4
 
+_PROBE_ITEMS: Final = 3
+_PROBE_S: Final = 2.0
+"""What the duration's estimate may cost: a few items and a few seconds of steps."""
+
 _BF16_FLAGS: Final = frozenset({"amx_bf16", "avx512_bf16", "bf16"})
 """x86's and Arm's names of the instruction sets."""
 
@@ -63,29 +67,47 @@ def _cpu_flags() -> set[str]:
 def estimate_training_s(
     network: PoseNetwork, datamodule: PoseDataModule, trainer_config: dict[str, Any], precision: str
 ) -> float:
-    """Estimate a CPU run's duration, seconds, from two images' steps and three items' loading.
+    """Estimate a CPU run's duration, seconds, from a few steps and a few items.
 
-    Loading is spread over the workers but shares the cores with training, so both count.
+    Loading is spread over the workers but shares the cores with training, so both count. An item
+    is loaded twice: a cache makes the second time, and so all later epochs, cheaper.
     """
+    per_epoch = len(datamodule.train_source)
+    num_images: int = per_epoch * trainer_config["max_epochs"]
+    if trainer_config["max_steps"] > 0:
+        num_images = min(num_images, trainer_config["max_steps"] * datamodule.batch_size)
+    threads = max(1, torch.get_num_threads())
+    first, again = (_loading_s(datamodule) / threads for _ in range(2))
+    num_first = min(num_images, per_epoch)
+    loading = first * num_first + again * (num_images - num_first)
+    return _step_s_per_image(network, datamodule, precision) * num_images + loading
+
+
+def _loading_s(datamodule: PoseDataModule) -> float:
+    items = min(_PROBE_ITEMS, len(datamodule.train_source))
+    start = time.perf_counter()
+    for index in range(items):
+        datamodule.train_item(0, index)
+    return (time.perf_counter() - start) / items
+
+
+def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precision: str) -> float:
+    """Time forward and backward: one image first, then as large a batch as a few seconds allow."""
     width, height = datamodule.input_size
-    images = torch.zeros(2, 3, height, width).to(memory_format=torch.channels_last)
-    durations = []
-    network.eval()  # batch norm must not learn from these empty images
-    for _ in range(2):
+
+    def step_s(count: int) -> float:
+        images = torch.zeros(count, 3, height, width).to(memory_format=torch.channels_last)
         start = time.perf_counter()
         with torch.autocast("cpu", torch.bfloat16, enabled=precision.startswith("bf16")):
             stages = network(images)
         means = [tensor.float().mean() for stage in stages for tensor in stage]
         torch.autograd.backward(torch.stack(means).sum())
-        durations.append((time.perf_counter() - start) / len(images))
+        return time.perf_counter() - start
+
+    step_s(1)  # the first step chooses kernels and allocates memory
+    single = step_s(1)
+    count = max(1, min(datamodule.batch_size, int(_PROBE_S / single)))
+    step_s(count)
+    duration = step_s(count) / count
     network.zero_grad(set_to_none=True)
-    network.train()
-    start = time.perf_counter()
-    items = min(3, len(datamodule.train_source))
-    for index in range(items):
-        datamodule.train_item(0, index)
-    loading = (time.perf_counter() - start) / items / max(1, torch.get_num_threads())
-    num_images: int = len(datamodule.train_source) * trainer_config["max_epochs"]
-    if trainer_config["max_steps"] > 0:
-        num_images = min(num_images, trainer_config["max_steps"] * datamodule.batch_size)
-    return (min(durations) + loading) * num_images
+    return duration

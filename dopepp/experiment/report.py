@@ -124,7 +124,11 @@ def measure(
         of two estimators, the first in blue (paper Fig. 14).
     """
     colours = [YELLOW] if len(estimators) == 1 else [BLUE, YELLOW]
-    metrics = {name: PoseMetrics(one.parts, name) for name, one in estimators.items()}
+    # One process measures alone: after a distributed training the others have ended.
+    metrics = {
+        name: PoseMetrics(one.parts, name, sync_on_compute=False)
+        for name, one in estimators.items()
+    }
     times: dict[str, list[float]] = {name: [] for name in estimators}
     tiles: list[Tile] = []
     num_images = 0

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import save_accuracy_curves
@@ -33,6 +34,7 @@ from dopepp.experiment.sources import build_datamodule, build_parts, build_test_
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network, read
+from dopepp.models.gate import TARGET, check_integer, check_number
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.recovery.recover import RecoveryOptions
@@ -43,6 +45,11 @@ from dopepp.training.system import PoseSystem
 _log = logging.getLogger(__name__)
 
 PAPER_INPUT_SIZE: Final = (416, 416)
+_MAX_EPOCHS: Final = 10**9
+_MIN_CELLS: Final = 0.1
+"""A peak or disc narrower than this, in cells, is on no cell at all."""
+_MAX_THRESHOLD: Final = 1000
+"""Above any map size in cells, angle in degrees and number of peaks that means something."""
 QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
 
 
@@ -56,9 +63,10 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     Raises:
         UserError: A choice, a file or an option is wrong.
     """
-    seed = int(config["seed"])
+    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     seed_everything(seed, verbose=False)
     keep_freed_memory()
+    display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
     parts = build_parts(config["data"])
     datamodule = build_datamodule(config["data"], parts, seed)
     datamodule.check_objects()
@@ -87,6 +95,9 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
 def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str) -> PoseSystem:
     """Build the network, its loss and its optimiser as the config names them."""
     model, maps = config["model"], config["maps"]
+    for group, lowest in (("maps", _MIN_CELLS), ("recovery", 0)):
+        for name, value in config[group].items():
+            check_number(f"{group}.{name}", value, lowest, _MAX_THRESHOLD)
     loss = LOSSES.build(model["loss"])
     spec = {name: model[name] for name in ("backbone", "attention", "head")}
     spec |= {"activation": loss.activation, "num_objects": len(parts)}
@@ -115,7 +126,7 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         optimizer_factory(config["optimizer"]),
         scheduler_factory(config["scheduler"]),
         description.to_payload(),
-        compile_network=model["compile"],
+        compile_network=config["compile"],
     )
 
 
@@ -135,6 +146,8 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     """Build Lightning's trainer with the config's callbacks and loggers."""
     options = dict(config["trainer"])
+    check_integer("trainer.max_epochs", options["max_epochs"], 1, _MAX_EPOCHS)
+    check_integer("trainer.max_steps", options["max_steps"], -1, _MAX_EPOCHS)
     accelerator = options["accelerator"]
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
@@ -144,10 +157,9 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     display.console.print(f"precision {options['precision']}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
     loggers: list[Logger] = [MetricsTable(run_dir / "metrics.csv")]
-    loggers += [
-        GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir)))
-        for node in config.get("logger", {}).values()
-    ]
+    for node in config.get("logger", {}).values():
+        LOGGERS.resolve(node.get(TARGET))  # a wrong name is a mistake, not a logger's failure
+        loggers.append(GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir))))
     try:
         return Trainer(
             **{**options, "accelerator": accelerator},

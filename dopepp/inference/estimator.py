@@ -40,7 +40,7 @@ class PoseEstimator:
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.checkpoint = checkpoint
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
-        self.recovery = parse_recovery(checkpoint.recovery)
+        self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> PoseEstimator:
@@ -74,11 +74,12 @@ class PoseEstimator:
             Detections, best score first, in pixels of the given size and metres.
 
         Raises:
-            UserError: The image is no RGB picture, or K cannot belong to it.
+            UserError: The image is no RGB picture, K cannot belong to it, or there is no lens model
+                with so many coefficients.
         """
         image, K = _checked(image, K)
         if distortion is not None:
-            image = cv2.undistort(image, K, np.asarray(distortion, np.float64))
+            image = cv2.undistort(image, K, _checked_distortion(distortion))
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
         belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
         found = recover(
@@ -143,7 +144,22 @@ def _checked(
             "(height, width, 3) uint8 in RGB order",
             "convert the image, e.g. cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)",
         )
-    return image, check_camera(K, (image.shape[1], image.shape[0]), "predict")
+    # Flipped views, as of bgr[..., ::-1], have strides that OpenCV and torch do not take.
+    return np.ascontiguousarray(image), check_camera(K, (image.shape[1], image.shape[0]), "predict")
+
+
+def _checked_distortion(
+    distortion: Float[np.ndarray, "coefficients"],
+) -> Float[np.ndarray, "coefficients"]:
+    """Check that the coefficients are those of one of OpenCV's lens models."""
+    coefficients = np.asarray(distortion, np.float64).ravel()
+    if coefficients.size not in (4, 5, 8, 12, 14) or not np.isfinite(coefficients).all():
+        raise UserError(
+            f"distortion {coefficients.tolist()!s:.200}",
+            "4, 5, 8, 12 or 14 finite numbers in OpenCV's order (k1, k2, p1, p2, k3, …)",
+            "pass the camera's calibration, or None for an undistorted image",
+        )
+    return coefficients
 
 
 def _in_original(

@@ -202,7 +202,7 @@ def _read_channels(
     cell = geometry.to_cells(peaks.position.nan_to_num()).round().long()
     index = cell[..., 1].clamp(0, height - 1) * width + cell[..., 0].clamp(0, width - 1)
     corner_index = index.view(batch, num_objects, NUM_KEYPOINTS, 1, count)[:, :, :NUM_CORNERS]
-    vectors = field.float().view(batch, num_objects, NUM_CORNERS, 2, -1)
+    vectors = field.float().reshape(batch, num_objects, NUM_CORNERS, 2, -1)
     read = vectors.gather(-1, corner_index.expand(-1, -1, -1, 2, -1)).transpose(-1, -2)
     toward = torch.zeros(
         batch, num_objects, NUM_KEYPOINTS, count, 2, dtype=read.dtype, device=read.device

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import (
+    Letterbox,
+    camera_matrix,
+    check_camera,
+    invert_transform,
+    make_transform,
+    project,
+    project_keypoints,
+    resize_camera,
+    resize_points,
+    transform,
+)
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
+
+K = camera_matrix(600, 610, 310.5, 245.25)
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    return make_transform(random_rotation(rng), rng.uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 1.0]))
+
+
+def test_projection_is_opencvs() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.1, 0.1, (40, 3))
+    vector, translation = rng.normal(size=3), np.array([0.03, -0.02, 0.5])
+    T_cam_obj = make_transform(rotation_vector_to_matrix(vector), translation)
+    expected = cv2.projectPoints(points, vector, translation, K, None)[0][:, 0]
+    assert_allclose(project(transform(T_cam_obj, points), K), expected, atol=1e-9)
+
+
+def test_keypoints_project_like_their_points() -> None:
+    cuboid = cuboid_keypoints(np.full(3, -0.05), np.full(3, 0.05))
+    T = random_pose(np.random.default_rng(1))
+    expected = project(cuboid @ T[:3, :3].T + T[:3, 3], K)
+    assert_allclose(project_keypoints(cuboid, T, K), expected)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_in_front_of_the_camera_has_no_pixel() -> None:
+    points = np.array([[0, 0, 1], [0.1, 0.2, 0], [0.1, 0.2, -1], [np.nan, 0, 1], [1, 1, 1e-320]])
+    pixels = project(points, K)
+    assert_allclose(pixels[0], K[:2, 2])
+    assert np.isnan(pixels[1:4]).all()
+
+
+def test_transforms_invert() -> None:
+    rng = np.random.default_rng(2)
+    T, points = random_pose(rng), rng.normal(size=(2, 5, 3))
+    assert_allclose(invert_transform(T), np.linalg.inv(T), atol=1e-12)
+    assert_allclose(transform(invert_transform(T), transform(T, points)), points, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 0.8, 1.5, 2.0])
+def test_resize_rule_is_opencvs(scale: float) -> None:
+    """A blob's centre of mass moves with cv2.resize as u → s(u + ½) − ½ says."""
+    x, y = np.array([37.3, 61.9])
+    grid_y, grid_x = np.mgrid[:120, :120]
+    blob = np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / (2 * 5.0**2))
+    side = round(120 * scale)
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(blob, (side, side), interpolation=method)
+    rows, columns = np.mgrid[:side, :side]
+    centre = np.array([(resized * columns).sum(), (resized * rows).sum()]) / resized.sum()
+    assert_allclose(resize_points(np.array([x, y]), scale, scale), centre, atol=0.02)
+
+
+def test_resized_camera_sees_the_resized_points() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 1], (20, 3))
+    expected = resize_points(project(points, K), 0.65, 1.7)
+    assert_allclose(project(points, resize_camera(K, 0.65, 1.7)), expected, atol=1e-9)
+    assert_array_equal(K, camera_matrix(600, 610, 310.5, 245.25))
+
+
+SIZES = st.tuples(st.integers(1, 3000), st.integers(1, 3000))
+
+
+@settings(deadline=None, max_examples=200)
+@given(SIZES, SIZES)
+def test_letterbox_fits_and_comes_back(size: tuple[int, int], input_size: tuple[int, int]) -> None:
+    box = Letterbox.fit(size, input_size)
+    assert 1 <= box.width <= input_size[0]
+    assert 1 <= box.height <= input_size[1]
+    assert box.width == input_size[0] or box.height == input_size[1]
+    scale = min(input_size[0] / size[0], input_size[1] / size[1])
+    assert abs(box.width - size[0] * scale) <= max(0.5, 1 - size[0] * scale) + 1e-9
+    assert abs(box.height - size[1] * scale) <= max(0.5, 1 - size[1] * scale) + 1e-9
+
+    corners = np.array([[-0.5, -0.5], [size[0] - 0.5, size[1] - 0.5]])
+    assert_allclose(box.points(corners), [[-0.5, -0.5], [box.width - 0.5, box.height - 0.5]])
+    assert_allclose(box.original_points(box.points(corners)), corners, atol=1e-9)
+    ray = np.array([0.1, -0.2, 1.0])
+    assert_allclose(project(ray, box.camera(K)), box.points(project(ray, K)), atol=1e-6)
+
+
+@pytest.mark.parametrize("input_size", [(128, 128), (416, 416), (64, 300)])
+def test_letterbox_image_goes_where_its_points_go(input_size: tuple[int, int]) -> None:
+    grid_y, grid_x = np.mgrid[:150, :200]
+    blob = 255 * np.exp(-((grid_x - 120.4) ** 2 + (grid_y - 60.8) ** 2) / (2 * 8.0**2))
+    image = np.repeat(np.round(blob).astype(np.uint8)[..., None], 3, axis=2)
+    box = Letterbox.fit((200, 150), input_size)
+    resized = box.image(image)
+    assert resized.shape == (box.height, box.width, 3)
+    assert resized.dtype == np.uint8
+    rows, columns = np.mgrid[: box.height, : box.width]
+    weight = resized[..., 1].astype(float)
+    centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    assert_allclose(centre, box.points(np.array([120.4, 60.8])), atol=0.1)
+
+
+def test_letterbox_image_of_the_same_size_is_itself() -> None:
+    image = np.zeros((30, 40, 3), np.uint8)
+    assert Letterbox.fit((40, 30), (40, 64)).image(image) is image
+
+
+def test_letterbox_averages_when_it_shrinks() -> None:
+    checkers = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
+    image = np.repeat(checkers[..., None].astype(np.uint8), 3, axis=2)
+    assert np.abs(Letterbox.fit((64, 64), (16, 16)).image(image).astype(int) - 128).max() <= 1
+
+
+def test_good_camera_is_returned_as_float64() -> None:
+    checked = check_camera(K.astype(np.float32), (640, 480), "test")
+    assert checked.dtype == np.float64
+    assert_allclose(checked, K)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (np.eye(2), "3×3 pinhole"),
+        (np.zeros(9), "3×3 pinhole"),
+        ("calibration.yaml", "3×3 pinhole"),
+        ([[1, 2, 3], [4, 5], [6]], "3×3 pinhole"),
+        (np.full((3, 3), np.nan), "3×3 pinhole"),
+        (K.T, "3×3 pinhole"),
+        (2 * K, "3×3 pinhole"),
+        (K + np.array([[0, 5.0, 0], [0, 0, 0], [0, 0, 0]]), "3×3 pinhole"),
+        (K + np.array([[0, 0, 0], [5.0, 0, 0], [0, 0, 0]]), "3×3 pinhole"),
+        (camera_matrix(600, 600, 700, 240), "principal point inside"),
+        (camera_matrix(600, 600, 320, -1), "principal point inside"),
+        (camera_matrix(-600, 600, 320, 240), "field of view"),
+        (camera_matrix(0.6, 0.6, 320, 240), "field of view"),
+        (camera_matrix(60000, 60000, 320, 240), "field of view"),
+    ],
+)
+def test_bad_camera(bad: np.ndarray, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        check_camera(bad, (640, 480), "frame 7")
+    assert "frame 7" in str(caught.value)
+    assert "\n" not in str(caught.value)

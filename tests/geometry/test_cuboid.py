@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dopepp.geometry.cuboid import EDGES, cuboid_keypoints
+
+NDDS_ORDER = [
+    (1, -1, 1),
+    (-1, -1, 1),
+    (-1, 1, 1),
+    (1, 1, 1),
+    (1, -1, -1),
+    (-1, -1, -1),
+    (-1, 1, -1),
+    (1, 1, -1),
+    (0, 0, 0),
+]
+
+
+def test_keypoints_are_in_ndds_order() -> None:
+    assert_array_equal(cuboid_keypoints(np.full(3, -1.0), np.ones(3)), NDDS_ORDER)
+
+
+def test_box_off_the_origin() -> None:
+    lower, upper = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.0, 0.307])
+    keypoints = cuboid_keypoints(lower, upper)
+    assert_allclose(keypoints[8], (lower + upper) / 2)
+    assert_allclose(keypoints[:8].min(0), lower)
+    assert_allclose(keypoints[:8].max(0), upper)
+    assert_array_equal(np.sign(keypoints - keypoints[8]), NDDS_ORDER)
+
+
+def test_edges_are_the_twelve_of_a_box() -> None:
+    sides = np.array([0.2, 0.3, 0.5])
+    keypoints = cuboid_keypoints(np.zeros(3), sides)
+    edges = np.array([keypoints[b] - keypoints[a] for a, b in EDGES])
+    assert len(set(EDGES)) == 12
+    assert ((edges != 0).sum(1) == 1).all()
+    assert_allclose(np.sort(np.abs(edges).sum(1)), np.repeat(sides, 4))
+
+
+def test_flat_box_is_allowed() -> None:
+    assert cuboid_keypoints(np.zeros(3), np.array([1.0, 1.0, 0.0])).shape == (9, 3)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [([0, 0, 1], [1, 1, 0]), ([0, 0, np.nan], [1, 1, 1]), ([0] * 3, [np.inf] * 3)],
+)
+def test_bad_bounds(lower: list[float], upper: list[float]) -> None:
+    with pytest.raises(ValueError, match="finite with lower <= upper"):
+        cuboid_keypoints(np.array(lower), np.array(upper))

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.data.batch import Batch
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.rendered import RenderedSource, Split
+from dopepp.maps.encode import MapGeometry
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.losses import SpatialCrossEntropy
+from dopepp.models.spec import build_network
+from dopepp.parts.builtin import pivconnector
+from dopepp.parts.part import Part
+from dopepp.recovery.recover import RecoveryOptions
+from dopepp.training.system import PoseSystem
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import PRESETS
+
+INPUT_SIZE = (128, 128)
+SystemMaker = Callable[..., PoseSystem]
+
+
+@pytest.fixture(scope="session")
+def part() -> Part:
+    return pivconnector()
+
+
+@pytest.fixture(scope="session")
+def make_system(part: Part) -> SystemMaker:
+    """A tiny DOPE++ for one part, or two of the same shape."""
+
+    def make(
+        num_objects: int = 1, system_class: type[PoseSystem] = PoseSystem, **options: Any
+    ) -> PoseSystem:
+        torch.manual_seed(0)
+        parts = [part, Part("other", part.cuboid, part.diameter, part.points)][:num_objects]
+        loss = SpatialCrossEntropy(sigma=1.0, count_weight=1.0, field_weight=0.2)
+        spec = {
+            "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
+            "attention": {"_target_": "dopepp.models.attention.Identity"},
+            "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625},
+            "activation": loss.activation,
+            "num_objects": num_objects,
+        }
+        network = build_network(spec)
+        described = Checkpoint(spec, {}, parts, INPUT_SIZE, network.stride, 1.0)
+        return system_class(
+            network,
+            loss,
+            parts,
+            MapGeometry(network.stride),
+            RecoveryOptions(),
+            options.pop("make_optimizer", partial(torch.optim.Adam, lr=3e-3)),
+            payload=described.to_payload(),
+            **options,
+        )
+
+    return make
+
+
+@pytest.fixture
+def make_datamodule(part: Part) -> Callable[[], PoseDataModule]:
+    """Eight training and three validation renders in batches of two."""
+
+    def source(num_items: int, split: Split) -> RenderedSource:
+        return RenderedSource(Factory([part], PRESETS["quickstart"], seed=0), num_items, split)
+
+    def make() -> PoseDataModule:
+        sources = (source(8, "train"), source(3, "val"), source(1, "test"))
+        return PoseDataModule(*sources, [part.name], INPUT_SIZE, batch_size=2)
+
+    return make
+
+
+@pytest.fixture
+def batch(make_datamodule: Callable[[], PoseDataModule]) -> Batch:
+    """Two rendered images."""
+    first: Batch = next(iter(make_datamodule().val_dataloader()))
+    return first
+
+
+@pytest.fixture
+def read_png() -> Callable[[Path], np.ndarray]:
+    def read(path: Path) -> np.ndarray:
+        import cv2
+
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        assert image is not None, f"{path} cannot be read"
+        return np.asarray(image)
+
+    return read

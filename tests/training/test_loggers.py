@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import csv
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning.pytorch.loggers import Logger
+
+from dopepp.training.loggers import GuardedLogger, MetricsTable
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path: Path) -> None:
+    table = MetricsTable(tmp_path / "run" / "metrics.csv")
+    table.save()
+    assert not table.path.exists()
+    table.log_metrics({"train/loss": 2.0}, step=0)
+    table.save()
+    table.log_metrics({"val/loss": 1.5}, step=1)
+    table.log_metrics({"train/loss": 1.0}, step=1)
+    table.finalize("success")
+    assert rows(table.path) == [
+        {"step": "0", "train/loss": "2.0", "val/loss": ""},
+        {"step": "1", "train/loss": "1.0", "val/loss": "1.5"},
+    ]
+    assert [path.name for path in table.path.parent.iterdir()] == ["metrics.csv"]
+
+
+def test_a_failing_write_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = MetricsTable(tmp_path / "metrics.csv")
+    table.log_metrics({"loss": 2.0}, step=0)
+    table.save()
+    before = table.path.read_bytes()
+    table.log_metrics({"loss": 1.0}, step=1)
+
+    def full(self: Path, content: bytes) -> int:
+        with self.open("wb") as stream:
+            stream.write(content[:5])
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="no space"):
+        table.save()
+    assert table.path.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+def test_an_existing_file_is_continued(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    first = MetricsTable(path)
+    for step in range(4):
+        first.log_metrics({"loss": 4.0 - step}, step=step)
+    first.save()
+
+    second = MetricsTable(path)
+    second.forget_after(1)
+    second.log_metrics({"loss": 9.0, "rate": 0.1}, step=2)
+    second.save()
+    assert [(row["step"], row["loss"], row["rate"]) for row in rows(path)] == [
+        ("0", "4.0", ""), ("1", "3.0", ""), ("2", "9.0", "0.1"),
+    ]  # fmt: skip
+
+
+class Broken(Logger):
+    """Fails in the named calls."""
+
+    def __init__(self, *calls: str) -> None:
+        super().__init__()
+        self.calls = calls
+        self.seen: list[str] = []
+        self._do("construction")
+
+    def _do(self, call: str) -> None:
+        self.seen.append(call)
+        if call in self.calls:
+            raise ConnectionError(f"{call} failed")
+
+    @property
+    def name(self) -> str:
+        self._do("name")
+        return "broken"
+
+    @property
+    def version(self) -> str:
+        return ""
+
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        self._do("log_hyperparams")
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:  # type: ignore[override]
+        self._do("log_metrics")
+
+    def save(self) -> None:
+        self._do("save")
+
+    def finalize(self, status: str) -> None:
+        self._do("finalize")
+
+
+CALLS = ("construction", "name", "log_hyperparams", "log_metrics", "save", "finalize")
+
+
+def use(logger: GuardedLogger) -> None:
+    assert logger.name in (None, "broken")
+    logger.log_hyperparams({})
+    for step in range(3):
+        logger.log_metrics({"loss": 1.0}, step)
+        logger.save()
+    logger.finalize("success")
+    assert logger.version in (None, "")
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_a_failing_logger_warns_once_and_is_off(
+    call: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    made: list[Broken] = []
+
+    def make() -> Broken:
+        made.append(Broken(call))
+        return made[-1]
+
+    with caplog.at_level(logging.WARNING):
+        logger = GuardedLogger(make)
+        use(logger)
+    assert len(caplog.records) == 1
+    assert f"{call} failed" in caplog.text
+    if made:
+        assert made[0].seen.count(call) == 1
+        assert made[0].seen[-1] == call
+
+
+def test_a_working_logger_gets_everything(caplog: pytest.LogCaptureFixture) -> None:
+    logger = GuardedLogger(Broken)
+    use(logger)
+    assert isinstance(logger.inner, Broken)
+    assert set(logger.inner.seen) == set(CALLS)
+    assert not caplog.records
