@@ -104,10 +104,12 @@ def _step_s_per_image(network: PoseNetwork, datamodule: PoseDataModule, precisio
         torch.autograd.backward(torch.stack(means).sum())
         return time.perf_counter() - start
 
+    network.eval()  # batch norm must not learn from these empty images
     step_s(1)  # the first step chooses kernels and allocates memory
     single = step_s(1)
     count = max(1, min(datamodule.batch_size, int(_PROBE_S / single)))
     step_s(count)
     duration = step_s(count) / count
     network.zero_grad(set_to_none=True)
+    network.train()
     return duration

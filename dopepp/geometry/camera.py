@@ -148,7 +148,8 @@ def check_camera(
         matrix = np.empty(0)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not _is_pinhole(matrix):
         raise UserError(f"K {K!r:.200} of {source}", pinhole, "pass the camera's own K")
-    K = matrix
+    # What is 0 or 1 but for a file's digits is made exactly so.
+    K = camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     fits = 0 <= K[0, 2] < width and 0 <= K[1, 2] < height
     # 5° and 150° of view are focal lengths of 11.5 and 0.13 image widths.
     longest = max(width, height)

@@ -43,7 +43,7 @@ def test_other_accelerators_are_not_guessed_at() -> None:
 
 
 def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Composer) -> None:
-    config = tiny("model.batch_norm=true")
+    config = tiny("model.backbone.batch_norm=true")
     parts = build_parts(config["data"])
     module, system = build_datamodule(config["data"], parts, 0), build_system(config, parts, "")
     before = {name: value.clone() for name, value in system.network.state_dict().items()}

@@ -47,6 +47,13 @@ PLACES = (
 )
 
 
+def build_all(config: dict[str, Any], run_dir: Path) -> None:
+    parts = build_parts(config["data"])
+    build_datamodule(config["data"], parts, seed=0)
+    build_system(config, parts, "")
+    build_trainer(config, run_dir)
+
+
 @pytest.mark.parametrize(
     ("place", "target"),
     [(place, HOSTILE[0]) for place in PLACES] + [("optimizer", target) for target in HOSTILE[1:]],
@@ -56,10 +63,7 @@ def test_a_hostile_target_is_refused(
 ) -> None:
     config = tiny(f"++{place}._target_='{target}'")
     with pytest.raises(UserError, match="_target_") as error:
-        parts = build_parts(config["data"])
-        build_datamodule(config["data"], parts, seed=0)
-        build_system(config, parts, "")
-        build_trainer(config, tmp_path)
+        build_all(config, tmp_path)
     assert repr(target) in error.value.got
     assert "\n" not in str(error.value)
 
@@ -71,10 +75,7 @@ def test_nested_targets_are_refused(place: str, tiny: Composer, tmp_path: Path) 
     # Where the optimiser's rate is one, the schedule's copy of it is one too.
     config = tiny(override, "scheduler=constant")
     with pytest.raises(UserError, match="_target_"):
-        parts = build_parts(config["data"])
-        build_datamodule(config["data"], parts, seed=0)
-        build_system(config, parts, "")
-        build_trainer(config, tmp_path)
+        build_all(config, tmp_path)
 
 
 def test_an_unknown_argument_is_named() -> None:

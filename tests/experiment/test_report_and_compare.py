@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -104,13 +105,11 @@ def test_a_failed_job_is_a_row(
     assert (tmp_path / "compare_auc.png").exists() == bool(others)
     # In the terminal it is folded, not read as markup.
     shown = "".join(capsys.readouterr().out.split())
-    assert "".join(part for part in "[width,") in shown
-    assert "[/nothing]" in shown or "[/noth" in shown
+    assert "[width," in shown
+    assert "[/noth" in shown
 
 
-def write_job(
-    sweep: Path, number: int, overrides: list[str], result: Report | str | None
-) -> Path:
+def write_job(sweep: Path, number: int, overrides: list[str], result: Report | str | None) -> Path:
     job = sweep / str(number)
     (job / ".hydra").mkdir(parents=True)
     OmegaConf.save(OmegaConf.create(overrides), job / ".hydra" / "overrides.yaml")
@@ -166,8 +165,6 @@ def test_a_run_records_what_it_ran_with(tmp_path: Path) -> None:
     record.write_json(tmp_path / record.VERSIONS_FILE, environment)
     assert record.read_json(tmp_path / record.VERSIONS_FILE) == environment
     assert (environment["seed"], environment["data_fingerprint"]) == (7, "abc")
-    from importlib.metadata import version
-
     assert environment["packages"]["torch"] == version("torch")
     assert set(environment) >= {"dopepp", "python", "platform", "git", "hardware", "command"}
 

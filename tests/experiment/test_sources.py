@@ -166,9 +166,7 @@ def test_a_users_mesh_with_its_unit(tiny: Composer, tmp_path: Path) -> None:
         ("data.masking.probability=2", "probability"),
     ],
 )
-def test_a_mistake_in_the_data_is_one_line(
-    override: str, got: str | None, tiny: Composer
-) -> None:
+def test_a_mistake_in_the_data_is_one_line(override: str, got: str | None, tiny: Composer) -> None:
     data = tiny(override)["data"]
     if got is None:  # a unit matters to files only: built-in parts have their size
         assert [part.name for part in build_parts(data)] == ["pivconnector"]

@@ -136,6 +136,11 @@ def test_good_camera_is_returned_as_float64() -> None:
     assert_allclose(checked, K)
 
 
+def test_the_rounding_of_a_calibration_file_is_removed() -> None:
+    rounding = 1e-8 * np.array([[0, 1, 0], [1, 0, 0], [1, -1, 1.0]])
+    assert_array_equal(check_camera(K + rounding, (640, 480), "test"), K)
+
+
 @pytest.mark.parametrize(
     ("bad", "message"),
     [

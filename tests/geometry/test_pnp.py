@@ -196,9 +196,8 @@ def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name: str) -> None:
         poses = (ours.T_cam_obj, sqpnp(cuboid, pixels), epnp(cuboid, pixels))
         passed.append([add(T, truth, cuboid) < 0.1 for T in poses])
     our_rate, *other_rates = np.mean(passed, axis=0)
-    print(name, our_rate, other_rates)
     assert our_rate >= max(other_rates) + 0.25
-    assert our_rate >= (0.8 if name == "plate" else 0.95)
+    assert our_rate >= 0.9
 
 
 def test_two_wild_corners_are_rejected() -> None:

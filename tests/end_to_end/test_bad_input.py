@@ -1,0 +1,246 @@
+"""A user's mistake ends in one line on stderr with got, allowed and fix, and exit code 2."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+Runner = Callable[..., Any]
+
+
+@pytest.fixture
+def train(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> Runner:
+    """A tiny training with overrides; its mistake must be the only line, and nothing is begun."""
+
+    def run(*overrides: str) -> str:
+        output_dir = tmp_path / "outputs"
+        done = call("train.py", *tiny, *overrides, f"output_dir={output_dir}")
+        line: str = done.line
+        assert done.err.count("\n") == 1, done.err
+        assert not list(output_dir.glob("**/versions.json"))
+        assert not list(output_dir.glob("**/*.ckpt"))
+        return line
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["data.bach_size=4"], "override 'data.bach_size', which names no option; allowed: the "
+                               "options of `--cfg job`, nearest data.batch_size"),
+        (["modl=dope"], "override 'modl', which names no option"),
+        (["model=dopeppp"], "model=dopeppp; allowed: dope dopepp"),
+        (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
+        (["data=ycb"], "data=ycb; allowed: hybrid virtual ycb_video"),
+        (["trainer.max_epochs"], "trainer.max_epochs"),
+        (["trainer.max_epochs=1,2"], "Ambiguous value"),
+        (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),
+        (["trainer.precision=17"], "which Lightning refuses"),
+        (["trainer.accelerator=abacus"], "which Lightning refuses"),
+        (["seed=lucky"], "seed='lucky'; allowed: an integer"),
+        (["recovery.max_peaks=all"], "recovery.max_peaks='all'; allowed: a number"),
+        (["maps.sigma=0"], "maps.sigma=0; allowed: a number from 0.1"),
+        (["model.width=thin"], "width='thin'; allowed: a number"),
+        (["model.backbone._target_=os.system"], "backbone _target_ 'os.system'"),
+        (["data=ycb_video", "data.preset=null"], "data=ycb_video without data.root"),
+        (["data=hybrid", "data.root=/nowhere"], "data.root=/nowhere, which is no folder"),
+        (["data.parts=[gearwheel]"], "unknown part 'gearwheel'; allowed: servoholder, pivc"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)  # fmt: skip
+def test_a_mistake_in_the_overrides(overrides: list[str], expected: str, train: Runner) -> None:
+    assert expected in train(*overrides)
+
+
+def test_roots_that_are_no_ycb_video(train: Runner, ycb_root: Path, tmp_path: Path) -> None:
+    root = tmp_path / "not ycb"
+    root.mkdir()
+    override = f"data.root='{root}'"
+    assert f"data.root={root}, which has no data/" in train("data=hybrid", override)
+    (root / "data").mkdir()
+    assert "has no image_sets/classes.txt" in train("data=hybrid", override)
+    line = train("data=hybrid", f"data.root={ycb_root}", "data.objects=[003_cracker]")
+    assert "data.objects with '003_cracker'; allowed: 002_master_chef_can, 003_cracker_box" in line
+
+
+def test_meshes_that_cannot_be_parts(train: Runner, tmp_path: Path) -> None:
+    path = tmp_path / "plate.stl"
+    trimesh.creation.box((100.0, 60.0, 5.0)).export(path)  # millimetres
+    line = train(f"data.parts=['{path}']", "data.unit=m")
+    assert "diameter" in line
+    assert "unit" in line
+    empty = tmp_path / "empty.stl"
+    empty.write_bytes(b"")
+    assert str(empty) in train(f"data.parts=['{empty}']")
+    assert "no such file" in train(f"data.parts=['{tmp_path / 'absent.stl'}']")
+    assert "unit='feet'" in train(f"data.parts=['{path}']", "data.unit=feet")
+
+
+def damage_meta(root: Path) -> None:
+    path = root / "data" / "0050" / "000003-meta.mat"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def damage_image(root: Path) -> None:
+    """Cut the picture in the middle, where OpenCV alone would return half of it."""
+    path = root / "data" / "0050" / "000003-color.png"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def shrink_label(root: Path) -> None:
+    path = root / "data" / "0050" / "000003-label.png"
+    label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert label is not None
+    cv2.imwrite(str(path), label[::2, ::2])
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (damage_meta, "000003-meta.mat"),
+        (damage_image, "000003-color.png"),
+        (shrink_label, "320"),
+    ],
+)
+def test_a_damaged_frame(
+    damage: Callable[[Path], None],
+    expected: str,
+    frame_root: Path,
+    call: Runner,
+    tmp_path: Path,
+) -> None:
+    damage(frame_root)
+    output_dir = tmp_path / "outputs"
+    done = call(
+        "train.py", "debug=overfit", f"data.root={frame_root}", "data.num_workers=0",
+        "data.samples_per_epoch=2", f"output_dir={output_dir}",
+    )  # fmt: skip
+    assert expected in done.line
+    assert "0050/000003" in done.line or "000003-" in done.line
+    assert not list(output_dir.glob("**/*.ckpt"))
+    assert not list(output_dir.glob("**/*.json"))
+
+
+def test_a_frame_that_breaks_during_training_ends_it_in_one_line(
+    frame_root: Path, ycb_root: Path, call: Runner, tmp_path: Path
+) -> None:
+    """The training data are read by worker processes; their mistake reaches the user as it is."""
+    for name in ("color.png", "label.png", "meta.mat", "depth.png"):
+        folder = frame_root / "data" / "0000"
+        folder.mkdir(exist_ok=True)
+        source = ycb_root / "data" / "0000" / f"000001-{name}"
+        (folder / source.name).write_bytes(source.read_bytes())
+    damage_image(frame_root)
+    done = call(
+        "train.py", "data=ycb_video", f"data.root={frame_root}", "model.width=0.0625",
+        "data.objects=[003_cracker_box]", "data.input_size=[64,64]", "data.batch_size=1",
+        "data.samples_per_epoch=2", "data.num_workers=1", "trainer=cpu", "trainer.max_epochs=1",
+        "data.image_sets={train: train, val: train, test: train}", "data.masking._target_=null",
+        f"output_dir={tmp_path / 'outputs'}",
+    )  # fmt: skip
+    assert "000003-color.png" in done.line
+    assert not list(tmp_path.glob("outputs/**/metrics.json"))
+
+
+def write_text(path: Path, good: Path) -> None:
+    path.write_text("this is no checkpoint\n")
+
+
+def truncate(path: Path, good: Path) -> None:
+    content = good.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def other_zip(path: Path, good: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data.pkl", b"nothing")
+
+
+def foreign(path: Path, good: Path) -> None:
+    torch.save({"state_dict": {"weight": torch.zeros(3)}}, path)
+
+
+def hostile_spec(path: Path, good: Path) -> None:
+    content = torch.load(good, weights_only=True)
+    content["dopepp"]["spec"]["backbone"] = {"_target_": "os.system", "command": "true"}
+    torch.save(content, path)
+
+
+def hostile_pickle(path: Path, good: Path) -> None:
+    class Command:
+        def __reduce__(self) -> tuple[Any, tuple[str]]:
+            import os
+
+            return os.mkdir, (str(path.parent / "trace"),)
+
+    torch.save({"state_dict": Command(), "dopepp": {}}, path)
+
+
+def absent(path: Path, good: Path) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("write", "expected"),
+    [
+        (write_text, "which is not a torch file or was cut short"),
+        (truncate, "which is not a torch file or was cut short"),
+        (other_zip, "which torch refuses to load"),
+        (foreign, "without 'dopepp' entry"),
+        (hostile_spec, "backbone _target_ 'os.system'"),
+        (hostile_pickle, "which torch refuses to load"),
+        (absent, "which is no file"),
+    ],
+)
+def test_a_file_that_is_no_checkpoint(
+    write: Callable[[Path, Path], None],
+    expected: str,
+    trained: tuple[Path, Any],
+    call: Runner,
+    train: Runner,
+    tmp_path: Path,
+) -> None:
+    good, bad = trained[0] / "checkpoints" / "best.ckpt", tmp_path / "bad.ckpt"
+    write(bad, good)
+    output_dir = f"output_dir={tmp_path / 'evaluations'}"
+    for overrides in ([f"ckpt_path={bad}"], [f"ckpt_path={good}", f"baseline={bad}"]):
+        done = call("evaluate.py", *overrides, output_dir)
+        assert expected in done.line
+        assert str(bad) in done.line
+        assert done.err.count("\n") == 1
+    assert expected in train(f"init_from={bad}")
+    assert not (tmp_path / "trace").exists()
+    assert not list(tmp_path.glob("evaluations/**/versions.json"))
+
+
+def test_evaluation_asks_for_its_checkpoint(call: Runner, tmp_path: Path) -> None:
+    done = call("evaluate.py", f"output_dir={tmp_path}")
+    assert done.line.startswith("got no ckpt_path; allowed: ckpt_path=")
+
+
+def test_a_k_that_cannot_belong_to_the_image(trained: tuple[Path, Any]) -> None:
+    from dopepp import PoseEstimator
+    from dopepp.errors import UserError
+
+    estimator = PoseEstimator.load(trained[0] / "checkpoints" / "best.ckpt")
+    image = np.zeros((120, 160, 3), np.uint8)
+    K = np.array([[1066.8, 0, 313.0], [0, 1067.5, 241.3], [0, 0, 1.0]])  # of 640×480
+    with pytest.raises(UserError, match=r"K .*160") as error:
+        estimator.predict(image, K)
+    assert "\n" not in str(error.value)
+
+
+def test_the_shell_sees_one_line_and_code_two(command: Runner, tmp_path: Path) -> None:
+    done = command("train.py", "data.objects=[003_cracker_box]", f"output_dir={tmp_path}")
+    assert "data.objects=['003_cracker_box'] without data.root" in done.line
+    assert done.err.count("\n") == 1
+    assert done.out == ""

@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import csv
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dopepp.training.system import PoseSystem
+
+Runner = Callable[..., Any]
+FindRun = Callable[[Path], Path]
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    with (run / "metrics.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def steps(run: Path) -> list[int]:
+    return [int(row["step"]) for row in rows(run)]
+
+
+def last(run: Path) -> dict[str, Any]:
+    content: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    return content
+
+
+@pytest.fixture
+def run(call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path) -> Path:
+    """A run of one epoch of two steps, in this test's own folder."""
+    done = call("train.py", *tiny, f"output_dir={tmp_path / 'outputs'}")
+    assert done.code == 0, done.err
+    return find_run(tmp_path / "outputs")
+
+
+def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: FindRun) -> None:
+    before = rows(run)
+    assert steps(run) == [0, 1]
+    done = call("train.py", f"resume={run}", "trainer.max_epochs=2")
+    assert done.code == 0, done.err
+    assert find_run(run.parents[1]) == run  # no second folder
+    assert steps(run) == [0, 1, 2, 3]
+    for old, new in zip(before, rows(run)[:2], strict=True):
+        assert {name: new[name] for name in old} == old
+    assert last(run)["global_step"] == 4
+    assert last(run)["epoch"] == 1
+    assert json.loads((run / "metrics.json").read_text())["num_images"] == 3
+
+    # A finished run has nothing to continue: it is measured again, nothing else.
+    done = call("train.py", f"resume={run}")
+    assert done.code == 0, done.err
+    assert steps(run) == [0, 1, 2, 3]
+
+
+def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
+    call: Runner,
+    find_run: FindRun,
+    tiny: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overrides = [*tiny, "trainer.max_epochs=2"]
+    assert call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}").code == 0
+
+    def press_ctrl_c(system: PoseSystem, batch: object, batch_idx: int) -> None:
+        if (system.current_epoch, batch_idx) == (1, 1):
+            raise KeyboardInterrupt
+
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        patch.setattr(PoseSystem, "on_train_batch_start", press_ctrl_c, raising=False)
+        done = call("train.py", *overrides, f"output_dir={tmp_path / 'cut'}")
+    signal.signal(signal.SIGINT, handler)  # Lightning ignores it from the first one on
+    assert done.code == 130, done.err
+    assert "Traceback" not in done.err
+    run = find_run(tmp_path / "cut")
+    assert done.err.rstrip("\n").rpartition("\n")[2] == f"interrupted: go on with resume={run}"
+    assert not (run / "metrics.json").exists()
+
+    done = call("train.py", f"resume={run}")
+    assert done.code == 0, done.err
+    whole, resumed = (rows(folder) for folder in (find_run(tmp_path / "whole"), run))
+    assert [row["step"] for row in resumed] == ["0", "1", "2", "3"]
+    for name in ("epoch", "train/loss", "val/loss", "lr-AdamW"):
+        values = [[float(row[name] or "nan") for row in table] for table in (whole, resumed)]
+        assert values[1] == pytest.approx(values[0], rel=1e-4, nan_ok=True), name
+    ends = [json.loads((folder / "metrics.json").read_text())["objects"]
+            for folder in (find_run(tmp_path / "whole"), run)]  # fmt: skip
+    assert ends[0] == ends[1]
+
+
+def test_init_from_starts_a_new_run_with_the_weights(
+    run: Path, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = run / "checkpoints" / "best.ckpt"
+    done = call(
+        "train.py", *tiny, f"init_from={path}", "optimizer.lr=1e-12", "scheduler=constant",
+        "optimizer.weight_decay=0", f"output_dir={tmp_path / 'new'}",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    fresh = find_run(tmp_path / "new")
+    assert fresh != run
+    assert last(fresh)["global_step"] == 2  # counted anew
+    trained = torch.load(path, weights_only=True)["state_dict"]
+    for name, value in last(fresh)["state_dict"].items():
+        if "running_" not in name and "num_batches" not in name:  # batch norm still counts
+            torch.testing.assert_close(value, trained[name], atol=1e-6, rtol=0)
+
+
+def test_mistakes_in_the_three_words(
+    run: Path, call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    new = f"output_dir={tmp_path / 'new'}"
+    checkpoint = run / "checkpoints" / "best.ckpt"
+    for overrides, expected in (
+        (["resume=/nowhere"], "resume=/nowhere, which has no checkpoints/last.ckpt"),
+        ([f"resume={checkpoint}"], "which has no checkpoints/last.ckpt"),
+        ([f"init_from={run}"], "which is no file"),
+        ([f"init_from={checkpoint}", "model.width=0.125"], "whose network differs"),
+        (["ckpt_path=x"], "override 'ckpt_path', which names no option"),
+    ):
+        done = call("train.py", *tiny, *overrides, new)
+        assert expected in done.line, overrides
+        # Nothing but Hydra's own folder was begun.
+        assert not list((tmp_path / "new").glob("**/versions.json"))
+
+    before = (run / "checkpoints" / "last.ckpt").read_bytes()
+    done = call("train.py", f"resume={run}", "model/attention=se")
+    assert "whose network differs from the chosen one" in done.line
+    (run / "checkpoints" / "last.ckpt").write_bytes(before[: len(before) // 2])
+    assert "cut short" in call("train.py", f"resume={run}").line

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dopepp.data.rendered import RenderedSource
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.references import REFERENCES
+from dopepp.parts.builtin import pivconnector
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import PRESETS
+
+Runner = Callable[..., Any]
+FindRun = Callable[[Path], Path]
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_run_folder_holds_everything(trained: tuple[Path, Any], tiny: tuple[str, ...]) -> None:
+    run, _ = trained
+    for name in ("auc.png", "overlay.png", "val_auc.png", "val_overlay.png"):
+        image = cv2.imread(str(run / name))
+        assert image is not None, name
+        assert image.std() > 0, name
+    assert rows(run / "auc.csv")[0].keys() == {"threshold_m", "pivconnector"}
+
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["num_images"] == 3
+    assert set(metrics["objects"]) == {"pivconnector", "mean"}
+    assert set(metrics["references"]) == set(REFERENCES)
+    assert metrics["objects"]["pivconnector"]["num_instances"] == 3
+    assert len(metrics["add"]["pivconnector"]) == 3
+    assert metrics["cost"]["ms_per_frame"] > 0
+    assert (run / metrics["checkpoint"]).name == "best.ckpt"
+
+    table = rows(run / "metrics.csv")
+    assert [row["step"] for row in table] == sorted({row["step"] for row in table}, key=int)
+    assert {"train/loss", "val/loss", "val/auc_10cm", "throughput/images_per_s"} <= set(table[0])
+    assert any(name.startswith("lr-") for name in table[0])
+
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["data"]["parts"] == ["pivconnector"]
+    assert config["model"]["backbone"]["width"] == 0.0625  # every interpolation is resolved
+    versions = json.loads((run / "versions.json").read_text())
+    assert versions["packages"]["torch"]
+    assert versions["command"][:2] == ["train.py", tiny[0]]
+    assert len(versions["data_fingerprint"]) == 64
+
+
+def test_a_run_shows_what_it_does(trained: tuple[Path, Any]) -> None:
+    _, done = trained
+    for text in (
+        "config", "model", "width: 0.0625",  # the config's tree
+        "train", "virtual",  # the sources
+        "no accelerator: about", "precision",
+        "pivconnector: 3 test images", "ADD-0.1d", "AUC[0,10cm]", "rotation °", "missed %",
+        "chance, all rotations", "best constant pose",
+        "checkpoints/best.ckpt", "metrics.json",
+    ):  # fmt: skip
+        assert text in done.out, text
+    assert "Epoch 0" in done.out + done.err  # the progress bar
+
+
+def test_a_checkpoint_is_one_safe_file_that_predicts(trained: tuple[Path, Any]) -> None:
+    run, _ = trained
+    path = run / "checkpoints" / "best.ckpt"
+    assert "=" not in path.name  # which Hydra could not parse in ckpt_path=…
+    payload = torch.load(path, weights_only=True)["dopepp"]
+    assert payload["data"]["name"] == "dopepp"
+    estimator = PoseEstimator.load(path)
+    source = RenderedSource(Factory([pivconnector()], PRESETS["paper"], seed=3), 1, "test")
+    sample = source.sample(0)
+    assert isinstance(estimator.predict(sample.image, sample.K), list)
+    # A K of half the image's size, as after resizing the picture without it.
+    from dopepp.errors import UserError
+
+    small = np.ascontiguousarray(sample.image[::4, ::4])
+    with pytest.raises(UserError, match="K") as error:
+        estimator.predict(small, sample.K)
+    assert "\n" not in str(error.value)
+
+
+def test_evaluation_needs_the_checkpoint_alone(
+    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
+) -> None:
+    run, _ = trained
+    path = run / "checkpoints" / "best.ckpt"
+    done = call("evaluate.py", f"ckpt_path={path}", f"output_dir={tmp_path}")
+    assert done.code == 0, done.err
+    folder = find_run(tmp_path)
+    ours, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, run))
+    # The same images, the same poses: the same figures as at the end of training.
+    assert ours["objects"] == theirs["objects"]
+    assert ours["add"] == theirs["add"]
+    assert {path.name for path in folder.iterdir()} >= {
+        "auc.png", "auc.csv", "overlay.png", "config.yaml", "versions.json",
+    }  # fmt: skip
+
+
+def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
+    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
+) -> None:
+    run, _ = trained
+    best, last = (run / "checkpoints" / name for name in ("best.ckpt", "last.ckpt"))
+    done = call(
+        "evaluate.py", f"ckpt_path={best}", f"baseline={last}", "num_pictures=1",
+        f"output_dir={tmp_path}",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    folder = find_run(tmp_path)
+    methods = [row["method"] for row in rows(folder / "compare.csv")]
+    assert methods[:2] == ["dopepp (baseline)", "dopepp"]
+    assert cv2.imread(str(folder / "overlay.png")) is not None
+    assert set(rows(folder / "auc.csv")[0]) >= {"dopepp pivconnector"}
+
+
+def test_other_data_must_show_the_checkpoints_objects(
+    trained: tuple[Path, Any], call: Runner, tmp_path: Path
+) -> None:
+    path = trained[0] / "checkpoints" / "best.ckpt"
+    done = call(
+        "evaluate.py", f"ckpt_path={path}", "data=virtual", "data.parts=[servoholder]",
+        f"output_dir={tmp_path}",
+    )  # fmt: skip
+    assert "test data without pivconnector" in done.line
+    done = call(
+        "evaluate.py", f"ckpt_path={path}", "data=virtual", "data.num_test=1",
+        "data.preset=quickstart", f"output_dir={tmp_path}",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert "pivconnector: 1 test images" in done.out
+
+
+@pytest.mark.parametrize("logger", ["tensorboard"])
+def test_loggers_write_beside_the_table(
+    logger: str, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = call("train.py", *tiny, f"logger={logger}", f"output_dir={tmp_path}")
+    assert done.code == 0, done.err
+    run = find_run(tmp_path)
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    assert "train/loss" in events.Tags()["scalars"]
+    assert {"val/auc", "val/overlay"} <= set(events.Tags()["images"])
+    assert rows(run / "metrics.csv")
+
+
+def test_weights_and_biases_stays_offline(
+    command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = command("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}")
+    assert done.code == 0, done.err[-3000:]
+    run = find_run(tmp_path)
+    assert list(run.glob("wandb/offline-run-*/*.wandb"))
+    assert {path.name.split("_")[0] for path in run.glob("wandb/*/files/media/images/val/*")} == {
+        "auc", "overlay",
+    }  # fmt: skip
+    assert rows(run / "metrics.csv")
+
+
+@pytest.mark.ddp
+def test_two_processes_make_one_run_and_one_report(
+    command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = command(
+        "train.py", *tiny, "trainer=ddp", "trainer.accelerator=cpu", f"output_dir={tmp_path}"
+    )
+    assert done.code == 0, done.err[-4000:]
+    assert done.out.count("3 test images") == 1
+    assert done.out.count("run folder") == 1
+    assert done.out.count("num_test: 3") == 1  # the config's tree
+    run = find_run(tmp_path)
+    # Both processes' images are in the figures: of 8 images and 2 processes, one batch each.
+    assert [row["epoch"] for row in rows(run / "metrics.csv")] == ["0"]
+    assert json.loads((run / "metrics.json").read_text())["num_images"] == 3

@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dopepp import PoseEstimator
+from dopepp.errors import UserError
+from dopepp.geometry.camera import (
+    Letterbox,
+    camera_matrix,
+    make_transform,
+    project_keypoints,
+    transform,
+)
+from dopepp.geometry.rotation import random_rotation
+from dopepp.inference import estimator as module
+from dopepp.inference.estimator import letterboxed, parse_recovery
+from dopepp.maps import MapGeometry, encode
+from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.spec import build_network
+from dopepp.parts.part import Part, make_part
+
+SPEC = {
+    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.125},
+    "attention": {"_target_": "dopepp.models.attention.CBAM"},
+    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.125},
+    "activation": "exp",
+    "num_objects": 2,
+}
+K_VGA = camera_matrix(560, 565, 318.0, 242.5)
+
+
+@pytest.fixture(scope="session")
+def parts() -> list[Part]:
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
+    return [
+        make_part("bracket", None, corners * [0.08, 0.06, 0.1]),
+        make_part("plate", None, corners * [0.105, 0.052, 0.007] + [0.01, 0.02, 0.0]),
+    ]
+
+
+@pytest.fixture(scope="session")
+def checkpoint_path(parts: list[Part], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    checkpoint = Checkpoint(
+        spec=SPEC,
+        state_dict=build_network(SPEC).state_dict(),
+        parts=parts,
+        input_size=(416, 416),
+        stride=8,
+        sigma=1.5,
+        recovery={"peak_threshold": 0.03, "max_peaks": 8},
+    )
+    path = tmp_path_factory.mktemp("checkpoint") / "best.ckpt"
+    write_atomic(checkpoint.to_file(), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def estimator(checkpoint_path: Path) -> PoseEstimator:
+    return PoseEstimator.load(checkpoint_path)
+
+
+def image(width: int, height: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+class Oracle(PoseEstimator):
+    """Knows where the objects are and draws their maps instead of running its network."""
+
+    def show(
+        self, size: tuple[int, int], K: np.ndarray, poses: list[tuple[int, np.ndarray]]
+    ) -> None:
+        box = Letterbox.fit(size, self.checkpoint.input_size)
+        self.truth = [
+            (index, box.points(project_keypoints(self.cuboids[index], T, K))) for index, T in poses
+        ]
+
+    def maps(self, image: np.ndarray) -> module.Maps:
+        assert image.shape[0] % self.network.size_multiple == 0
+        assert image.shape[1] % self.network.size_multiple == 0
+        belief, field = encode(
+            torch.tensor(np.stack([points for _, points in self.truth]))[None],
+            torch.tensor([[index for index, _ in self.truth]]),
+            len(self.parts),
+            (image.shape[0] // 8, image.shape[1] // 8),
+            MapGeometry(8, self.checkpoint.sigma),
+        )
+        return belief[0], field[0]
+
+
+def test_loads_what_was_saved(estimator: PoseEstimator, parts: list[Part]) -> None:
+    assert [part.name for part in estimator.parts] == ["bracket", "plate"]
+    for ours, theirs in zip(estimator.parts, parts, strict=True):
+        assert_allclose(ours.cuboid, theirs.cuboid)
+    assert not estimator.network.training
+    assert estimator.recovery.peak_threshold == 0.03
+    assert estimator.recovery.max_peaks == 8
+    assert estimator.recovery.sigma == 1.5
+
+
+def test_loads_under_weights_only(checkpoint_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    original = torch.load
+
+    def spy(*args: Any, **kwargs: Any) -> Any:
+        calls.append(kwargs.get("weights_only"))
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(torch, "load", spy)
+    PoseEstimator.load(str(checkpoint_path))
+    assert calls
+    assert set(calls) == {True}
+
+
+def test_a_file_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"best\.ckpt"):
+        PoseEstimator.load(tmp_path / "best.ckpt")
+    (tmp_path / "best.ckpt").write_text("weights")
+    with pytest.raises(UserError, match=r"best\.ckpt"):
+        PoseEstimator.load(tmp_path / "best.ckpt")
+
+
+@pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
+def test_any_image_size(estimator: PoseEstimator, size: tuple[int, int]) -> None:
+    longest = max(size)
+    K = camera_matrix(longest, longest, size[0] / 2 - 0.5, size[1] / 2 - 0.5)
+    for one in estimator.predict(image(*size), K):
+        assert one.object in ("bracket", "plate")
+        assert np.isfinite(one.T_cam_obj).all()
+
+
+def test_the_network_sees_the_letterboxed_image(estimator: PoseEstimator) -> None:
+    picture = image(640, 480)
+    padded = letterboxed(picture, Letterbox.fit((640, 480), (416, 416)), 32)
+    assert padded.shape == (320, 416, 3)
+    expected = cv2.resize(picture, (416, 312), interpolation=cv2.INTER_AREA)
+    assert_array_equal(padded[:312], expected)
+    assert not padded[312:].any()
+    belief, field = estimator.maps(padded)
+    with torch.no_grad():
+        batch = torch.tensor(padded).permute(2, 0, 1)[None].contiguous()
+        expected_belief, expected_field = estimator.network.maps(batch)
+    torch.testing.assert_close(belief, expected_belief[0], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(field, expected_field[0], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (416, 416), (2560, 1440), (200, 301)])
+def test_poses_and_pixels_refer_to_the_given_image(
+    checkpoint_path: Path, size: tuple[int, int]
+) -> None:
+    oracle, rng = Oracle.load(checkpoint_path), np.random.default_rng(1)
+    assert isinstance(oracle, Oracle)
+    width, height = size
+    K = camera_matrix(0.9 * width, 0.91 * width, 0.49 * width, 0.52 * height)
+    for _ in range(5):
+        truth = [
+            make_transform(random_rotation(rng), np.array([x, 0.0, 0.4])) for x in (-0.07, 0.07)
+        ]
+        oracle.show(size, K, list(enumerate(truth)))
+        found = oracle.predict(image(*size), K)
+        assert sorted(one.object for one in found) == ["bracket", "plate"]
+        for one in found:
+            index = ["bracket", "plate"].index(one.object)
+            part = oracle.parts[index]
+            there, here = (transform(T, part.cuboid) for T in (truth[index], one.T_cam_obj))
+            assert np.linalg.norm(there - here, axis=1).mean() < 0.1 * part.diameter
+            pixels = project_keypoints(part.cuboid, truth[index], K)
+            assert_allclose(one.keypoints, pixels, atol=0.005 * width)
+            seen = ~np.isnan(one.peaks).any(1)
+            assert seen.sum() >= 5
+            assert_allclose(one.peaks[seen], pixels[seen], atol=0.002 * width)
+            assert one.reprojection_error_px < 0.003 * width
+
+
+def test_distorted_images_are_undistorted_first(
+    estimator: PoseEstimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[np.ndarray] = []
+    original = PoseEstimator.maps
+
+    def spy(self: PoseEstimator, pixels: np.ndarray) -> module.Maps:
+        seen.append(pixels)
+        return original(self, pixels)
+
+    monkeypatch.setattr(PoseEstimator, "maps", spy)
+    picture, distortion = cv2.blur(image(640, 480), (9, 9)), [-0.3, 0.1, 0.001, -0.002, 0.01]
+    estimator.predict(picture, K_VGA, np.array(distortion))
+    by_hand = cv2.undistort(picture, K_VGA, np.array(distortion))
+    assert_array_equal(seen[0], letterboxed(by_hand, Letterbox.fit((640, 480), (416, 416)), 32))
+    estimator.predict(picture, K_VGA, np.zeros((1, 4)))
+    estimator.predict(picture, K_VGA)
+    assert_array_equal(seen[1], seen[2])
+
+
+@pytest.mark.parametrize("bad", [[0.1], [0.1] * 6, [0.1, np.nan, 0, 0], [[0.1, 0.2, 0.3]]])
+def test_bad_distortion(estimator: PoseEstimator, bad: list[float]) -> None:
+    with pytest.raises(UserError, match="4, 5, 8, 12 or 14 finite numbers"):
+        estimator.predict(image(640, 480), K_VGA, np.array(bad))
+
+
+def test_views_and_lists_are_taken(estimator: PoseEstimator) -> None:
+    bgr = image(640, 480)
+    flipped = estimator.predict(bgr[..., ::-1], K_VGA)
+    copied = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA)
+    listed = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA.tolist())
+    assert len(flipped) == len(copied) == len(listed)
+    for one, two in zip(flipped, copied, strict=True):
+        assert_allclose(one.T_cam_obj, two.T_cam_obj)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((480, 640, 3), np.float32),
+        np.zeros((480, 640, 3), np.uint16),
+        np.zeros((480, 640), np.uint8),
+        np.zeros((480, 640, 1), np.uint8),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((3, 480, 640), np.uint8),
+        np.zeros((0, 640, 3), np.uint8),
+        None,
+    ],
+)
+def test_bad_image(estimator: PoseEstimator, bad: Any) -> None:
+    with pytest.raises(UserError, match=r"\(height, width, 3\) uint8 in RGB order") as caught:
+        estimator.predict(bad, K_VGA)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "bad", [np.eye(4), np.full((3, 3), np.nan), K_VGA * 2, camera_matrix(1e5, 1e5, 320, 240), None]
+)
+def test_bad_camera(estimator: PoseEstimator, bad: Any) -> None:
+    with pytest.raises(UserError, match=r"pinhole matrix|field of view"):
+        estimator.predict(image(640, 480), bad)
+
+
+def test_a_recovery_option_of_another_program() -> None:
+    with pytest.raises(UserError, match="recovery option 'nms_radius'"):
+        parse_recovery({"nms_radius": 3.0})
+    with pytest.raises(UserError, match="recovery option max_peaks=0"):
+        parse_recovery({"max_peaks": 0})
+
+
+def loaded_after(code: str) -> set[str]:
+    """Which modules a fresh interpreter has loaded after running some code."""
+    command = f"{code}\nimport sys\nprint(*sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", command], capture_output=True, text=True, check=True
+    )
+    return set(run.stdout.split())
+
+
+def test_importing_dopepp_is_light() -> None:
+    loaded = loaded_after("import dopepp")
+    assert "dopepp" in loaded
+    assert not {"torch", "lightning", "cv2", "scipy"} & loaded
+
+
+@pytest.mark.parametrize("code", ["from dopepp import PoseEstimator", "import dopepp.inference"])
+def test_inference_needs_no_training_and_no_data(code: str) -> None:
+    loaded = loaded_after(code)
+    assert "dopepp.inference.estimator" in loaded
+    packages = {name.split(".")[0] for name in loaded}
+    assert not {"lightning", "hydra", "omegaconf", "wandb", "numba"} & packages
+    above = ("training", "data", "virtual", "experiment", "metrics")
+    assert not {name for name in loaded if name.startswith(tuple(f"dopepp.{p}" for p in above))}
+
+
+def test_an_unknown_name_of_the_package() -> None:
+    import dopepp
+
+    with pytest.raises(AttributeError, match="PoseEstimater"):
+        _ = dopepp.PoseEstimater

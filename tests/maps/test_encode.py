@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dopepp.maps import MapGeometry, encode
+
+GEOMETRY = MapGeometry(stride=8, sigma=1.3, field_radius=2.5)
+
+
+def by_hand(
+    keypoints: np.ndarray, objects: np.ndarray, count: int, size: tuple[int, int], g: MapGeometry
+) -> tuple[np.ndarray, np.ndarray]:
+    """The definition, cell by cell: slow, and written without the code under test."""
+    height, width = size
+    beliefs = np.zeros((len(keypoints), 9 * count, height, width))
+    fields = np.zeros((len(keypoints), 16 * count, height, width))
+    for b, i, j in np.ndindex(len(keypoints), height, width):
+        cell = np.array([g.stride * j, g.stride * i]) + (g.stride - 1) / 2
+        nearest: dict[int, float] = {}
+        for c, points in zip(objects[b], keypoints[b], strict=True):
+            if c < 0:
+                continue
+            for k in range(9):
+                inside = (points[k] >= -0.5) & (points[k] < np.array([width, height]) * g.stride)
+                if not inside.all():
+                    continue
+                distance = math.dist(cell, points[k]) / g.stride
+                value = math.exp(-(distance**2) / (2 * g.sigma**2))
+                beliefs[b, 9 * c + k, i, j] = max(beliefs[b, 9 * c + k, i, j], value)
+                channel = 16 * c + 2 * k
+                closest = min(g.field_radius, nearest.get(channel, np.inf))
+                if k < 8 and distance <= closest and np.isfinite(points[8]).all():
+                    nearest[channel] = distance
+                    vector = points[8] - points[k]
+                    fields[b, channel : channel + 2, i, j] = vector / np.linalg.norm(vector)
+    return beliefs, fields
+
+
+def test_maps_are_what_their_definition_says() -> None:
+    """Several images, objects and instances, padding, absent and off-map keypoints."""
+    rng = np.random.default_rng(0)
+    keypoints = rng.uniform(-30, 150, (3, 4, 9, 2))
+    keypoints[0, 1] = keypoints[0, 0] + 9  # discs overlap
+    keypoints[0, 2, 8] = keypoints[1, 0, 3] = np.nan
+    keypoints[1, 1, 8] = (900.0, -700.0)
+    objects = np.array([[0, 0, 1, -1], [1, 1, 1, 0], [-1, -1, 0, 1]])
+    expected = by_hand(keypoints, objects, 2, (11, 15), GEOMETRY)
+    found = encode(torch.tensor(keypoints), torch.tensor(objects), 2, (11, 15), GEOMETRY)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.dtype == torch.float32
+        assert_close(ours, torch.tensor(theirs).float(), atol=2e-5, rtol=0)
+
+
+def test_cell_centre_is_pixel_8i_plus_3_5() -> None:
+    keypoints = torch.full((1, 1, 9, 2), torch.nan)
+    keypoints[0, 0, 4] = torch.tensor([8 * 5 + 3.5, 8 * 2 + 3.5])
+    belief, _ = encode(keypoints, torch.zeros(1, 1, dtype=torch.long), 1, (6, 9), MapGeometry())
+    assert belief[0, 4, 2, 5] == 1
+    assert belief[0, 4].argmax() == 2 * 9 + 5
+    assert_close(belief[0, 4, 2, 6], torch.tensor(math.exp(-0.5)))
+    assert not belief[0, [0, 1, 2, 3, 5, 6, 7, 8]].any()
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        (math.nan, math.nan),
+        (math.nan, 40.0),
+        (math.inf, 40.0),
+        (-0.6, 40.0),
+        (40.0, 96.0),
+        (1e30, 0),
+    ],
+)
+def test_an_absent_keypoint_leaves_its_channels_empty(where: tuple[float, float]) -> None:
+    keypoints = torch.full((1, 1, 9, 2), 30.0)
+    keypoints[0, 0, 8] = 60.0
+    keypoints[0, 0, 2] = torch.tensor(where)
+    belief, field = encode(keypoints, torch.zeros(1, 1, dtype=torch.long), 1, (12, 12), GEOMETRY)
+    assert not belief[0, 2].any()
+    assert not field[0, 4:6].any()
+    assert belief[0].flatten(1).any(1).sum() == 8
+    assert torch.isfinite(belief).all()
+    assert torch.isfinite(field).all()
+
+
+def test_padding_draws_nothing() -> None:
+    keypoints = torch.full((2, 3, 9, 2), 30.0)
+    belief, field = encode(keypoints, torch.full((2, 3), -1), 2, (12, 12), GEOMETRY)
+    assert belief.shape == (2, 18, 12, 12)
+    assert field.shape == (2, 32, 12, 12)
+    assert not belief.any()
+    assert not field.any()
+
+
+def test_no_instances_at_all() -> None:
+    empty = torch.zeros(2, 0, dtype=torch.long)
+    belief, field = encode(torch.zeros(2, 0, 9, 2), empty, 1, (4, 5), GEOMETRY)
+    assert not belief.any()
+    assert not field.any()
+
+
+def test_a_corner_on_its_centroid_has_no_direction() -> None:
+    keypoints = torch.full((1, 1, 9, 2), 43.5)
+    belief, field = encode(keypoints, torch.zeros(1, 1, dtype=torch.long), 1, (12, 12), GEOMETRY)
+    assert (belief.amax((-2, -1)) == 1).all()
+    assert not field.any()
+
+
+def test_a_batch_is_its_images() -> None:
+    rng = np.random.default_rng(1)
+    keypoints = torch.tensor(rng.uniform(0, 96, (5, 3, 9, 2)))
+    objects = torch.tensor(rng.integers(-1, 2, (5, 3)))
+    together = encode(keypoints, objects, 2, (12, 12), GEOMETRY)
+    for b in range(5):
+        alone = encode(keypoints[b : b + 1], objects[b : b + 1], 2, (12, 12), GEOMETRY)
+        for one, all_of_them in zip(alone, together, strict=True):
+            assert torch.equal(one[0], all_of_them[b])

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import random_rotation
+from dopepp.maps import MapGeometry, Peaks, encode, find_peaks
+
+GEOMETRY = MapGeometry(stride=8, sigma=1.0)
+NUM_CELLS = 30
+
+
+def gaussians(
+    *centres: tuple[float, float], sigma: float = 1.0, height: float = 1.0, cells: int = NUM_CELLS
+) -> Tensor:
+    """One channel with the maximum of Gaussians at (x, y) in cells."""
+    y, x = torch.meshgrid(torch.arange(cells), torch.arange(cells), indexing="ij")
+    belief = torch.zeros(cells, cells)
+    for cx, cy in centres:
+        squared = (x - cx) ** 2 + (y - cy) ** 2
+        belief = torch.maximum(belief, height * torch.exp(-squared / (2 * sigma**2)))
+    return belief[None, None]
+
+
+def positions(peaks: Peaks, channel: int = 0) -> np.ndarray:
+    """Found peaks of the first image's channel in cells, (n, 2)."""
+    found = peaks.position[0, channel][peaks.found[0, channel]]
+    return GEOMETRY.to_cells(found).numpy()
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
+def test_decoding_an_encoded_pose_finds_its_keypoints(sigma: float) -> None:
+    """Bias under 0.1 px and 99 % of errors under 0.5 px, at the border too."""
+    rng = np.random.default_rng(0)
+    geometry = MapGeometry(stride=8, sigma=sigma)
+    cuboid = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
+    K = camera_matrix(400, 400, 127.5, 127.5)
+    low, high = [-0.12, -0.12, 0.25], [0.12, 0.12, 0.5]
+    keypoints = np.stack(
+        [
+            project_keypoints(
+                cuboid, make_transform(random_rotation(rng), rng.uniform(low, high)), K
+            )
+            for _ in range(150)
+        ]
+    )
+    belief, _ = encode(
+        torch.tensor(keypoints)[:, None],
+        torch.zeros(len(keypoints), 1, dtype=torch.long),
+        1,
+        (32, 32),
+        geometry,
+    )
+    peaks = find_peaks(belief, geometry)
+    on_map = ((keypoints > -0.5) & (keypoints < 255.5)).all(-1)
+    assert on_map.mean() < 0.99  # some are off the map
+    border = on_map & ((keypoints < 8) | (keypoints > 247)).any(-1)
+    assert border.sum() > 20
+    assert (peaks.found.sum(-1).numpy() == on_map).all()
+    error = peaks.position[:, :, 0].numpy()[on_map] - keypoints[on_map]
+    distance = np.linalg.norm(error, axis=-1)
+    assert np.abs(error.mean(0)).max() < 0.1
+    assert np.quantile(distance, 0.99) < 0.5
+    assert_close(peaks.spread_px[peaks.found].median().item(), 8 * sigma, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (-0.4, 29.3), (29.4, -0.3), (12.0, 29.49)])
+def test_peaks_on_the_border_are_exact(corner: tuple[float, float]) -> None:
+    found = positions(find_peaks(gaussians(corner), GEOMETRY))
+    assert found == pytest.approx(np.array([corner]), abs=1e-3)
+
+
+def test_pixels_of_a_cell() -> None:
+    peaks = find_peaks(gaussians((5.0, 2.0)), GEOMETRY)
+    assert_close(peaks.position[0, 0, 0], torch.tensor([8 * 5 + 3.5, 8 * 2 + 3.5]))
+    assert peaks.score[0, 0, 0] == 1
+
+
+@pytest.mark.parametrize(
+    "centre", [(10.5, 10.0), (10.0, 10.5), (10.5, 10.5), (0.5, 0.0), (28.5, 28.5)]
+)
+def test_equal_neighbours_are_one_peak(centre: tuple[float, float]) -> None:
+    belief = gaussians(centre)
+    assert (belief == belief.max()).sum() >= 2
+    found = positions(find_peaks(belief, GEOMETRY))
+    assert found == pytest.approx(np.array([centre]), abs=1e-3)
+
+
+@pytest.mark.parametrize("height", [1.3, 2.0, 3.0])
+@pytest.mark.parametrize("sigma", [1.0, 1.5])
+def test_a_clamped_belief_has_one_peak_in_the_middle_of_its_top(
+    height: float, sigma: float
+) -> None:
+    """The activation cuts beliefs off at 1; the flanks still tell where the peak is."""
+    rng = np.random.default_rng(1)
+    for centre in rng.uniform(5, 25, (40, 2)):
+        belief = gaussians((centre[0], centre[1]), sigma=sigma, height=height).clamp(max=1)
+        found = positions(find_peaks(belief, GEOMETRY))
+        assert len(found) == 1
+        assert 8 * np.linalg.norm(found[0] - centre) < 0.5
+
+
+PLATEAUS = {
+    "row": torch.ones(1, 5),
+    "column": torch.ones(5, 1),
+    "square": torch.ones(3, 3),
+    "diagonal": torch.eye(4),
+    "other diagonal": torch.eye(4).flip(0),
+    "flat slope": torch.tensor([[0.0, 0, 0, 1, 1], [1, 1, 1, 1, 0]]),
+    "steep slope": torch.tensor([[0.0, 1], [0, 1], [1, 1], [1, 0]]),
+    "plus": torch.tensor([[0.0, 1, 0], [1, 1, 1], [0, 1, 0]]),
+}
+
+
+@pytest.mark.parametrize("name", PLATEAUS)
+def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name: str) -> None:
+    shape = PLATEAUS[name]
+    belief = torch.zeros(1, 1, NUM_CELLS, NUM_CELLS)
+    belief[0, 0, 10 : 10 + shape.shape[0], 12 : 12 + shape.shape[1]] = shape
+    found = positions(find_peaks(belief, GEOMETRY))
+    rows, columns = np.nonzero(shape.numpy())
+    assert len(found) == 1
+    assert np.linalg.norm(found[0] - [12 + columns.mean(), 10 + rows.mean()]) < 1.0
+
+
+def test_the_steps_of_a_coarse_number_format_are_no_peaks() -> None:
+    """A bf16 belief has terraces on its flanks: equal neighbours below the top."""
+    for sigma in (2.0, 4.0):
+        belief = gaussians((14.3, 15.6), sigma=sigma).bfloat16()
+        found = positions(find_peaks(belief, MapGeometry(8, sigma)))
+        assert found == pytest.approx(np.array([[14.3, 15.6]]), abs=0.05)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0])
+@pytest.mark.parametrize("apart", [3.0, 3.5, 4.0, 6.0])
+def test_two_instances_do_not_pull_at_each_other(sigma: float, apart: float) -> None:
+    rng = np.random.default_rng(2)
+    geometry = MapGeometry(8, sigma)
+    for first, turn in zip(
+        rng.uniform(13, 17, (60, 2)), rng.uniform(0, 2 * np.pi, 60), strict=True
+    ):
+        second = first + apart * sigma * np.array([np.cos(turn), np.sin(turn)])
+        belief = gaussians((first[0], first[1]), (second[0], second[1]), sigma=sigma)
+        found = positions(find_peaks(belief, geometry))
+        assert len(found) == 2
+        for truth in (first, second):
+            assert 8 * np.linalg.norm(found - truth, axis=1).min() < 0.5
+
+
+def test_a_weak_peak_beside_a_strong_one() -> None:
+    belief = torch.maximum(gaussians((10.2, 10.4)), gaussians((14.3, 10.1), height=0.2))
+    peaks = find_peaks(belief, GEOMETRY)
+    assert positions(peaks) == pytest.approx(np.array([[10.2, 10.4], [14.3, 10.1]]), abs=0.06)
+    assert (peaks.score[0, 0].diff() <= 0).all()
+
+
+def test_noise_on_a_peak_moves_it_little() -> None:
+    rng = torch.Generator().manual_seed(0)
+    belief = gaussians((14.3, 15.6)) + 0.02 * torch.randn(
+        1, 200, NUM_CELLS, NUM_CELLS, generator=rng
+    )
+    peaks = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=1)
+    error = GEOMETRY.to_cells(peaks.position[0, :, 0]) - torch.tensor([14.3, 15.6])
+    assert peaks.found.all()
+    assert 8 * error.square().mean().sqrt() < 0.4
+
+
+def test_threshold() -> None:
+    belief = torch.maximum(gaussians((5.0, 5.0), height=0.3), gaussians((20.0, 20.0), height=0.6))
+    assert len(positions(find_peaks(belief, GEOMETRY, threshold=0.2))) == 2
+    assert positions(find_peaks(belief, GEOMETRY, threshold=0.4)) == pytest.approx(
+        np.array([[20.0, 20.0]]), abs=1e-3
+    )
+    assert len(positions(find_peaks(belief, GEOMETRY, threshold=0.6001))) == 0
+
+
+def test_max_peaks_keeps_the_strongest() -> None:
+    heights = [0.3, 0.9, 0.5, 0.7]
+    maps = [gaussians((5.0 + 6 * k, 15.0), height=h) for k, h in enumerate(heights)]
+    peaks = find_peaks(torch.stack(maps).amax(0), GEOMETRY, max_peaks=3)
+    assert peaks.score[0, 0].tolist() == pytest.approx([0.9, 0.7, 0.5])
+    assert positions(peaks)[:, 0] == pytest.approx([11.0, 23.0, 17.0], abs=1e-3)
+
+
+def test_slots_without_a_peak_are_marked() -> None:
+    belief = torch.cat([gaussians((5.0, 5.0), (20.0, 20.0)), gaussians((9.0, 9.0))], dim=1)
+    peaks = find_peaks(belief, GEOMETRY)
+    assert peaks.found.tolist() == [[[True, True], [True, False]]]
+    assert peaks.position[0, 1, 1].isnan().all()
+    assert peaks.score[0, 1, 1] == 0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_constant_map_of_nothing_has_no_peak(value: float) -> None:
+    peaks = find_peaks(torch.full((2, 9, 8, 8), value), GEOMETRY)
+    assert not peaks.found.any()
+
+
+def test_beliefs_of_any_size() -> None:
+    """An identity activation does not bound beliefs; the fit must not care."""
+    for height in (1e3, 1e15):
+        found = positions(find_peaks(gaussians((14.3, 15.6), height=height), GEOMETRY))
+        assert found == pytest.approx(np.array([[14.3, 15.6]]), abs=1e-3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3)])
+def test_tiny_maps(size: tuple[int, int]) -> None:
+    peaks = find_peaks(
+        torch.rand(3, 2, *size, generator=torch.Generator().manual_seed(0)), GEOMETRY
+    )
+    assert peaks.found.any(-1).all()
+    assert torch.isfinite(peaks.position[peaks.found]).all()
+
+
+def test_random_maps_never_give_a_position_that_is_none() -> None:
+    rng = torch.Generator().manual_seed(3)
+    belief = torch.rand(4, 9, 20, 20, generator=rng)
+    belief[0] = (belief[0] > 0.5).float()
+    belief[1, :, ::3] = torch.nan
+    belief[2, :, ::5, ::5] = torch.inf
+    belief[3] *= 1e-3
+    peaks = find_peaks(belief, GEOMETRY, threshold=1e-6)
+    cells = GEOMETRY.to_cells(peaks.position[peaks.found])
+    assert peaks.found.sum() > 100
+    assert (cells > -3).all()
+    assert (cells < 23).all()
+    assert torch.isfinite(peaks.spread_px[peaks.found]).all()
+
+
+def test_a_batch_is_its_images() -> None:
+    rng = torch.Generator().manual_seed(4)
+    belief = torch.rand(5, 9, 16, 20, generator=rng) ** 4
+    together = find_peaks(belief, GEOMETRY, max_peaks=7)
+    for b in range(5):
+        alone = find_peaks(belief[b : b + 1], GEOMETRY, max_peaks=7)
+        slots = alone.score.shape[-1]
+        found = together.found[b : b + 1, :, :slots]
+        assert torch.equal(alone.found, found)
+        assert not together.found[b, :, slots:].any()
+        for name in ("position", "score", "spread_px"):
+            expected = getattr(together, name)[b : b + 1, :, :slots][found]
+            # Not bit by bit: white noise leaves fits that hardly any cell determines.
+            assert_close(getattr(alone, name)[found], expected, rtol=0, atol=0.05)
+            assert (getattr(alone, name)[found] - expected).abs().median() < 1e-6
+
+
+def test_no_gradient_is_kept() -> None:
+    belief = gaussians((5.0, 5.0)).requires_grad_()
+    with torch.inference_mode():
+        assert not find_peaks(belief, GEOMETRY).position.requires_grad

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints, transform
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import random_rotation
+from dopepp.maps import MapGeometry, encode
+
+
+class Scene:
+    """Poses of some objects, and the perfect maps that belong to them."""
+
+    def __init__(
+        self, cuboids: Sequence[np.ndarray], K: np.ndarray, cells: tuple[int, int] = (52, 52)
+    ) -> None:
+        self.cuboids, self.K, self.cells = np.stack(cuboids), K, cells
+        self.objects: list[int] = []
+        self.poses: list[np.ndarray] = []
+
+    def place(self, index: int, T_cam_obj: np.ndarray) -> Scene:
+        self.objects.append(index)
+        self.poses.append(T_cam_obj)
+        return self
+
+    def maps(self, sigma: float = 1.0) -> tuple[Tensor, Tensor]:
+        points = [
+            project_keypoints(self.cuboids[c], T, self.K)
+            for c, T in zip(self.objects, self.poses, strict=True)
+        ]
+        belief, field = encode(
+            torch.tensor(np.array(points))[None],
+            torch.tensor(self.objects)[None],
+            len(self.cuboids),
+            self.cells,
+            MapGeometry(8, sigma),
+        )
+        return belief[0], field[0]
+
+    def error(self, index: int, T_cam_obj: np.ndarray) -> float:
+        """ADD of the cuboid to the nearest instance of an object, in diameters."""
+        cuboid = self.cuboids[index]
+        moved = transform(T_cam_obj, cuboid)
+        errors = [
+            np.linalg.norm(moved - transform(T, cuboid), axis=1).mean()
+            for c, T in zip(self.objects, self.poses, strict=True)
+            if c == index
+        ]
+        return float(min(errors) / np.linalg.norm(cuboid[0] - cuboid[6]))
+
+
+@pytest.fixture(name="K")
+def camera() -> np.ndarray:
+    return camera_matrix(500, 510, 207.5, 205.0)
+
+
+@pytest.fixture
+def box() -> np.ndarray:
+    return cuboid_keypoints(np.array([-0.04, -0.03, -0.05]), np.array([0.04, 0.03, 0.05]))
+
+
+@pytest.fixture
+def plate() -> np.ndarray:
+    half = np.array([0.0525, 0.026, 0.0035])
+    return cuboid_keypoints(-half, half)
+
+
+@pytest.fixture
+def pose() -> Callable[..., np.ndarray]:
+    def draw(
+        rng: np.random.Generator, x: float = 0.0, y: float = 0.0, z: float = 0.4
+    ) -> np.ndarray:
+        """A random rotation at a place, moved by up to a centimetre."""
+        return make_transform(
+            random_rotation(rng), rng.uniform(-0.01, 0.01, 3) + np.array([x, y, z])
+        )
+
+    return draw
+
+
+@pytest.fixture
+def make_scene(K: np.ndarray) -> Callable[..., Scene]:
+    def make(*cuboids: np.ndarray, camera: np.ndarray = K) -> Scene:
+        return Scene(cuboids, camera)
+
+    return make

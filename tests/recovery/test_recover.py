@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.recovery import Detection, RecoveryOptions, recover, recover_batch
+
+Make = Callable[..., Any]
+PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
+
+
+def same(one: Detection, other: Detection) -> None:
+    assert one.object == other.object
+    assert one.score == pytest.approx(other.score, abs=1e-6)
+    assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-5)
+    assert_allclose(one.peaks, other.peaks, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["box", "plate"])
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_all_instances_come_back(
+    name: str, count: int, request: pytest.FixtureRequest, make_scene: Make, pose: Make
+) -> None:
+    cuboid, rng = request.getfixturevalue(name), np.random.default_rng(count)
+    for _ in range(8):
+        scene = make_scene(cuboid)
+        for x, y in PLACES[:count]:
+            scene.place(0, pose(rng, x, y, 0.55))
+        found = recover(*scene.maps(), scene.cuboids, scene.K)
+        assert len(found) == count
+        assert max(scene.error(0, one.T_cam_obj) for one in found) < 0.1
+        places = {tuple(np.round(one.T_cam_obj[:2, 3] / 0.09).astype(int)) for one in found}
+        assert len(places) == count
+
+
+def test_instances_side_by_side_keep_their_own_corners(
+    make_scene: Make, box: np.ndarray, pose: Make
+) -> None:
+    """Their outlines interlock, so only the vector field tells whose corner is whose."""
+    rng, right, total = np.random.default_rng(0), 0, 0
+    for _ in range(20):
+        scene = make_scene(box).place(0, pose(rng, -0.045)).place(0, pose(rng, 0.045))
+        found = recover(*scene.maps(), scene.cuboids, scene.K)
+        errors = [scene.error(0, one.T_cam_obj) for one in found]
+        right, total = right + sum(error < 0.1 for error in errors), total + 2
+    assert right >= 0.9 * total
+
+
+def test_two_objects_in_one_network(
+    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
+) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        scene = make_scene(box, plate)
+        for index, (x, y) in zip([0, 1, 1, 0], PLACES, strict=True):
+            scene.place(index, pose(rng, x, y, 0.55))
+        found = recover(*scene.maps(), scene.cuboids, scene.K, names=["box", "plate"])
+        assert sorted(one.object for one in found) == ["box", "box", "plate", "plate"]
+        for one in found:
+            assert scene.error(["box", "plate"].index(one.object), one.T_cam_obj) < 0.1
+
+
+def test_an_object_that_is_absent_is_not_found(
+    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
+) -> None:
+    scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
+    assert [one.object for one in recover(*scene.maps(), scene.cuboids, scene.K)] == ["1"]
+
+
+@pytest.mark.parametrize("name", ["box", "plate"])
+def test_three_missing_corners_are_borne(
+    name: str, request: pytest.FixtureRequest, make_scene: Make, pose: Make
+) -> None:
+    cuboid, rng = request.getfixturevalue(name), np.random.default_rng(3)
+    good = 0
+    for _ in range(40):
+        scene = make_scene(cuboid).place(0, pose(rng))
+        belief, field = scene.maps()
+        missing = rng.permutation(8)[:3]
+        belief[missing] = 0
+        found = recover(belief, field, scene.cuboids, scene.K)
+        good += len(found) == 1 and scene.error(0, found[0].T_cam_obj) < 0.1
+        for one in found:
+            assert np.isnan(one.peaks[missing]).all()
+            assert np.isfinite(one.keypoints).all()
+            assert one.score == pytest.approx(6 / 9, abs=0.25)
+    assert good >= 36
+
+
+def test_what_a_detection_says(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+    scene = make_scene(box).place(0, pose(np.random.default_rng(4)))
+    (one,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
+    assert one.object == "bracket"
+    assert 0.8 < one.score <= 1
+    truth = project_keypoints(box, scene.poses[0], scene.K)
+    assert_allclose(one.keypoints, project_keypoints(box, one.T_cam_obj, scene.K))
+    assert_allclose(one.keypoints, truth, atol=0.5)
+    assert_allclose(one.peaks, truth, atol=0.5)
+    rms = np.sqrt(((one.peaks - one.keypoints) ** 2).sum(1).mean())
+    assert one.reprojection_error_px == pytest.approx(rms, abs=1e-6)
+    assert_array_equal(one.T_cam_obj[3], [0, 0, 0, 1])
+
+
+def test_best_score_comes_first_and_stays_within_one(
+    make_scene: Make, box: np.ndarray, pose: Make
+) -> None:
+    rng = np.random.default_rng(5)
+    scene = make_scene(box).place(0, pose(rng, -0.1)).place(0, pose(rng, 0.1))
+    belief, field = scene.maps()
+    belief[:, :, :26] *= 0.5
+    belief[:, :, 26:] *= 1.7  # an identity activation does not bound beliefs
+    first, second = recover(belief, field, scene.cuboids, scene.K)
+    assert first.T_cam_obj[0, 3] > 0 > second.T_cam_obj[0, 3]
+    assert 1 >= first.score > second.score >= 0
+    assert len(recover(belief, field, scene.cuboids, scene.K, min_score=0.7)) == 1
+    assert len(recover(belief, field, scene.cuboids, scene.K, centroid_threshold=0.7)) == 1
+
+
+def test_a_part_with_its_origin_elsewhere(make_scene: Make, pose: Make) -> None:
+    cuboid = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        T = pose(rng)
+        T[:3, 3] -= T[:3, :3] @ cuboid[8]
+        scene = make_scene(cuboid).place(0, T)
+        (one,) = recover(*scene.maps(), scene.cuboids, scene.K)
+        assert scene.error(0, one.T_cam_obj) < 0.1
+
+
+def test_empty_maps_give_nothing(box: np.ndarray, K: np.ndarray) -> None:
+    assert recover(torch.zeros(9, 52, 52), torch.zeros(16, 52, 52), box[None], K) == []
+
+
+@pytest.mark.parametrize("kind", ["uniform", "sparse", "constant", "nan", "inf", "field nan"])
+def test_noise_gives_no_exception(kind: str, box: np.ndarray, K: np.ndarray) -> None:
+    rng = torch.Generator().manual_seed(0)
+    belief = torch.rand(18, 20, 24, generator=rng)
+    field = torch.randn(32, 20, 24, generator=rng)
+    if kind == "sparse":
+        belief = belief * (belief > 0.98)
+    elif kind == "constant":
+        belief = torch.full_like(belief, 0.01)
+    elif kind == "nan":
+        belief, field = belief * torch.nan, field * torch.nan
+    elif kind == "inf":
+        belief[:, ::4, ::4] = torch.inf
+    elif kind == "field nan":
+        field *= torch.nan
+    for one in recover(belief, field, np.stack([box, 2 * box]), K):
+        assert np.isfinite(one.T_cam_obj).all()
+        assert (one.T_cam_obj @ np.append(box[8], 1))[2] > 0
+        assert 0 <= one.score <= 1
+
+
+def test_a_batch_is_its_images_each_with_its_own_camera(
+    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
+) -> None:
+    rng = np.random.default_rng(7)
+    cameras = [camera_matrix(f, 1.02 * f, 200.0 + k, 210.0) for k, f in enumerate((450, 500, 600))]
+    scenes = [
+        make_scene(box, plate, camera=camera)
+        .place(0, pose(rng, -0.08, 0, 0.5))
+        .place(1, pose(rng, 0.08, 0, 0.5))
+        for camera in cameras
+    ]
+    maps = [scene.maps() for scene in scenes]
+    belief, field = (torch.stack(kind) for kind in zip(*maps, strict=True))
+    batch = recover_batch(belief, field, scenes[0].cuboids, np.stack(cameras))
+    for scene, found, (one_belief, one_field) in zip(scenes, batch, maps, strict=True):
+        alone = recover(one_belief, one_field, scene.cuboids, scene.K)
+        assert len(found) == len(alone) == 2
+        for one, other in zip(found, alone, strict=True):
+            same(one, other)
+            assert scene.error(int(one.object), one.T_cam_obj) < 0.1
+
+
+def test_maps_in_half_precision_and_channels_last(
+    make_scene: Make, box: np.ndarray, pose: Make
+) -> None:
+    """What a network under autocast hands over."""
+    scene = make_scene(box).place(0, pose(np.random.default_rng(8)))
+    belief, field = (
+        maps[None].bfloat16().to(memory_format=torch.channels_last) for maps in scene.maps()
+    )
+    ((one,),) = recover_batch(belief, field, scene.cuboids, scene.K[None])
+    assert scene.error(0, one.T_cam_obj) < 0.1
+
+
+@pytest.mark.parametrize("sigma", [0.7, 1.5, 2.0])
+def test_any_width_of_the_peaks(
+    sigma: float, make_scene: Make, box: np.ndarray, pose: Make
+) -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(5):
+        scene = make_scene(box).place(0, pose(rng))
+        (one,) = recover(*scene.maps(sigma), scene.cuboids, scene.K, sigma=sigma)
+        assert scene.error(0, one.T_cam_obj) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("belief", "field"),
+    [
+        ((8, 20, 20), (16, 20, 20)),
+        ((9, 20, 20), (8, 20, 20)),
+        ((18, 20, 20), (32, 20, 20)),
+        ((9, 20, 20), (16, 20, 21)),
+    ],
+)
+def test_channels_must_fit_the_objects(
+    belief: tuple[int, ...], field: tuple[int, ...], box: np.ndarray, K: np.ndarray
+) -> None:
+    with pytest.raises(ValueError, match=r"1 objects need \(9, 16\) belief and field channels"):
+        recover(torch.zeros(belief), torch.zeros(field), box[None], K)
+
+
+def test_cameras_and_names_must_fit(box: np.ndarray, K: np.ndarray) -> None:
+    maps = torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8)
+    with pytest.raises(ValueError, match="2 images need as many camera matrices"):
+        recover_batch(*maps, box[None], K)
+    with pytest.raises(ValueError, match="1 objects need as many names"):
+        recover_batch(*maps, box[None], np.stack([K, K]), names=["a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("sigma", 0.0),
+        ("peak_threshold", 0.0),
+        ("centroid_threshold", 2.0),
+        ("max_angle_deg", -1.0),
+        ("max_angle_deg", float("nan")),
+        ("max_peaks", 0),
+        ("min_score", 1.5),
+    ],
+)
+def test_bad_option(option: str, value: float) -> None:
+    with pytest.raises(UserError, match=f"recovery option {option}={value}"):
+        RecoveryOptions(**{option: value})

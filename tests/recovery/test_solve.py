@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dopepp.geometry.camera import project_keypoints, transform
+from dopepp.recovery.association import KeypointGroup
+from dopepp.recovery.solve import solve_group
+
+Pose = Callable[..., np.ndarray]
+
+
+def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
+    if T is None:
+        return np.inf
+    return float(np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean())
+
+
+def test_wide_peaks_count_less(box: np.ndarray, K: np.ndarray, pose: Pose) -> None:
+    """The same noisy pixels with and without the width that betrays the noisy ones."""
+    rng = np.random.default_rng(0)
+    errors = []
+    for _ in range(40):
+        truth = pose(rng)
+        noise = np.array([0.3] * 5 + [6.0] * 4)
+        pixels = project_keypoints(box, truth, K) + rng.normal(size=(9, 2)) * noise[:, None]
+        honest = np.sqrt(8.0**2 + noise**2)[:, None].repeat(2, 1)
+        errors.append(
+            [
+                error(solve_group(group, box, K, 8.0).T_cam_obj, truth, box)
+                for group in (
+                    KeypointGroup(pixels, np.ones(9), honest),
+                    KeypointGroup(pixels, np.ones(9), np.full((9, 2), honest.mean())),
+                )
+            ]
+        )
+    told, untold = np.median(errors, axis=0)
+    assert told < 0.5 * untold
+
+
+def test_maps_narrower_than_their_errors_still_give_poses(
+    box: np.ndarray, K: np.ndarray, pose: Pose
+) -> None:
+    rng = np.random.default_rng(1)
+    good = 0
+    for _ in range(40):
+        truth = pose(rng)
+        pixels = project_keypoints(box, truth, K) + 2.0 * rng.normal(size=(9, 2))
+        group = KeypointGroup(pixels, np.ones(9), np.full((9, 2), 8.0))
+        result = solve_group(group, box, K, 8.0)
+        good += error(result.T_cam_obj, truth, box) < 0.0141  # a tenth of the diameter
+        assert result.T_cam_obj is None or result.inliers.sum() >= 4
+    assert good >= 38
+
+
+def test_too_few_keypoints_have_a_reason(box: np.ndarray, K: np.ndarray) -> None:
+    pixels = np.full((9, 2), np.nan)
+    pixels[:3] = [[0, 0], [50, 0], [0, 50]]
+    spread = np.where(np.isnan(pixels), np.nan, 8.0)
+    result = solve_group(KeypointGroup(pixels, np.zeros(9), spread), box, K, 8.0)
+    assert result.T_cam_obj is None
+    assert "only 3 usable points" in result.reason
