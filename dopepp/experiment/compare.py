@@ -43,15 +43,18 @@ class Failure:
     reason: str
 
 
-def compare(results: Sequence[Report | Failure], folder: Path, note: str = "") -> None:
+def compare(
+    results: Sequence[Report | Failure], folder: Path, note: str = "", baseline: str = BASELINE
+) -> None:
     """Print and write ``compare.csv``, ``compare.md`` and ``compare_auc.{png,csv}`` into a folder.
 
     Args:
-        results: One per method; a method named ``dope``, else the first one, is the baseline.
+        results: One per method.
         folder: Where the files go.
         note: A line below the table, e.g. that both networks were narrowed.
+        baseline: The method of this name, else the first one, is the baseline.
     """
-    ordered = sorted(results, key=lambda result: result.name.split(" ")[0] != BASELINE)
+    ordered = sorted(results, key=lambda r: baseline not in (r.name, r.name.split(" ")[0]))
     table = comparison_table(ordered)
     display.show_comparison([{key: row[key] for key in _SHOWN if key in row} for row in table])
     write_whole(folder / "compare.csv", _csv(table).encode())

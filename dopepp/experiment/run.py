@@ -73,13 +73,12 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     fingerprint = datamodule.fingerprint()
     system = build_system(config, parts, fingerprint)
     resume_from = _resume_path(config["resume"], system)
+    trainer = build_trainer(config, run_dir)  # whatever it refuses, nothing is written yet
     display.show_config(config)
     record.write_config(run_dir, config)
     environment = record.environment(seed, fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     display.show_sources(datamodule.summary())
-
-    trainer = build_trainer(config, run_dir)
     _announce_duration(config, system, datamodule, trainer)
     try:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
@@ -264,7 +263,7 @@ def measure_and_record(
     if tiles:
         write_png(run_dir / "overlay.png", contact_sheet(tiles))
     if len(reports) > 1:
-        compare(reports, run_dir)
+        compare(reports, run_dir, baseline=reports[0].name)
     display.show_files(run_dir)
     return reports
 

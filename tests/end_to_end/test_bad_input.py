@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+
+from dopepp import PoseEstimator
+from dopepp.errors import UserError
 
 Runner = Callable[..., Any]
 
@@ -178,8 +182,6 @@ def hostile_spec(path: Path, good: Path) -> None:
 def hostile_pickle(path: Path, good: Path) -> None:
     class Command:
         def __reduce__(self) -> tuple[Any, tuple[str]]:
-            import os
-
             return os.mkdir, (str(path.parent / "trace"),)
 
     torch.save({"state_dict": Command(), "dopepp": {}}, path)
@@ -228,9 +230,6 @@ def test_evaluation_asks_for_its_checkpoint(call: Runner, tmp_path: Path) -> Non
 
 
 def test_a_k_that_cannot_belong_to_the_image(trained: tuple[Path, Any]) -> None:
-    from dopepp import PoseEstimator
-    from dopepp.errors import UserError
-
     estimator = PoseEstimator.load(trained[0] / "checkpoints" / "best.ckpt")
     image = np.zeros((120, 160, 3), np.uint8)
     K = np.array([[1066.8, 0, 313.0], [0, 1067.5, 241.3], [0, 0, 1.0]])  # of 640×480

@@ -66,6 +66,8 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
 ) -> None:
     overrides = [*tiny, "trainer.max_epochs=2"]
     assert call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}").code == 0
+    # The last epoch's, though nothing has become better since the first one's.
+    assert last(find_run(tmp_path / "whole"))["global_step"] == 4
 
     def press_ctrl_c(system: PoseSystem, batch: object, batch_idx: int) -> None:
         if (system.current_epoch, batch_idx) == (1, 1):

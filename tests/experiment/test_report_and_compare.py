@@ -82,6 +82,11 @@ def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path: Path) ->
     assert (tmp_path / "compare_auc.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_baseline_that_is_asked_for_stands_before_dope(tmp_path: Path) -> None:
+    compare([make_report("dopepp"), make_report("dope")], tmp_path, baseline="dopepp")
+    assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dopepp", "dope"]
+
+
 def test_without_dope_the_first_is_the_baseline() -> None:
     table = comparison_table([make_report("a", 0.1), make_report("b", 0.3)])
     assert [row["Δ ADD-0.1d %"] for row in table[:2]] == ["", "+20.0"]
