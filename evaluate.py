@@ -9,7 +9,7 @@ from dopepp.experiment.command_line import entry, run_job
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     """Run one evaluation."""
-    from dopepp.experiment.run import evaluate
+    from dopepp.experiment.evaluation import evaluate
 
     run_job(config, evaluate)
 

@@ -1,6 +1,6 @@
 """Training speed of the quickstart's network, with and without glibc keeping freed memory.
 
-``python benchmarks/train_step.py`` runs both settings alternately in one process and prints a ratio.
+``python benchmarks/train_step.py`` runs both settings in turn in one process and prints the ratio.
 """
 
 from __future__ import annotations

@@ -103,18 +103,18 @@ class PoseEstimator:
 
 
 def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
-    """Turn a checkpoint's thresholds into options.
+    """Turn the thresholds of a config or a checkpoint into options.
 
     Raises:
-        UserError: A name is none of the options', as in a file of another program.
+        UserError: A name is none of the options', or a value is out of its range.
     """
     allowed = [entry.name for entry in fields(RecoveryOptions)]
     unknown = sorted(set(stored) - set(allowed))
     if unknown:
         raise UserError(
-            f"recovery option {unknown[0]!r} in the checkpoint",
+            f"recovery option {unknown[0]!r}",
             ", ".join(allowed),
-            "use a checkpoint written by this version",
+            "remove it; a checkpoint must be of this version",
         )
     return RecoveryOptions(**stored)  # type: ignore[arg-type]
 

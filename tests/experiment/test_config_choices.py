@@ -12,6 +12,7 @@ import yaml
 from hydra.experimental.callback import Callback
 from hydra.utils import get_class
 
+from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.gates import (
     AUGMENTATIONS,
     CALLBACKS,
@@ -20,7 +21,6 @@ from dopepp.experiment.gates import (
     OPTIMIZERS,
     SCHEDULERS,
 )
-from dopepp.experiment.run import build_system, build_trainer
 from dopepp.experiment.sources import build_parts
 from dopepp.models.gate import Gate
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dopepp.experiment import hardware
+from dopepp.experiment.build import build_system
 from dopepp.experiment.hardware import choose_precision, estimate_training_s
-from dopepp.experiment.run import build_system
 from dopepp.experiment.sources import build_datamodule, build_parts
 
 Composer = Callable[..., dict[str, Any]]

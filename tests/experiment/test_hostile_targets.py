@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from dopepp.errors import UserError
+from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.gates import (
     CALLBACKS,
     LOGGERS,
@@ -18,7 +19,6 @@ from dopepp.experiment.gates import (
     optimizer_factory,
     scheduler_factory,
 )
-from dopepp.experiment.run import build_system, build_trainer
 from dopepp.experiment.sources import build_datamodule, build_parts
 
 Composer = Callable[..., dict[str, Any]]
@@ -26,7 +26,7 @@ HOSTILE = (
     "os.system",
     "subprocess.Popen",
     "builtins.eval",
-    "dopepp.experiment.run.torch.hub.load",
+    "dopepp.experiment.build.torch.hub.load",
     "dopepp.models.spec.build_network",
     "dopepp.training.system.PoseSystem",
     "not_a_module.Thing",

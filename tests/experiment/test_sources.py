@@ -10,8 +10,9 @@ import pytest
 import trimesh
 
 from dopepp.errors import UserError
+from dopepp.experiment.build import build_system
+from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.record import METRICS_FILE, read_json
-from dopepp.experiment.run import build_system, measure_and_record
 from dopepp.experiment.sources import (
     PAPER_OBJECTS,
     build_datamodule,

@@ -1,0 +1,127 @@
+"""From a plain config to the LightningModule and the Trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.loggers import Logger
+
+from dopepp.errors import UserError
+from dopepp.experiment import display
+from dopepp.experiment.gates import (
+    CALLBACKS,
+    LOGGERS,
+    optimizer_factory,
+    scheduler_factory,
+)
+from dopepp.experiment.hardware import choose_precision
+from dopepp.inference.estimator import parse_recovery
+from dopepp.maps.encode import MapGeometry
+from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.gate import TARGET, check_integer, check_number
+from dopepp.models.spec import LOSSES, build_network
+from dopepp.parts.part import Part
+from dopepp.training.loggers import GuardedLogger, MetricsTable
+from dopepp.training.saving import AtomicCheckpointIO
+from dopepp.training.system import PoseSystem
+
+_MAX_EPOCHS: Final = 10**9
+_MIN_CELLS: Final = 0.1
+"""A peak or disc narrower than this, in cells, is on no cell at all."""
+_MAX_THRESHOLD: Final = 1000
+"""Above any map size in cells, angle in degrees and number of peaks that means something."""
+
+
+def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str) -> PoseSystem:
+    """Build the network, its loss and its optimiser as the config names them."""
+    model, maps = config["model"], config["maps"]
+    for group, lowest in (("maps", _MIN_CELLS), ("recovery", 0)):
+        for name, value in config[group].items():
+            check_number(f"{group}.{name}", value, lowest, _MAX_THRESHOLD)
+    loss = LOSSES.build(model["loss"])
+    spec = {name: model[name] for name in ("backbone", "attention", "head")}
+    spec |= {"activation": loss.activation, "num_objects": len(parts)}
+    network = build_network(spec)
+    geometry = MapGeometry(network.stride, maps["sigma"], maps["field_radius"])
+    recovery = parse_recovery({"sigma": geometry.sigma, **config["recovery"]})
+    description = Checkpoint(
+        spec=spec,
+        state_dict={},
+        parts=parts,
+        input_size=tuple(config["data"]["input_size"]),
+        stride=network.stride,
+        sigma=geometry.sigma,
+        recovery=vars(recovery),
+        data={"name": model["name"], "seed": config["seed"], "config": config["data"]},
+        data_fingerprint=fingerprint,
+    )
+    if config["init_from"] is not None:
+        _start_from(network, Path(config["init_from"]))
+    return PoseSystem(
+        network,
+        loss,
+        parts,
+        geometry,
+        recovery,
+        optimizer_factory(config["optimizer"]),
+        scheduler_factory(config["scheduler"]),
+        description.to_payload(),
+        compile_network=config["compile"],
+    )
+
+
+def _start_from(network: torch.nn.Module, path: Path) -> None:
+    """Copy a checkpoint's weights into a network of the same shape."""
+    trained, _ = load_network(path)
+    try:
+        network.load_state_dict(trained.state_dict())
+    except RuntimeError as error:
+        raise UserError(
+            f"init_from={path}, whose network differs from the chosen one",
+            "a checkpoint of the same backbone, attention, head, width and number of objects",
+            "choose the model it was trained with",
+        ) from error
+
+
+def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
+    """Build Lightning's trainer with the config's callbacks and loggers."""
+    options = dict(config["trainer"])
+    check_integer("trainer.max_epochs", options["max_epochs"], 1, _MAX_EPOCHS)
+    check_integer("trainer.max_steps", options["max_steps"], -1, _MAX_EPOCHS)
+    accelerator = options["accelerator"]
+    if accelerator == "auto":
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    elif accelerator == "gpu" and torch.cuda.is_available():
+        accelerator = "cuda"
+    options["precision"], reason = choose_precision(options["precision"], accelerator)
+    display.console.print(f"precision {options['precision']}: {reason}")
+    callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
+    loggers: list[Logger] = [MetricsTable(run_dir / "metrics.csv")]
+    for node in config.get("logger", {}).values():
+        LOGGERS.resolve(node.get(TARGET))  # a wrong name is a mistake, not a logger's failure
+        loggers.append(GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir))))
+    try:
+        return Trainer(
+            **{**options, "accelerator": accelerator},
+            default_root_dir=run_dir,
+            logger=loggers,
+            callbacks=[*callbacks, TQDMProgressBar(refresh_rate=10)],
+            plugins=[AtomicCheckpointIO()],
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            # The DataModule's own sampler knows rank and epoch.
+            use_distributed_sampler=False,
+        )
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        raise UserError(
+            f"trainer {config['trainer']}, which Lightning refuses: {error}",
+            "values of Lightning's Trainer that this machine can run",
+            "correct the trainer's options",
+        ) from error
