@@ -89,12 +89,19 @@ def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) 
         object_names=[part.name for part in parts],
         input_size=input_size,
         batch_size=data["batch_size"],
-        num_workers=len(os.sched_getaffinity(0)) if workers is None else workers,
+        num_workers=_num_cores() if workers is None else workers,
         seed=seed,
         masking=build_optional(MASKINGS, data["masking"]),
         augment=build_optional(AUGMENTATIONS, data["augment"]),
         backgrounds=backgrounds,
     )
+
+
+def _num_cores() -> int:
+    """Return the cores that this process may use, where the system tells (Linux), else all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def build_test_source(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> DescribedSource:
