@@ -47,8 +47,8 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
 def keep_freed_memory() -> None:
     """Let glibc reuse large blocks instead of returning them to the system after each operation.
 
-    By default every large tensor is mapped afresh, and on a CPU the page faults cost about a third
-    of a training step (see ``benchmarks/train_step.py``).
+    By default every large tensor is mapped afresh, and on a CPU the page faults take up to half of
+    a training step (see ``benchmarks/train_step.py``).
     """
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
         libc = ctypes.CDLL(None)

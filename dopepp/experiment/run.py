@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +23,8 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_integer
 from dopepp.training.system import PoseSystem
+
+_log = logging.getLogger(__name__)
 
 PAPER_INPUT_SIZE: Final = (416, 416)
 QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
@@ -106,6 +109,7 @@ def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> 
     path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
     if not path.is_file():
         path = run_dir / record.LAST_CHECKPOINT
+        _log.warning("the run ended before its first validation: measuring %s", path.name)
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
     details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
