@@ -112,7 +112,7 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
             **{**options, "accelerator": accelerator},
             default_root_dir=run_dir,
             logger=loggers,
-            callbacks=[*callbacks, TQDMProgressBar()],
+            callbacks=[*callbacks, TQDMProgressBar(refresh_rate=5)],
             plugins=[AtomicCheckpointIO()],
             enable_model_summary=False,
             num_sanity_val_steps=0,
