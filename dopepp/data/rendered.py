@@ -13,7 +13,7 @@ import numpy as np
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.rasteriser import Rendered
+from dopepp.virtual.scene import Rendered
 
 Split = Literal["train", "val", "test"]
 

@@ -2,6 +2,7 @@
 
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
 from dopepp.virtual.factory import Factory
+from dopepp.virtual.material import Grooves, Material
 from dopepp.virtual.placement import (
     DistancePlacement,
     FacingTurning,
@@ -11,8 +12,16 @@ from dopepp.virtual.placement import (
 )
 from dopepp.virtual.presets import PRESETS, Distractors, Lighting, Preset
 from dopepp.virtual.randomise import random_scene
-from dopepp.virtual.rasteriser import Rendered, render, visible_fractions
-from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.rasteriser import Silhouette, render, silhouette, visible_fractions
+from dopepp.virtual.scene import (
+    Ambient,
+    Light,
+    Plane,
+    Rendered,
+    Scene,
+    SceneObject,
+    Sensor,
+)
 from dopepp.virtual.surface import Surface, make_surface
 
 __all__ = [
@@ -25,19 +34,24 @@ __all__ = [
     "Factory",
     "FillPlacement",
     "FreeTurning",
+    "Grooves",
     "Light",
     "Lighting",
     "Material",
     "OffsetPlacement",
     "PhotoBackgrounds",
+    "Plane",
     "Preset",
     "ProceduralBackgrounds",
     "Rendered",
     "Scene",
     "SceneObject",
+    "Sensor",
+    "Silhouette",
     "Surface",
     "make_surface",
     "random_scene",
     "render",
+    "silhouette",
     "visible_fractions",
 ]

@@ -11,8 +11,8 @@ from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.randomise import random_scene
-from dopepp.virtual.rasteriser import Rendered, render
-from dopepp.virtual.scene import Scene
+from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.scene import Rendered, Scene
 from dopepp.virtual.surface import make_surface
 
 
@@ -27,6 +27,7 @@ class Factory:
         preset: The distribution of scenes.
         seed: Non-negative seed of the whole supply.
         backgrounds: Where backgrounds come from; procedural ones if not given.
+        renderer: Key of :data:`~dopepp.virtual.renderers.RENDERERS`.
 
     Raises:
         UserError: There is no part, a part has no mesh, two share a name, or the seed is negative.
@@ -38,6 +39,7 @@ class Factory:
         preset: Preset,
         seed: int,
         backgrounds: Backgrounds | None = None,
+        renderer: str = "raster",
     ) -> None:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
@@ -49,6 +51,7 @@ class Factory:
             raise UserError(f"seed {seed}", "an integer >= 0", "choose another seed")
         self.parts, self.preset, self.seed = tuple(parts), preset, seed
         self.backgrounds = ProceduralBackgrounds() if backgrounds is None else backgrounds
+        self.renderer, self._render = renderer, find_renderer(renderer)
         self._surfaces = {}
         for part in parts:
             if part.mesh is None:
@@ -70,4 +73,4 @@ class Factory:
         Raises:
             UserError: The preset cannot show the part (see :func:`random_scene`).
         """
-        return render(self.scene(epoch, index))
+        return self._render(self.scene(epoch, index))

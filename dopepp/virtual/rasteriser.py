@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int16, UInt8
+from jaxtyping import Bool, Float, Int16
 
 from dopepp.geometry.camera import resize_camera
 from dopepp.virtual.compiled import Array
-from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
+from dopepp.virtual.scene import NEAR, Light, Rendered, Scene, SceneObject
 from dopepp.virtual.shading import SRGB_TO_LINEAR, TONE_CURVE, shade
 from dopepp.virtual.visibility import (
     CENTRE_SAMPLE,
@@ -33,23 +33,19 @@ _SHADOW_SIDES: Final = (256, 768)
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
-    """An image and its ground truth.
+class Silhouette:
+    """What an object would cover if nothing stood before it.
 
     Attributes:
-        image: RGB, uint8.
-        depth: Metres along z at pixel centres, float32; 0 on the background.
-        instances: Index into ``scene.objects`` at pixel centres, −1 on the background.
-        visible_fractions: Per object, its visible pixels over those of its whole silhouette,
-            alone and without the image's border: occlusion and truncation both count.
-        scene: What was rendered; poses, camera and keypoints are there.
+        mask: Its pixels within the image.
+        num_px: Its pixels on a canvas without borders; infinite around the camera.
+        box: (left, top, right, bottom) of those pixels' bounds, pixels, right and bottom excluded;
+            it may reach beyond the image. None behind the camera.
     """
 
-    image: UInt8[np.ndarray, "height width 3"]
-    depth: Float32[np.ndarray, "height width"]
-    instances: Int16[np.ndarray, "height width"]
-    visible_fractions: Float[np.ndarray, "objects"]
-    scene: Scene
+    mask: Bool[np.ndarray, "height width"]
+    num_px: float
+    box: tuple[int, int, int, int] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +97,23 @@ def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
         )  # fmt: skip
     owners = np.searchsorted(first_ids, ids[..., 0], side="right") - 1
     return _fractions(scene, projected, owners.astype(np.int16))
+
+
+def silhouette(item: SceneObject, K: Array, size: tuple[int, int]) -> Silhouette:
+    """Return an object's whole silhouette, for formats that store it (BOP's ``mask``)."""
+    width, height = size
+    seen, surface = _project(item, K, size), item.surface
+    canvas, ids = np.zeros((height, width, 1), np.float32), np.empty((height, width, 1), np.int32)
+    rasterise(seen.hom, surface.faces, surface.closed, NEAR, (0, 0), CENTRE_SAMPLE, canvas, ids, 0)
+    mask = canvas[..., 0] > 0
+    left, top, right, bottom = bounds(seen.hom, NEAR)
+    if left > right:
+        return Silhouette(mask, 0.0, None)
+    if not math.isfinite(left):
+        return Silhouette(mask, math.inf, (0, 0, width, height))
+    box = (math.ceil(left), math.ceil(top), math.floor(right) + 1, math.floor(bottom) + 1)
+    whole = float(mask.sum()) if _in_frame(seen, size) else _silhouette_px(item, seen, K)
+    return Silhouette(mask, whole, box)
 
 
 def _first_ids(scene: Scene) -> Array:

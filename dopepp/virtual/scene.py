@@ -5,34 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, Int16, UInt8
 
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.parts.part import Part
+from dopepp.virtual.material import Material
 from dopepp.virtual.surface import Surface
 
 NEAR = 0.01
 """Metres; nothing closer to the camera is drawn."""
-
-
-@dataclass(frozen=True)
-class Material:
-    """How a surface reflects light (Lambert plus GGX).
-
-    Attributes:
-        colour: Linear albedo in [0, 1] per channel; a factor on the texture where there is one.
-        roughness: GGX roughness in (0, 1]; 1 is chalk.
-        specular: Reflectance at normal incidence, 0.04 for plastics.
-        noise: Relative amplitude of the albedo's variation over the surface.
-        noise_pitch: Size of that variation, metres.
-    """
-
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
-    roughness: float = 0.6
-    specular: float = 0.04
-    noise: float = 0.0
-    noise_pitch: float = 0.005
 
 
 @dataclass(frozen=True)
@@ -63,6 +45,47 @@ class Ambient:
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
     above: tuple[float, float, float] = (0.25, 0.25, 0.25)
     below: tuple[float, float, float] = (0.12, 0.12, 0.12)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A supporting plane, unbounded: the table the objects lie on.
+
+    Its look is the scene's background, which is a picture of it already; a renderer only darkens
+    it where objects keep light from it. It belongs to the depth, not to the instances.
+
+    Attributes:
+        normal: Unit vector away from the plane, on the camera's side, camera frame.
+        offset: ``normal · x`` of the plane's points, metres; negative, because the camera (at 0)
+            is above the plane.
+    """
+
+    normal: tuple[float, float, float]
+    offset: float
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the camera does to the light, applied to the whole picture after rendering.
+
+    Attributes:
+        exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
+        blur_px: Standard deviation of the defocus, pixels.
+        motion_px: Displacement (x, y) of the image during the exposure, pixels.
+        read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
+        shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
+            it falls with the square root of the signal.
+        jpeg_quality: 1 to 100; None for no compression.
+        noise_seed: Seed of the noise.
+    """
+
+    exposure_ev: float = 0.0
+    blur_px: float = 0.0
+    motion_px: tuple[float, float] = (0.0, 0.0)
+    read_noise: float = 0.0
+    shot_noise: float = 0.0
+    jpeg_quality: int | None = None
+    noise_seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +125,8 @@ class Scene:
         objects: Targets and distractors.
         lights: Point lights, at most a few; the first casts shadows.
         ambient: Light from everywhere else.
+        plane: The supporting plane, or None.
+        sensor: What the camera does to the rendered picture.
     """
 
     K: Float[np.ndarray, "3 3"]
@@ -109,6 +134,8 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     lights: tuple[Light, ...] = ()
     ambient: Ambient = field(default_factory=Ambient)
+    plane: Plane | None = None
+    sensor: Sensor = field(default_factory=Sensor)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -130,3 +157,23 @@ class Scene:
         if item.part is None:
             raise ValueError(f"object {index} is a distractor and has no {NUM_KEYPOINTS} keypoints")
         return project_keypoints(item.part.cuboid, item.T_cam_obj, self.K)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """An image and its ground truth, whichever renderer made it.
+
+    Attributes:
+        image: RGB, uint8.
+        depth: Metres along z at pixel centres, float32; 0 on the background.
+        instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
+        visible_fractions: Per object, its visible pixels over those of its whole silhouette,
+            alone and without the image's border: occlusion and truncation both count.
+        scene: What was rendered; poses, camera and keypoints are there.
+    """
+
+    image: UInt8[np.ndarray, "height width 3"]
+    depth: Float32[np.ndarray, "height width"]
+    instances: Int16[np.ndarray, "height width"]
+    visible_fractions: Float[np.ndarray, "objects"]
+    scene: Scene
