@@ -15,9 +15,10 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
+from dopepp.virtual.material import Material
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.rasteriser import visible_fractions
-from dopepp.virtual.scene import NEAR, Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.scene import NEAR, Ambient, Light, Scene, SceneObject
 from dopepp.virtual.shapes import distractor_shapes
 from dopepp.virtual.surface import Surface
 
