@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from typing import Any
+from typing import Any, Final
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from dopepp.data.batch import Batch
+
+_log = logging.getLogger(__name__)
+
+_STARVED: Final = 0.2
+"""A larger share of waiting is worth a hint."""
 
 
 class Throughput(Callback):
     """Logs images per second and the share of an epoch spent waiting for the loader.
 
     ``throughput/images_per_s`` counts training time only; ``throughput/loader_wait`` is the share
-    of it between the end of one step and the arrival of the next batch.
+    of it between the end of one step and the arrival of the next batch. Both are said in a line
+    per epoch, with what helps where the loader is too slow.
     """
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -43,5 +50,14 @@ class Throughput(Callback):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the epoch's figures."""
         elapsed = max(self._step_ended - self._started, 1e-9)
-        pl_module.log("throughput/images_per_s", self._images / elapsed, rank_zero_only=False)
-        pl_module.log("throughput/loader_wait", self._waited / elapsed, rank_zero_only=False)
+        speed, waiting = self._images / elapsed, self._waited / elapsed
+        pl_module.log("throughput/images_per_s", speed, rank_zero_only=False)
+        pl_module.log("throughput/loader_wait", waiting, rank_zero_only=False)
+        if trainer.is_global_zero:
+            hint = (
+                "; data.cache=memory or disk renders each image once" if waiting > _STARVED else ""
+            )
+            _log.info(
+                "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s",
+                trainer.current_epoch, speed, 100 * waiting, hint,
+            )  # fmt: skip

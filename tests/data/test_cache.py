@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import errno
 import multiprocessing
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,8 +111,65 @@ def test_what_does_not_fit_a_slot_is_refused(fake_source: Any) -> None:
         cached.sample(1)
 
 
+def test_a_file_lasts_and_is_told_apart(fake_source: Any, tmp_path: Path) -> None:
+    first = fake_source(num_items=4)
+    kept = CachedSource(first, (64, 64), tmp_path, identity="a")
+    for index in range(3):
+        kept.sample(index)
+    assert first.calls == [(0, 0), (0, 1), (0, 2)]
+
+    second = fake_source(num_items=4)
+    again = CachedSource(second, (64, 64), tmp_path, identity="a")
+    for index in range(4):
+        assert_same(again.sample(index), fake_source().sample(index))
+    assert second.calls == [(0, 0), (0, 3)]  # the first tells the slot's layout
+    assert again.folder == kept.folder
+
+    for other in (
+        CachedSource(fake_source(num_items=4), (64, 64), tmp_path, identity="b"),
+        CachedSource(fake_source(num_items=5), (64, 64), tmp_path, identity="a"),
+        CachedSource(fake_source(num_items=4), (32, 32), tmp_path, identity="a"),
+    ):
+        assert other.folder != kept.folder
+
+
+def test_a_torn_slot_is_filled_again(fake_source: Any, tmp_path: Path) -> None:
+    kept = CachedSource(fake_source(num_items=4), (64, 64), tmp_path)
+    kept.sample(2)
+    assert kept.folder is not None
+    path = kept.folder / "slots.bin"
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size * 2 // 4 + 100)
+        file.write(b"torn")
+    source = fake_source(num_items=4)
+    assert_same(CachedSource(source, (64, 64), tmp_path).sample(2), fake_source().sample(2))
+    assert (0, 2) in source.calls
+
+
+def test_native_size_keeps_depth(fake_source: Any, tmp_path: Path) -> None:
+    source = fake_source()
+    sample = source.sample(1)
+    sample.depth = np.linspace(0, 1, 48 * 64, dtype=np.float32).reshape(48, 64)
+    source.sample = lambda index, epoch=0: sample
+    kept = CachedSource(source, None, tmp_path).sample(1)
+    np.testing.assert_array_equal(kept.depth, sample.depth)
+    assert CachedSource(source, (64, 64)).sample(1).depth is None
+
+
+def test_no_room_is_one_line(
+    fake_source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(UserError, match=r"data\.cache=disk.*No space left.*data\.cache_dir"):
+        CachedSource(fake_source(), (64, 64), tmp_path)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 def test_describes_itself_as_cached(fake_source: Any) -> None:
     source = fake_source()
     (info,), (plain,) = CachedSource(source, (64, 64)).describe(), source.describe()
-    assert info.identity == {**plain.identity, "cache": "memory"}
+    assert info.identity == {**plain.identity, "cached": True}
     assert CachedSource(source, (64, 64)).contains("box")

@@ -95,8 +95,12 @@ class Run:
 
 @pytest.fixture
 def run(
-    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule], tmp_path: Path
+    make_system: SystemMaker,
+    make_datamodule: Callable[[], PoseDataModule],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> Run:
+    caplog.set_level(logging.INFO)
     return Run(tmp_path, make_system(system_class=Displaced), make_datamodule())
 
 
@@ -134,6 +138,11 @@ def test_figures_pictures_and_throughput(
     assert float(last["throughput/images_per_s"]) > 0
     assert 0 <= float(last["throughput/loader_wait"]) <= 1
     assert float(last["val/auc_10cm"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+
+    # … and said in a line per epoch.
+    said = [r.getMessage() for r in caplog.get_records("setup") if "images/s" in r.getMessage()]
+    assert len(said) == len({line.partition(":")[0] for line in said}) > 0
+    assert "% of the time waiting for the loader" in said[0]
 
     # A logger without its service did not end the run, and said so once.
     complaints = [r for r in caplog.get_records("setup") if "a logger failed" in r.getMessage()]
