@@ -15,4 +15,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    entry(main)
+    entry(main, open_nodes=["virtual.scene"])

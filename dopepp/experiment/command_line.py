@@ -11,7 +11,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,15 +80,21 @@ def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
         )
 
 
-def entry(main: Callable[[], None]) -> None:
-    """Run an entry point and exit with its code; a user's mistake is printed as one line."""
+def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
+    """Run an entry point and exit with its code; a user's mistake is printed as one line.
+
+    Args:
+        main: The function under ``@hydra.main``.
+        open_nodes: Nodes whose keys are not in ``conf/`` but checked later, so that they can be
+            set without Hydra's ``+``: ``virtual.scene`` takes any field of a preset.
+    """
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     # Lightning's own lines say again, and less exactly, what this package says.
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    sys.argv = [sys.argv[0], *_resumed(sys.argv[1:])]
+    sys.argv = [sys.argv[0], *_resumed([_opened(text, open_nodes) for text in sys.argv[1:]])]
     try:
         main()
     except KeyboardInterrupt as interrupt:
@@ -102,6 +108,12 @@ def _exit(line: str, code: int) -> None:
     display.console.file.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)
+
+
+def _opened(argument: str, open_nodes: Sequence[str]) -> str:
+    """Let an override add a key where that is allowed."""
+    inside = argument.startswith(tuple(f"{node}." for node in open_nodes))
+    return f"++{argument}" if inside else argument
 
 
 def _resumed(arguments: list[str]) -> list[str]:

@@ -14,8 +14,9 @@ from dopepp.drawing.sheet import contact_sheet
 from dopepp.errors import UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.compare import compare
+from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import Report, measure
-from dopepp.experiment.sources import build_parts, build_test_source
+from dopepp.experiment.sources import build_test_source
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Part
 
@@ -85,17 +86,56 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     loaded = [PoseEstimator.load(path, device) for path in paths]
     own = loaded[-1].checkpoint
     stored = own.data
-    data = config.get("data") or stored.get("config")
-    if not isinstance(data, dict):
-        raise UserError(
-            f"{config['ckpt_path']}, which names no data", "data=… on the command line", "add it"
-        )
+    data = chosen_data(config, stored.get("config"), str(config["ckpt_path"]))
     record.write_config(run_dir, config)
     environment = record.environment(int(config["seed"]), own.data_fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     seed = int(stored.get("seed", config["seed"]))
     estimators = dict(zip(_names(loaded), loaded, strict=True))
     return measure_and_record(estimators, data, seed, run_dir, config["num_pictures"])
+
+
+def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> dict[str, Any]:
+    """Return the data config to evaluate on: the checkpoint's, with what the user gives instead.
+
+    Args:
+        config: May have ``data`` (whole, or the options to change) and ``virtual`` (options to
+            change).
+        stored: What the checkpoint was trained on.
+        checkpoint: Its path, for messages.
+
+    Raises:
+        UserError: Neither names the data, or an option does not exist.
+    """
+    given = config.get("data") or {}
+    whole = "name" in given  # a file of conf/data, not single options
+    if not whole and not isinstance(stored, dict):
+        raise UserError(
+            f"{checkpoint}, which names no data", "data=… on the command line", "add it"
+        )
+    base = stored if isinstance(stored, dict) else {}
+    data = dict(given) if whole else _changed(base, given, "data")
+    if data.get("virtual") is None:
+        data["virtual"] = base.get("virtual")
+    if data["virtual"] is None:
+        raise UserError(
+            f"{checkpoint}, which does not say how to render", "virtual=default", "add it"
+        )
+    data["virtual"] = _changed(data["virtual"], config.get("virtual") or {}, "virtual")
+    return {**data, "test": {"renderer": None, "cache": "none", **(data.get("test") or {})}}
+
+
+def _changed(base: Mapping[str, Any], changes: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Replace options, one by one also inside groups; ``scene`` takes any key."""
+    merged = dict(base)
+    for key, value in changes.items():
+        if key not in base and not where.startswith("virtual.scene"):
+            raise UserError(
+                f"{where}.{key}={value}", ", ".join(map(str, base)), "check the option's name"
+            )
+        nested = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
+        merged[key] = _changed(base[key], value, f"{where}.{key}") if nested else value
+    return merged
 
 
 def _names(loaded: list[PoseEstimator]) -> list[str]:

@@ -17,8 +17,9 @@ from dopepp.experiment import display, record
 from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
+from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.sources import build_datamodule, build_parts
+from dopepp.experiment.sources import build_datamodule
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_integer

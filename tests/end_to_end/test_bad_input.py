@@ -55,7 +55,7 @@ def train(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> Runner:
         (["maps.sigma=0"], "maps.sigma=0; allowed: a number from 0.1"),
         (["model.width=thin"], "width='thin'; allowed: a number"),
         (["model.backbone._target_=os.system"], "backbone _target_ 'os.system'"),
-        (["data=ycb_video", "data.preset=null"], "data=ycb_video without data.root"),
+        (["data=ycb_video", "virtual.preset=null"], "data=ycb_video without data.root"),
         (["data=hybrid", "data.root=/nowhere"], "data.root=/nowhere, which is no folder"),
         (["data.parts=[gearwheel]"], "unknown part 'gearwheel'; allowed: servoholder, pivc"),
     ],

@@ -137,7 +137,7 @@ def test_other_data_must_show_the_checkpoints_objects(
     assert "test data without pivconnector" in done.line
     done = call(
         "evaluate.py", f"ckpt_path={path}", "data=virtual", "data.num_test=1",
-        "data.preset=quickstart", f"output_dir={tmp_path}",
+        "virtual.preset=quickstart", f"output_dir={tmp_path}",
     )  # fmt: skip
     assert done.code == 0, done.err
     assert "pivconnector: 1 test images" in done.out

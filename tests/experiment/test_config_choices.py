@@ -21,7 +21,7 @@ from dopepp.experiment.gates import (
     OPTIMIZERS,
     SCHEDULERS,
 )
-from dopepp.experiment.sources import build_parts
+from dopepp.experiment.objects import build_parts
 from dopepp.models.gate import Gate
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 

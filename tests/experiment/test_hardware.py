@@ -9,7 +9,8 @@ import torch
 from dopepp.experiment import hardware
 from dopepp.experiment.build import build_system
 from dopepp.experiment.hardware import choose_precision, estimate_training_s
-from dopepp.experiment.sources import build_datamodule, build_parts
+from dopepp.experiment.objects import build_parts
+from dopepp.experiment.sources import build_datamodule
 
 Composer = Callable[..., dict[str, Any]]
 

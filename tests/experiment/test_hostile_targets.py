@@ -19,7 +19,8 @@ from dopepp.experiment.gates import (
     optimizer_factory,
     scheduler_factory,
 )
-from dopepp.experiment.sources import build_datamodule, build_parts
+from dopepp.experiment.objects import build_parts
+from dopepp.experiment.sources import build_datamodule
 
 Composer = Callable[..., dict[str, Any]]
 HOSTILE = (

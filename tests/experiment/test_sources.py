@@ -12,13 +12,9 @@ import trimesh
 from dopepp.errors import UserError
 from dopepp.experiment.build import build_system
 from dopepp.experiment.evaluation import measure_and_record
+from dopepp.experiment.objects import PAPER_OBJECTS, build_parts
 from dopepp.experiment.record import METRICS_FILE, read_json
-from dopepp.experiment.sources import (
-    PAPER_OBJECTS,
-    build_datamodule,
-    build_parts,
-    build_test_source,
-)
+from dopepp.experiment.sources import build_datamodule, build_test_source
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import load_network, write_atomic
 
@@ -107,7 +103,7 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(
     tiny: Composer, ycb_root: Path, tmp_path: Path
 ) -> None:
     objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
-    config = tiny("data=hybrid", "data.preset=null", f"data.root={ycb_root}", objects)
+    config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
     data = config["data"] | {"frames": ["0050/000003"]}
     system = build_system(config, build_parts(data), "")
     path = tmp_path / "untrained.ckpt"
@@ -159,11 +155,11 @@ def test_a_users_mesh_with_its_unit(tiny: Composer, tmp_path: Path) -> None:
         ("data.num_val=0", "data.num_val=0"),
         ("data.num_workers=-1", "data.num_workers=-1"),
         ("data.real_fraction=1.5", "data.real_fraction=1.5"),
-        ("data.cache=disk", "data.cache=disk"),
-        ("data.preset=moon", "preset 'moon'"),
-        ("+data.scene.gravity=1", "'gravity' in preset quickstart"),
-        ("+data.scene.turning=free", "turning='free'"),
-        ("data.backgrounds=/nowhere", "/nowhere"),
+        ("data.cache=tape", "data.cache=tape"),
+        ("virtual.preset=moon", "preset 'moon'"),
+        ("++virtual.scene.gravity=1", "'gravity' in preset quickstart"),
+        ("++virtual.scene.turning=free", "'free' for turning of preset quickstart"),
+        ("virtual.backgrounds=/nowhere", "/nowhere"),
         ("data.masking.probability=2", "probability"),
     ],
 )
@@ -195,7 +191,7 @@ def test_a_root_is_never_replaced_by_renders(composed: Composer, tmp_path: Path)
 
 
 def test_preset_changes_reach_the_renders(tiny: Composer) -> None:
-    plain, changed = tiny(), tiny("+data.scene.horizontal_fov_deg=20")
+    plain, changed = tiny(), tiny("++virtual.scene.horizontal_fov_deg=20")
     fx = [
         build_test_source(config["data"], build_parts(config["data"]), 0).sample(0, 0).K[0, 0]
         for config in (plain, changed)
