@@ -88,7 +88,7 @@ def _bop(
     sets = data["image_sets"]
     return BopSource(
         Path(data["root"]), parts, sets[split], part_of=share_of(sets, split),
-        read_depth=split == "test",
+        targets=data.get("targets") if split == "test" else None, read_depth=split == "test",
     )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def _webdataset(
     sets = data["image_sets"]
     return WebdatasetSource(
         Path(data["root"]), parts, sets[split], part_of=share_of(sets, split),
-        read_depth=split == "test",
+        download_dir=data.get("download_dir"), read_depth=split == "test",
     )  # fmt: skip
 
 
