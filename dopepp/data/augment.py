@@ -1,8 +1,9 @@
 """Photometric augmentation: light, colour, focus, sensor noise and compression vary, poses do not.
 
-To add one, write a method with the image and the generator as arguments, give its range a
-constructor argument and call it in :meth:`Photometric.__call__`, where the order is the order of a
-camera: light and colour, lens, sensor, file.
+Lens, sensor and file are those of the virtual camera (:mod:`dopepp.virtual.sensor`). To add a
+change, write a function of an image, give its range a constructor argument and call it in
+:meth:`Photometric.__call__`, where the order is the order of a camera: light and colour, lens,
+sensor, file.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from dopepp.virtual.sensor import add_noise, compress, defocus
 
 Image = UInt8[np.ndarray, "height width 3"]
 Range = tuple[float, float]
@@ -79,11 +82,11 @@ class Photometric:
         """Return a changed copy of an RGB image."""
         image = cv2.transform(image, self._colour_matrix(rng))
         if rng.random() < self.blur_probability:
-            image = cv2.GaussianBlur(image, (0, 0), rng.uniform(*self.blur_sigma))
+            image = defocus(image, rng.uniform(*self.blur_sigma))
         if rng.random() < self.noise_probability:
-            image = _noisy(image, rng.uniform(*self.noise_sigma), rng)
+            image = add_noise(image, rng.uniform(*self.noise_sigma), 0.0, int(rng.integers(2**32)))
         if rng.random() < self.jpeg_probability:
-            image = _compressed(image, round(rng.uniform(*self.jpeg_quality)))
+            image = compress(image, round(rng.uniform(*self.jpeg_quality)))
         return np.asarray(image)
 
     def _colour_matrix(self, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
@@ -98,17 +101,3 @@ class Photometric:
         linear = contrast * gain[:, None] * (_RGB @ turn @ _YIQ)
         offset = 127.5 * (1 - contrast) + 255 * rng.uniform(-self.brightness, self.brightness)
         return np.column_stack([linear, np.full(3, offset)])
-
-
-def _noisy(image: Image, sigma: float, rng: np.random.Generator) -> Image:
-    noise = rng.standard_normal(image.shape, dtype=np.float32)
-    noise *= np.float32(sigma)
-    noise += image
-    return np.asarray(cv2.convertScaleAbs(np.maximum(noise, 0, out=noise)))
-
-
-def _compressed(image: Image, quality: int) -> Image:
-    # The codec takes the channels as B, G, R; a swapped order would weigh red and blue wrongly.
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))

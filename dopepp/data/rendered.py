@@ -70,7 +70,9 @@ class RenderedSource:
             "seed": self.factory.seed,
             "preset": repr(self.factory.preset),
             "backgrounds": background_identity(self.factory.backgrounds),
+            "renderer": self.factory.renderer,
             "parts": {part.name: part.mesh_hash for part in self.factory.parts},
+            "negatives": {part.name: part.mesh_hash for part in self.factory.negatives},
         }
         return [SourceInfo(self.name, self._num_items, identity)]
 

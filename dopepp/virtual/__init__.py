@@ -1,6 +1,7 @@
 """The virtual-reality factory: from parts to labelled images, without torch and without files."""
 
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
+from dopepp.virtual.customise import customised_preset
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.material import Grooves, Material
 from dopepp.virtual.placement import (
@@ -10,7 +11,15 @@ from dopepp.virtual.placement import (
     FreeTurning,
     OffsetPlacement,
 )
-from dopepp.virtual.presets import PRESETS, Distractors, Lighting, Preset
+from dopepp.virtual.presets import (
+    PRESETS,
+    Distractors,
+    Lighting,
+    Materials,
+    Preset,
+    Sensors,
+    Table,
+)
 from dopepp.virtual.randomise import random_scene
 from dopepp.virtual.rasteriser import Silhouette, render, silhouette, visible_fractions
 from dopepp.virtual.scene import (
@@ -22,6 +31,7 @@ from dopepp.virtual.scene import (
     SceneObject,
     Sensor,
 )
+from dopepp.virtual.sensor import capture
 from dopepp.virtual.surface import Surface, make_surface
 
 __all__ = [
@@ -38,6 +48,7 @@ __all__ = [
     "Light",
     "Lighting",
     "Material",
+    "Materials",
     "OffsetPlacement",
     "PhotoBackgrounds",
     "Plane",
@@ -47,8 +58,12 @@ __all__ = [
     "Scene",
     "SceneObject",
     "Sensor",
+    "Sensors",
     "Silhouette",
     "Surface",
+    "Table",
+    "capture",
+    "customised_preset",
     "make_surface",
     "random_scene",
     "render",

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dopepp.errors import UserError
+from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
+from dopepp.virtual.body import make_body
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.randomise import random_scene
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Rendered, Scene
-from dopepp.virtual.surface import make_surface
+from dopepp.virtual.sensor import capture
 
 
 class Factory:
@@ -28,9 +31,12 @@ class Factory:
         seed: Non-negative seed of the whole supply.
         backgrounds: Where backgrounds come from; procedural ones if not given.
         renderer: Key of :data:`~dopepp.virtual.renderers.RENDERERS`.
+        negatives: Parts that are shown among the distractors, so that a network learns not to
+            find them; the built-in parts that are no targets are always among them.
 
     Raises:
-        UserError: There is no part, a part has no mesh, two share a name, or the seed is negative.
+        UserError: There is no part, a part has no mesh, two share a name, a negative is a target
+            (by name or mesh), or the seed is negative.
     """
 
     def __init__(
@@ -40,6 +46,7 @@ class Factory:
         seed: int,
         backgrounds: Backgrounds | None = None,
         renderer: str = "raster",
+        negatives: Sequence[Part] = (),
     ) -> None:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
@@ -50,27 +57,43 @@ class Factory:
         if seed < 0:
             raise UserError(f"seed {seed}", "an integer >= 0", "choose another seed")
         self.parts, self.preset, self.seed = tuple(parts), preset, seed
+        self.negatives = _all_negatives(parts, negatives)
         self.backgrounds = ProceduralBackgrounds() if backgrounds is None else backgrounds
         self.renderer, self._render = renderer, find_renderer(renderer)
-        self._surfaces = {}
-        for part in parts:
-            if part.mesh is None:
-                raise UserError(
-                    f"part {part.name} without a mesh",
-                    "parts that were read from a mesh file or built in",
-                    "give the part's mesh file; a checkpoint's objects table holds no mesh",
-                )
-            self._surfaces[part.name] = make_surface(part.mesh)
+        self._targets = [make_body(part, is_target=True) for part in parts]
+        self._others = [make_body(part, is_target=False) for part in self.negatives]
 
     def scene(self, epoch: int, index: int) -> Scene:
         """Return the scene of an image without rendering it."""
         rng = np.random.default_rng([self.seed, epoch, index])
-        return random_scene(self.preset, self.parts, rng, self._surfaces, self.backgrounds)
+        return random_scene(self.preset, self._targets, self._others, rng, self.backgrounds)
 
     def render(self, epoch: int, index: int) -> Rendered:
-        """Render an image with its ground truth.
+        """Render an image with its ground truth, as the scene's sensor takes it.
 
         Raises:
             UserError: The preset cannot show the part (see :func:`random_scene`).
         """
-        return self._render(self.scene(epoch, index))
+        rendered = self._render(self.scene(epoch, index))
+        return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
+
+
+def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
+    """Return the given negatives and the built-in parts that are neither targets nor given.
+
+    Raises:
+        UserError: A given negative has the name or the mesh of a target.
+    """
+    names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
+    for part in given:
+        if part.name in names or part.mesh_hash in hashes:
+            raise UserError(
+                f"negative {part.name}, which is one of the targets {', '.join(sorted(names))}",
+                "parts of other names and other meshes than the targets'",
+                "take it out of the negatives",
+            )
+    known = names | {part.name for part in given}
+    hashes |= {part.mesh_hash for part in given}
+    built_in = (make() for make in BUILTIN.values())
+    others = [p for p in built_in if p.name not in known and p.mesh_hash not in hashes]
+    return (*given, *others)

@@ -15,9 +15,14 @@ from jaxtyping import Float
 from dopepp.errors import UserError
 from dopepp.geometry.camera import project
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
+from dopepp.virtual.ranges import check_number
 
-_CENTRING_STEPS: Final = 4
-"""Perspective moves a tilted part's box off its centre's image; so many steps bring it back."""
+_CENTRING_STEPS: Final = 10
+_CENTRED_PX: Final = 0.05
+"""Perspective moves a tilted part's box off its centre's image; a few steps bring it back."""
+
+_FARTHEST: Final = 1000.0
+"""Metres; nothing that a camera is to see is farther away."""
 
 _MAX_STEPS: Final = 80
 _SHARE_TOLERANCE: Final = 1e-4
@@ -80,9 +85,8 @@ class FacingTurning:
 
     def __post_init__(self) -> None:
         """Check the angles."""
-        for name, value in (("in_plane_deg", self.in_plane_deg), ("tilt_deg", self.tilt_deg)):
-            if not 0.0 <= value <= 180.0:
-                raise UserError(f"{name}={value}", "0 to 180 degrees", f"change {name}")
+        for name in ("in_plane_deg", "tilt_deg"):
+            check_number(self, name, 0.0, 180.0, "degrees")
 
     def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
         """Return a rotation from the object to the camera frame."""
@@ -110,10 +114,12 @@ class OffsetPlacement:
 
     def __post_init__(self) -> None:
         """Check that the box lies before the camera."""
-        if not (0.0 <= self.axial < self.distance and self.lateral >= 0.0):
+        for name in ("distance", "axial", "lateral"):
+            check_number(self, name, 0.0, _FARTHEST, "metres")
+        if not self.axial < self.distance:
             raise UserError(
-                f"distance={self.distance}, axial={self.axial}, lateral={self.lateral}",
-                "0 <= axial < distance and lateral >= 0, in metres",
+                f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
+                "axial < distance, in metres",
                 "move the box of positions before the camera",
             )
 
@@ -145,10 +151,13 @@ class DistancePlacement:
 
     def __post_init__(self) -> None:
         """Check the range."""
-        if not (0.0 < self.nearest <= self.farthest and 0.0 <= self.margin < 0.5):
+        for name in ("nearest", "farthest"):
+            check_number(self, name, 1e-6, _FARTHEST, "metres")
+        check_number(self, "margin", 0.0, 0.49, "share")
+        if self.nearest > self.farthest:
             raise UserError(
-                f"nearest={self.nearest}, farthest={self.farthest}, margin={self.margin}",
-                "0 < nearest <= farthest in metres and 0 <= margin < 0.5",
+                f"nearest={self.nearest} and farthest={self.farthest} of DistancePlacement",
+                "nearest <= farthest, in metres",
                 "change the placement's range",
             )
 
@@ -182,10 +191,12 @@ class FillPlacement:
 
     def __post_init__(self) -> None:
         """Check the range."""
-        if not 0.0 < self.smallest <= self.largest <= 1.0:
+        for name in ("smallest", "largest"):
+            check_number(self, name, 1e-3, 1.0, "share of the image")
+        if self.smallest > self.largest:
             raise UserError(
-                f"smallest={self.smallest}, largest={self.largest}",
-                "0 < smallest <= largest <= 1 of the image",
+                f"smallest={self.smallest} and largest={self.largest} of FillPlacement",
+                "smallest <= largest, shares of the image",
                 "change the placement's range",
             )
 
@@ -208,7 +219,10 @@ class FillPlacement:
             lower, upper = image.min(axis=0), image.max(axis=0)
             # The bounding box moves as far as it has room; one that fills the image cannot move.
             wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
-            pixel = pixel + wanted - (lower + upper) / 2
+            missing = wanted - (lower + upper) / 2
+            if np.abs(missing).max() < _CENTRED_PX:
+                break
+            pixel = pixel + missing
         return np.asarray(depth * ray - centre)
 
 

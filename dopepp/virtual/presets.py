@@ -14,6 +14,9 @@ from jaxtyping import Float
 
 from dopepp.errors import UserError
 from dopepp.geometry.camera import camera_matrix, check_camera, resize_camera
+from dopepp.virtual.distractors import Distractors
+from dopepp.virtual.lighting import Lighting
+from dopepp.virtual.materials import Materials
 from dopepp.virtual.placement import (
     DistancePlacement,
     FacingTurning,
@@ -23,45 +26,11 @@ from dopepp.virtual.placement import (
     Placement,
     Turning,
 )
+from dopepp.virtual.ranges import check_counts, check_number
+from dopepp.virtual.sensors import Sensors
+from dopepp.virtual.table import Table
 
-
-@dataclass(frozen=True)
-class Lighting:
-    """Ranges of light; intensities are what a white surface facing the light reflects, 1 clips.
-
-    Attributes:
-        num_lights: Smallest and largest number of point lights; the first casts shadows.
-        key_intensity: Of the first light.
-        fill_intensity: Of the second light.
-        ambient_intensity: Of the light from everywhere.
-        max_angle_deg: Largest angle between a light's direction and the camera's, as seen from
-            the scene; 0 is a flash light on the camera, 90 a light from the side.
-        distance: Of a light from the scene, in units of the camera's distance.
-        tint: Largest relative deviation of a colour channel from white.
-    """
-
-    num_lights: tuple[int, int] = (1, 2)
-    key_intensity: tuple[float, float] = (0.45, 1.3)
-    fill_intensity: tuple[float, float] = (0.1, 0.4)
-    ambient_intensity: tuple[float, float] = (0.08, 0.4)
-    max_angle_deg: float = 75.0
-    distance: tuple[float, float] = (1.0, 5.0)
-    tint: float = 0.12
-
-
-@dataclass(frozen=True)
-class Distractors:
-    """Random primitives around the targets.
-
-    Attributes:
-        number: Smallest and largest number per image.
-        image_share: Smallest and largest diameter of a distractor's image over the image's width.
-        depth: Smallest and largest depth in units of the first target's depth.
-    """
-
-    number: tuple[int, int] = (0, 2)
-    image_share: tuple[float, float] = (0.12, 0.5)
-    depth: tuple[float, float] = (0.6, 1.6)
+__all__ = ["PRESETS", "Distractors", "Lighting", "Materials", "Preset", "Sensors", "Table"]
 
 
 @dataclass(frozen=True)
@@ -75,15 +44,20 @@ class Preset:
         horizontal_fov_deg: Horizontal field of view, degrees, of a camera with square pixels that
             looks through the image's middle; ignored where ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
-        turning: Distribution of the targets' orientation.
-        placement: Distribution of the targets' position.
-        targets_per_image: Smallest and largest number of targets; each is a random part.
+        turning: Distribution of the targets' orientation; of no use on a table.
+        placement: Distribution of the targets' position; of no use on a table.
+        table: The plane that everything lies on; None for objects in mid-air.
+        targets_per_image: Smallest and largest number of targets, each a random part; one after
+            the first that finds no place is left out. Images without any are for learning and
+            testing silence.
         min_visible_fraction: Smallest visible fraction of every target; scenes are drawn again,
             a bounded number of times, to keep it.
         centroid_inside: Whether the image of every target's cuboid centre must lie inside the
             frame.
         lighting: Distribution of light.
+        materials: Distribution of what targets and distractors are made of.
         distractors: Distribution of distractors.
+        sensors: Distribution of what the camera does to the light.
     """
 
     name: str
@@ -93,37 +67,27 @@ class Preset:
     intrinsics_px: tuple[float, float, float, float] | None = None
     turning: Turning = field(default_factory=FreeTurning)
     placement: Placement = field(default_factory=OffsetPlacement)
+    table: Table | None = None
     targets_per_image: tuple[int, int] = (1, 1)
     min_visible_fraction: float = 0.5
     centroid_inside: bool = True
     lighting: Lighting = field(default_factory=Lighting)
+    materials: Materials = field(default_factory=Materials)
     distractors: Distractors = field(default_factory=Distractors)
+    sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
         """Check what a user may have replaced."""
-        for name, (low, high), least in (
-            ("targets_per_image", self.targets_per_image, 1),
-            ("distractors.number", self.distractors.number, 0),
-            ("lighting.num_lights", self.lighting.num_lights, 0),
-        ):
-            if not least <= low <= high:
-                raise UserError(
-                    f"{name}=({low}, {high}) of preset {self.name}",
-                    f"two counts with {least} <= smallest <= largest",
-                    f"change {name}",
-                )
-        if not (self.width >= 8 and self.height >= 8 and 0 <= self.min_visible_fraction <= 0.95):
+        check_counts(self, "targets_per_image", 0, 100)
+        for name in ("width", "height"):
+            check_number(self, name, 8, 16384, "pixels")
+        check_number(self, "min_visible_fraction", 0.0, 0.95, "share")
+        check_number(self, "horizontal_fov_deg", 5.0, 150.0, "degrees")
+        if self.intrinsics_px is not None and len(self.intrinsics_px) != 4:
             raise UserError(
-                f"width={self.width}, height={self.height}, min_visible_fraction="
-                f"{self.min_visible_fraction} of preset {self.name}",
-                "an image of at least 8×8 pixels and a fraction in [0, 0.95]",
-                "change the preset's fields",
-            )
-        if not 5.0 <= self.horizontal_fov_deg <= 150.0:
-            raise UserError(
-                f"horizontal_fov_deg={self.horizontal_fov_deg} of preset {self.name}",
-                "5 to 150 degrees",
-                "change horizontal_fov_deg",
+                f"intrinsics_px={self.intrinsics_px} of preset {self.name}",
+                "four numbers, fx, fy, cx and cy in pixels, or None",
+                "change intrinsics_px",
             )
         check_camera(self.K, (self.width, self.height), f"preset {self.name}")
 
@@ -144,7 +108,10 @@ class Preset:
         """
         K = resize_camera(self.K, width / self.width, height / self.height)
         intrinsics_px = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        return replace(self, width=width, height=height, intrinsics_px=intrinsics_px)
+        sensors = self.sensors.resized(width / self.width)
+        return replace(
+            self, width=width, height=height, intrinsics_px=intrinsics_px, sensors=sensors
+        )
 
 
 PRESETS: dict[str, Preset] = {
@@ -155,15 +122,36 @@ PRESETS: dict[str, Preset] = {
         # not in the paper: 90° is an inference, the one at which ±15 cm just spans the image's
         # height (30 cm of 40 cm × 30 cm) at 20 cm.
         Preset("paper", 640, 480, horizontal_fov_deg=90.0, distractors=Distractors((0, 0))),
-        # A task that two cores learn in minutes: one face, a limited range of poses.
+        # A task that two cores learn in minutes: one face, a limited range of poses, a good camera.
         Preset(
             "quickstart", 128, 128, turning=FacingTurning(), placement=FillPlacement(),
             min_visible_fraction=0.7,
+            lighting=Lighting((1, 2), temperature_k=(5000.0, 8000.0)),
+            materials=Materials(metal_share=0.05, layer_slope=(0.05, 0.3)),
+            distractors=Distractors(lookalike_share=0.15),
+            sensors=Sensors(
+                exposure_ev=(-0.2, 0.2), blur_px=(0.2, 0.5), motion_px=(0.5, 1.5),
+                read_noise=(0.3, 1.0), shot_noise=(0.3, 1.5), jpeg_quality=(85, 95),
+            ),
         ),
         # Textured household objects as YCB-Video's first camera sees them (scenes 0000 to 0059).
         Preset(
             "ycb", 640, 480, intrinsics_px=(1066.778, 1067.487, 312.9869, 241.3109),
             placement=DistancePlacement(), distractors=Distractors((0, 3)),
+        ),
+        # Parts that lie on a table beside others, as a robot's wrist camera sees them.
+        Preset(
+            "table", 640, 480, table=Table(), targets_per_image=(1, 3),
+            distractors=Distractors((0, 8), image_share=(0.06, 0.25), lookalike_share=0.4),
+        ),
+        # A heap of parts that hide each other.
+        Preset(
+            "bin", 640, 480,
+            table=Table(distance=(0.3, 0.6), elevation_deg=(45.0, 90.0), tilted_share=0.6,
+                        heaped=True),
+            targets_per_image=(3, 10), min_visible_fraction=0.15,
+            materials=Materials(alike_share=0.8),
+            distractors=Distractors((0, 2), image_share=(0.06, 0.2)),
         ),
     )
 }  # fmt: skip

@@ -9,13 +9,14 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 
 from dopepp.parts.part import Mesh
+from dopepp.virtual.body import Body
 from dopepp.virtual.surface import Surface, make_surface
 
 
 @cache
-def distractor_shapes() -> tuple[Surface, ...]:
+def distractor_shapes() -> tuple[Body, ...]:
     """Return the library of shapes; each is centred and has a bounding sphere of radius 1."""
-    return tuple(_unit_surface(solid) for solid in _solids())
+    return tuple(Body(_unit_surface(solid)) for solid in _solids())
 
 
 def _solids() -> Iterator[Manifold]:

@@ -20,22 +20,28 @@ from dopepp.virtual import (
     PRESETS,
     Factory,
     PhotoBackgrounds,
-    Preset,
     ProceduralBackgrounds,
     Rendered,
+    render,
 )
+from dopepp.virtual.presets import Distractors, Preset, Sensors
+from dopepp.virtual.sensor import capture
 
 DIGEST = """
 import sys
 sys.path.insert(0, {folder!r})
-from test_factory import digest, make_factory
-factory = make_factory()
+from test_factory import digest, make_factory, small
+factory = make_factory(preset=small({name!r}))
 print([digest(factory.render(epoch, index)) for epoch, index in {items!r}])
 """
 
 
 def make_factory(seed: int = 7, preset: Preset | None = None) -> Factory:
     return Factory([servoholder(), pivconnector()], preset or PRESETS["quickstart"], seed)
+
+
+def small(name: str) -> Preset:
+    return PRESETS[name].resized(128, 96)
 
 
 def digest(rendered: Rendered) -> str:
@@ -69,11 +75,12 @@ def test_a_distractor_has_no_keypoints() -> None:
         scene.keypoints(1)
 
 
-def test_same_bytes_in_another_process_and_order() -> None:
+@pytest.mark.parametrize("name", ["quickstart", "table", "bin"])
+def test_same_bytes_in_another_process_and_order(name: str) -> None:
     items = [(0, 0), (0, 1), (3, 1), (0, 12)]
-    factory = make_factory()
+    factory = make_factory(preset=small(name))
     expected = [digest(factory.render(*item)) for item in reversed(items)][::-1]
-    script = DIGEST.format(folder=str(Path(__file__).parent), items=items)
+    script = DIGEST.format(folder=str(Path(__file__).parent), items=items, name=name)
     result = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
@@ -81,10 +88,84 @@ def test_same_bytes_in_another_process_and_order() -> None:
     assert len(set(expected)) == len(items)
 
 
-def test_a_pickled_factory_renders_the_same() -> None:
-    factory = make_factory()
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_pickled_factory_renders_the_same(name: str) -> None:
+    factory = make_factory(preset=small(name))
+    factory.render(0, 1)  # what it keeps for later images must change none
     copy = pickle.loads(pickle.dumps(factory))
     assert digest(copy.render(2, 5)) == digest(factory.render(2, 5))
+
+
+def test_the_sensor_takes_the_renderers_picture() -> None:
+    noisy = Sensors(noise_probability=1.0, blur_probability=1.0, jpeg_probability=1.0)
+    factory = make_factory(preset=replace(PRESETS["quickstart"], sensors=noisy))
+    ideal, taken = render(factory.scene(0, 3)), factory.render(0, 3)
+    assert taken.scene.sensor.jpeg_quality is not None
+    np.testing.assert_array_equal(taken.image, capture(ideal.image, taken.scene.sensor))
+    np.testing.assert_array_equal(taken.depth, ideal.depth)
+    np.testing.assert_array_equal(taken.instances, ideal.instances)
+    assert np.abs(taken.image.astype(int) - ideal.image).mean() > 0.5
+
+
+def lookalikes(factory: Factory, num_scenes: int = 20) -> tuple[list[float], int]:
+    """Radii of the negatives that scenes show, and how many other distractors there are."""
+    sizes = [float(np.linalg.norm(part.cuboid[:8], axis=1).max()) for part in factory.negatives]
+    negative_faces = {len(p.mesh.faces) for p in factory.negatives if p.mesh is not None}
+    others, radii = 0, []
+    for index in range(num_scenes):
+        scene = factory.scene(0, index)
+        for item in scene.objects[len(scene.targets) :]:
+            assert item.label == "distractor"
+            if len(item.surface.faces) in negative_faces:
+                radii.append(item.surface.radius / max(sizes))
+            else:
+                others += 1
+    return radii, others
+
+
+def with_distractors(**changes: float) -> Preset:
+    return replace(PRESETS["ycb"], distractors=Distractors((3, 3), **changes))
+
+
+def test_other_parts_stand_among_the_distractors() -> None:
+    factory = Factory([pivconnector()], with_distractors(lookalike_share=0.5), 0)
+    assert [part.name for part in factory.negatives] == ["servoholder"]
+    radii, others = lookalikes(factory)
+    assert 0.3 < len(radii) / (len(radii) + others) < 0.7
+    # The farthest vertex lies a little inside of the cuboid's corner.
+    assert 0.6 < min(radii) < max(radii) <= 1.3
+
+
+def test_without_lookalikes_or_other_parts_there_are_only_primitives() -> None:
+    none = Factory([pivconnector()], with_distractors(lookalike_share=0.0), 0)
+    assert lookalikes(none)[0] == []
+    both = Factory([pivconnector(), servoholder()], with_distractors(lookalike_share=1.0), 0)
+    assert both.negatives == ()
+    assert lookalikes(both)[1] > 20
+
+
+def test_given_negatives_come_first_and_once(box_part: Part) -> None:
+    factory = Factory([pivconnector()], with_distractors(lookalike_share=1.0), 0,
+                      negatives=[box_part, servoholder()])  # fmt: skip
+    assert [part.name for part in factory.negatives] == ["box", "servoholder"]
+    assert lookalikes(factory)[1] == 0
+    copy = pickle.loads(pickle.dumps(factory))
+    assert digest(copy.render(0, 0)) == digest(factory.render(0, 0))
+
+
+def test_a_target_is_no_negative(box_part: Part) -> None:
+    preset = PRESETS["quickstart"]
+    with pytest.raises(UserError, match="negative pivconnector, which is one of the targets"):
+        Factory([pivconnector()], preset, 0, negatives=[pivconnector()])
+    with pytest.raises(UserError, match="negative other, which is one of the targets box"):
+        Factory([box_part], preset, 0, negatives=[replace(box_part, name="other")])
+    with pytest.raises(UserError, match="negative box, which"):
+        Factory([box_part], preset, 0, negatives=[replace(servoholder(), name="box")])
+    thing = replace(box_part, name="thing", mesh=None, mesh_hash="")
+    with pytest.raises(UserError, match="part thing without a mesh"):
+        Factory([pivconnector()], preset, 0, negatives=[thing])
+    renamed = Factory([replace(servoholder(), name="mine")], preset, 0)
+    assert [part.name for part in renamed.negatives] == ["pivconnector"]
 
 
 def test_seed_epoch_and_index_all_matter() -> None:

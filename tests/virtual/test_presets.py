@@ -19,15 +19,13 @@ from dopepp.parts.part import Part, make_part
 from dopepp.virtual import (
     PRESETS,
     DistancePlacement,
-    Distractors,
     FacingTurning,
     Factory,
     FillPlacement,
-    Lighting,
     OffsetPlacement,
-    Preset,
     Scene,
 )
+from dopepp.virtual.presets import Distractors, Preset
 
 NUM_SCENES = 200
 
@@ -69,6 +67,7 @@ def test_quickstart_poses(quickstart_scenes: list[Scene]) -> None:
     assert measured[:, 1].max() > 37
     assert {s.objects[0].label for s in quickstart_scenes} == {"servoholder", "pivconnector"}
     assert {len(s.objects) for s in quickstart_scenes} == {1, 2, 3}
+    assert all(s.plane is None for s in quickstart_scenes)
 
 
 def test_quickstart_fill(quickstart_scenes: list[Scene]) -> None:
@@ -125,11 +124,13 @@ def test_centroids_lie_inside_and_in_front(name: str, box_part: Part) -> None:
 
 
 def test_light_ranges(quickstart_scenes: list[Scene]) -> None:
-    ranges = Lighting()
+    ranges = PRESETS["quickstart"].lighting
     for scene in quickstart_scenes:
         assert ranges.num_lights[0] <= len(scene.lights) <= ranges.num_lights[1]
-        for light in scene.lights:
-            assert max(light.intensity) <= ranges.key_intensity[1] * (1 + ranges.tint)
+        for number, light in enumerate(scene.lights):
+            low, high = ranges.fill_intensity if number else ranges.key_intensity
+            luminance = np.array(light.intensity) @ [0.2126, 0.7152, 0.0722]
+            assert low * (1 - ranges.tint) <= luminance <= high * (1 + ranges.tint)
             assert light.reach > 0
 
 
@@ -182,13 +183,15 @@ def test_fill_placement_reaches_its_share(
     ("change", "message"),
     [
         ({"targets_per_image": (2, 1)}, "targets_per_image"),
-        ({"targets_per_image": (0, 1)}, "targets_per_image"),
-        ({"width": 4}, "at least 8×8"),
-        ({"min_visible_fraction": 1.0}, r"fraction in \[0, 0.95\]"),
-        ({"horizontal_fov_deg": 179.0}, "5 to 150 degrees"),
+        ({"targets_per_image": (-1, 1)}, "targets_per_image"),
+        ({"targets_per_image": (0.0, 1.0)}, "two whole numbers"),
+        ({"width": 4}, "width=4 of quickstart; allowed: a number from 8"),
+        ({"width": True}, "width=True of quickstart"),
+        ({"min_visible_fraction": 1.0}, r"a number from 0 to 0.95"),
+        ({"min_visible_fraction": float("nan")}, "min_visible_fraction=nan"),
+        ({"horizontal_fov_deg": 179.0}, r"from 5 to 150 \(degrees\)"),
+        ({"intrinsics_px": (300.0, 300.0)}, "four numbers"),
         ({"intrinsics_px": (300.0, 300.0, 900.0, 20.0)}, "principal point inside"),
-        ({"distractors": Distractors((3, 1))}, "distractors.number"),
-        ({"lighting": Lighting((2, 1))}, "lighting.num_lights"),
     ],
 )
 def test_wrong_presets_are_refused(change: dict[str, Any], message: str) -> None:
@@ -203,13 +206,40 @@ def test_wrong_presets_are_refused(change: dict[str, Any], message: str) -> None
         lambda: FillPlacement(0.0, 0.6),
         lambda: DistancePlacement(1.0, 0.5),
         lambda: DistancePlacement(margin=0.6),
+        lambda: DistancePlacement(nearest=float("nan")),
         lambda: OffsetPlacement(distance=0.1, axial=0.1),
+        lambda: OffsetPlacement(distance=float("inf")),
+        lambda: FillPlacement(smallest=True),
         lambda: FacingTurning(tilt_deg=-1),
     ],
 )
 def test_wrong_ranges_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(UserError, match="allowed"):
         make()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_stated_visibility_holds(name: str, parts: list[Part]) -> None:
+    preset = replace(PRESETS[name].resized(320, 240), distractors=Distractors((0, 8)))
+    factory = Factory(parts, preset, seed=3)
+    for index in range(10):
+        rendered = factory.render(0, index)
+        fractions = rendered.visible_fractions[list(rendered.scene.targets)]
+        assert (fractions >= preset.min_visible_fraction).all()
+
+
+def test_zero_to_one_target_gives_both(parts: list[Part]) -> None:
+    preset = replace(PRESETS["paper"].resized(80, 60), targets_per_image=(0, 1))
+    factory = Factory(parts, preset, seed=0)
+    counts = [len(factory.scene(0, index).targets) for index in range(40)]
+    assert set(counts) == {0, 1}
+
+
+def test_a_resized_preset_blurs_in_proportion() -> None:
+    preset = PRESETS["paper"]
+    small = preset.resized(320, 240)
+    assert small.sensors.blur_px == tuple(value / 2 for value in preset.sensors.blur_px)
+    assert small.sensors.read_noise == preset.sensors.read_noise
 
 
 def test_a_part_that_cannot_be_shown_is_an_error(box_part: Part) -> None:

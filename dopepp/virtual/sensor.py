@@ -1,0 +1,205 @@
+"""The sensor: what lens, chip and file make of an ideal picture.
+
+Every step is a pure function of its arguments. To add one, write a function like those below, give
+:class:`~dopepp.virtual.scene.Sensor` its parameter and call it in :func:`capture`, where the order
+is the order of a camera: exposure, lens, chip, file.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from statistics import NormalDist
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from dopepp.errors import UserError
+from dopepp.virtual.compiled import Array, compiled
+from dopepp.virtual.scene import Sensor
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+_NOISE_VALUES: Final = 65536
+"""Length of the table of normal values that noise is read from; a power of two."""
+
+_NOISE_RUN: Final = 1024
+"""So many values are read in a row; then the hash chooses another place of the table and a sign."""
+
+_MAX_MOTION_PX: Final = 200.0
+"""Longest motion blur; its kernel's cost grows with the length."""
+
+_SMALLEST_BLUR_PX: Final = 0.1
+"""A Gaussian this narrow leaves every 8-bit picture as it is."""
+
+
+def capture(image: Image, sensor: Sensor) -> Image:
+    """Return what a sensor makes of an ideal picture; the default sensor returns it unchanged.
+
+    Exposure works on linear light. Both blurs work on the sRGB picture, which spreads highlights
+    a little less than light would.
+
+    Args:
+        image: RGB, sRGB-encoded.
+        sensor: Its settings.
+
+    Raises:
+        UserError: A setting is outside of what :class:`~dopepp.virtual.scene.Sensor` says.
+    """
+    _check(sensor)
+    if sensor.exposure_ev:
+        image = np.asarray(cv2.LUT(image, _exposure_curve(sensor.exposure_ev)))
+    if sensor.blur_px >= _SMALLEST_BLUR_PX:
+        image = defocus(image, sensor.blur_px)
+    if any(sensor.motion_px):
+        image = motion_blur(image, sensor.motion_px)
+    if sensor.read_noise or sensor.shot_noise:
+        image = add_noise(image, sensor.read_noise, sensor.shot_noise, sensor.noise_seed)
+    if sensor.jpeg_quality is not None:
+        image = compress(image, sensor.jpeg_quality)
+    return image
+
+
+def defocus(image: Image, sigma_px: float) -> Image:
+    """Blur with a Gaussian of a standard deviation in pixels."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px))
+
+
+def motion_blur(image: Image, motion_px: tuple[float, float]) -> Image:
+    """Average the picture along a displacement (x, y) in pixels, centred, so that it stays put."""
+    return np.asarray(
+        cv2.filter2D(image, -1, _line_kernel(*motion_px), borderType=cv2.BORDER_REFLECT_101)
+    )
+
+
+def add_noise(image: Image, read: float, shot: float, seed: int) -> Image:
+    """Add Gaussian noise, independent per pixel and channel.
+
+    Args:
+        image: RGB.
+        read: Standard deviation of the signal-independent part, grey levels of 255.
+        shot: Standard deviation of the signal-dependent part at white, grey levels; its square
+            is proportional to the grey level.
+        seed: Any integer from 0 to 2³² − 1; the same seed gives the same noise.
+    """
+    noisy = np.empty(image.shape, np.uint8)
+    values = np.ascontiguousarray(image).reshape(-1)
+    read_variance, shot_variance = np.float32(read**2), np.float32(shot**2 / 255)
+    _add_noise(values, read_variance, shot_variance, _normal_values(), seed, noisy.reshape(-1))
+    return noisy
+
+
+def compress(image: Image, quality: int) -> Image:
+    """Compress to JPEG (quality 1 to 100) and back."""
+    # The codec takes the channels as B, G, R; a swapped order would weigh red and blue wrongly.
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
+
+
+def _exposure_curve(exposure_ev: float) -> UInt8[np.ndarray, "256"]:
+    """Return the sRGB codes after the light was multiplied by 2^EV; what is over white clips."""
+    code = np.arange(256) / 255
+    light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    light = np.clip(light * 2.0**exposure_ev, 0.0, 1.0)
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * code), np.uint8)
+
+
+def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
+    """Return the kernel of a line through the middle, its points spread over the four nearest."""
+    half = math.ceil(max(abs(x), abs(y)) / 2)
+    kernel = np.zeros((2 * half + 2, 2 * half + 2))
+    # Four points a pixel make it even; one lies in the middle, so a short line is nearly a point.
+    steps = 2 * math.ceil(2 * math.hypot(x, y)) + 1
+    points = half + ((np.arange(steps) + 0.5) / steps - 0.5)[:, None] * (x, y)
+    corner = points.astype(np.int64)
+    near = points - corner
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        share = np.abs(1 - right - near[:, 0]) * np.abs(1 - down - near[:, 1])
+        np.add.at(kernel, (corner[:, 1] + down, corner[:, 0] + right), share)
+    # No point reaches the last row and column; without them the middle is in the middle.
+    return np.asarray(kernel[:-1, :-1] / kernel.sum(), np.float32)
+
+
+@cache
+def _normal_values() -> Float32[np.ndarray, "values"]:
+    """Return the table of noise: quantiles of a normal distribution, shuffled, deviation 1.
+
+    Its beginning is repeated at its end, so that a run may start anywhere.
+    """
+    normal = NormalDist()
+    quantiles = [normal.inv_cdf((k + 0.5) / _NOISE_VALUES) for k in range(_NOISE_VALUES)]
+    values = np.array(quantiles, np.float32)
+    _shuffle(values)
+    return np.concatenate([values, values[:_NOISE_RUN]])
+
+
+@compiled()
+def _shuffle(values: Array) -> None:
+    """Shuffle in place (Fisher and Yates), by the hash, so that every platform has one order."""
+    for i in range(values.shape[0] - 1, 0, -1):
+        k = _mixed(np.uint32(i)) % np.uint32(i + 1)
+        values[i], values[k] = values[k], values[i]
+
+
+@compiled(fastmath=True)
+def _add_noise(
+    image: Array, read: np.float32, shot: np.float32, table: Array, seed: int, noisy: Array
+) -> None:
+    """Add noise from the table, in runs.
+
+    Args:
+        image: Grey levels, uint8, flat.
+        read: Variance of the signal-independent part, squared grey levels, float32.
+        shot: Variance of the signal-dependent part per grey level, float32.
+        table: Normal values, float32, ``_NOISE_RUN`` more than a power of two.
+        seed: 0 to 2³² − 1.
+        noisy: Result, uint8, flat.
+    """
+    count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
+    start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))
+    least, most, half = np.float32(0), np.float32(255), np.float32(0.5)
+    for run in range((count + _NOISE_RUN - 1) // _NOISE_RUN):
+        h = _mixed(np.uint32(np.uint32(run) + start))
+        first, last = run * _NOISE_RUN, min((run + 1) * _NOISE_RUN, count)
+        sign = np.float32(1) if h & np.uint32(1) else np.float32(-1)
+        normal = table[np.int64((h >> np.uint32(8)) & mask) :]
+        for i in range(last - first):
+            value = np.float32(image[first + i])
+            value += sign * normal[i] * np.sqrt(read + shot * value) + half
+            noisy[first + i] = np.uint8(np.int32(min(max(value, least), most)))
+
+
+@compiled(inline="always")
+def _mixed(h: np.uint32) -> np.uint32:
+    """Mix 32 bits: xor-shifts and odd multipliers, a bijection in which every bit moves all."""
+    h = np.uint32(h ^ (h >> np.uint32(16)))
+    h = np.uint32(h * np.uint32(0x7FEB352D))
+    h = np.uint32(h ^ (h >> np.uint32(15)))
+    h = np.uint32(h * np.uint32(0x846CA68B))
+    return np.uint32(h ^ (h >> np.uint32(16)))
+
+
+def _check(sensor: Sensor) -> None:
+    """Refuse settings that no camera has."""
+    quality = sensor.jpeg_quality
+    numbers = (
+        sensor.exposure_ev, sensor.blur_px, *sensor.motion_px, sensor.read_noise, sensor.shot_noise,
+    )  # fmt: skip
+    sensible = (
+        all(math.isfinite(value) for value in numbers)
+        and min(sensor.blur_px, sensor.read_noise, sensor.shot_noise) >= 0
+        and math.hypot(*sensor.motion_px) <= _MAX_MOTION_PX
+        and (quality is None or 1 <= quality <= 100)
+        and 0 <= sensor.noise_seed < 2**32
+    )
+    if not sensible:
+        raise UserError(
+            f"{sensor}",
+            f"finite numbers, blur and noise >= 0, motion up to {_MAX_MOTION_PX:g} px, JPEG "
+            "quality 1 to 100, a seed from 0 to 2**32 - 1",
+            "change the sensor's settings",
+        )

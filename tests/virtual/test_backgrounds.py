@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from dopepp.drawing.pictures import read_picture
+from dopepp.errors import UserError
+from dopepp.virtual.backgrounds import (
+    PhotoBackgrounds,
+    ProceduralBackgrounds,
+    find_backgrounds,
+)
+
+
+def write_photos(folder: Path, count: int, side: int = 40) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        noise = rng.integers(0, 256, (side, side + 20, 3), np.uint8)
+        assert cv2.imwrite(str(folder / f"{number:04}.jpg"), cv2.GaussianBlur(noise, (9, 9), 3))
+
+
+def draw(backgrounds: PhotoBackgrounds, seed: int) -> np.ndarray:
+    return backgrounds.draw(np.random.default_rng(seed), 32, 24)
+
+
+def test_a_choice_by_name() -> None:
+    assert isinstance(find_backgrounds(None), ProceduralBackgrounds)
+    assert find_backgrounds("procedural").identity() == ["procedural"]
+    with pytest.raises(UserError, match="no photo in the background folder nowhere"):
+        find_backgrounds("nowhere")
+
+
+def test_bundled_photos_come_without_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("skimage")
+    backgrounds = find_backgrounds("skimage")
+    assert isinstance(backgrounds, PhotoBackgrounds)
+    assert len(backgrounds.paths) >= 5
+    assert draw(backgrounds, 1).std() > 5
+    for path in backgrounds.paths:
+        assert min(read_picture(path).shape[:2]) >= 200
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"backgrounds=skimage without .*pip install scikit-image"):
+        find_backgrounds("skimage")
+
+
+def test_a_deep_tree_is_opened_without_decoding(tmp_path: Path) -> None:
+    content = b"never read"
+    for place in ("VOC2007/JPEGImages/b.JPG", "VOC2007/JPEGImages/a.jpg", "a.png", "z/y/x/w.webp"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_bytes(content)
+    (tmp_path / "folder.jpg").mkdir()
+    (tmp_path / "notes.txt").write_text("")
+    (tmp_path / "._a.jpg").write_bytes(content)
+    (tmp_path / ".cache").mkdir()
+    (tmp_path / ".cache" / "c.jpg").write_bytes(content)
+    (tmp_path / "loop").symlink_to(tmp_path)
+    os.mkfifo(tmp_path / "pipe.jpg")
+    backgrounds = PhotoBackgrounds(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in backgrounds.paths] == [
+        "VOC2007/JPEGImages/a.jpg", "VOC2007/JPEGImages/b.JPG", "a.png", "z/y/x/w.webp",
+    ]  # fmt: skip
+
+
+def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path: Path) -> None:
+    write_photos(tmp_path / "a", 3)
+    write_photos(tmp_path / "b", 3)
+    first, again = (PhotoBackgrounds(tmp_path / name).identity() for name in "ab")
+    assert first == again
+    assert first[:2] == ["photos", "3"]
+    (tmp_path / "b" / "0001.jpg").rename(tmp_path / "b" / "new.jpg")
+    renamed = PhotoBackgrounds(tmp_path / "b").identity()
+    (tmp_path / "b" / "new.jpg").write_bytes(b"longer or shorter")
+    assert (
+        len({tuple(x) for x in (first, renamed, PhotoBackgrounds(tmp_path / "b").identity())}) == 3
+    )
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp", "webp"])
+def test_half_a_photo_is_damaged(tmp_path: Path, suffix: str) -> None:
+    write_photos(tmp_path / "whole", 1, 200)
+    path = tmp_path / f"photo.{suffix}"
+    Image.open(tmp_path / "whole" / "0000.jpg").save(path)
+    content = path.read_bytes()
+    for share in (0.0, 0.1, 0.5, 0.9):
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(ValueError, match=r"\w"):
+            read_picture(path)
+    message = rf"1 damaged of 2 background photos \(.*photo\.{suffix}: .*\).*; 0 damaged"
+    backgrounds = PhotoBackgrounds(tmp_path)
+    with pytest.raises(UserError, match=message) as caught:
+        [draw(backgrounds, seed) for seed in range(20)]
+    assert "\n" not in str(caught.value)
+
+
+def test_one_bad_photo_of_many_is_replaced_whatever_came_before(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_photos(tmp_path, 200)
+    bad = tmp_path / "0100.jpg"
+    bad.write_bytes(bad.read_bytes()[:200])
+    backgrounds = PhotoBackgrounds(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        images = [draw(backgrounds, seed) for seed in range(600)]
+    assert list(backgrounds.bad) == [bad]
+    assert len(caplog.records) == 1
+    assert "0100.jpg left out" in caplog.text
+    assert "1 damaged of at most 2" in caplog.text
+    hits = [s for s in range(600) if int(np.random.default_rng(s).integers(200)) == 100]
+    assert hits  # these drew the damaged photo first
+    for seed in [*hits, 0]:
+        np.testing.assert_array_equal(draw(PhotoBackgrounds(tmp_path), seed), images[seed])
+
+
+@pytest.mark.parametrize(("count", "allowed"), [(99, 0), (100, 1), (1500, 10)])
+def test_damage_is_capped(tmp_path: Path, count: int, allowed: int) -> None:
+    for number in range(count):
+        (tmp_path / f"{number}.jpg").write_bytes(b"")
+    backgrounds = PhotoBackgrounds(tmp_path)
+    with pytest.raises(
+        UserError, match=rf"^got {allowed + 1} damaged of {count} .*; {allowed} dam"
+    ):
+        draw(backgrounds, 0)
+
+
+def test_a_photo_that_vanishes_counts_as_damaged(tmp_path: Path) -> None:
+    write_photos(tmp_path, 1)
+    backgrounds = PhotoBackgrounds(tmp_path)
+    (tmp_path / "0000.jpg").unlink()
+    with pytest.raises(UserError, match=r"0000\.jpg: .*No such file"):
+        draw(backgrounds, 0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [((9000, 200), "9000×200 pixels"), ((12_000, 12_000), "144000000 pixels")],
+)
+def test_a_photo_of_absurd_size_is_not_decoded(
+    tmp_path: Path, size: tuple[int, int], message: str
+) -> None:
+    Image.new("1", size).save(tmp_path / "bomb.png")
+    assert (tmp_path / "bomb.png").stat().st_size < 50_000
+    with pytest.raises(UserError, match=rf"bomb\.png: .*{message}"):
+        draw(PhotoBackgrounds(tmp_path), 0)
+
+
+def test_large_photos_are_reduced_as_opencv_would(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
+    photo = cv2.GaussianBlur(noise, (0, 0), 20)
+    Image.fromarray(photo).save(tmp_path / "a.png")
+    reduced = read_picture(tmp_path / "a.png", 400)
+    assert reduced.shape == (300, 400, 3)
+    expected = cv2.resize(photo, (400, 300), interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(reduced.astype(int), expected.astype(int), atol=1)
+    Image.fromarray(photo).save(tmp_path / "a.jpg", quality=95)
+    fast = read_picture(tmp_path / "a.jpg", 400)
+    np.testing.assert_allclose(fast.astype(int), expected.astype(int), atol=6)
+
+
+def test_pickling_leaves_the_decoded_photos_behind(tmp_path: Path) -> None:
+    write_photos(tmp_path, 3, 400)
+    backgrounds = PhotoBackgrounds(tmp_path)
+    images = [draw(backgrounds, seed) for seed in range(9)]
+    packed = pickle.dumps(backgrounds)
+    assert len(packed) < 5000
+    copy = pickle.loads(packed)
+    np.testing.assert_array_equal([draw(copy, seed) for seed in range(9)], images)
+
+
+def test_memory_for_photos_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_photos(tmp_path, 9, 100)
+    monkeypatch.setattr("dopepp.virtual.photos._KEPT_BYTES", 3 * 100 * 120 * 3)
+    backgrounds = PhotoBackgrounds(tmp_path)
+    for seed in range(50):
+        draw(backgrounds, seed)
+    assert len(backgrounds._photos) == 3
+    assert backgrounds._kept_bytes == sum(photo.nbytes for photo in backgrounds._photos.values())
+
+
+def test_crops_lie_inside_of_their_photo(tmp_path: Path) -> None:
+    # Colours ramp over the photo, so a crop's corners tell where it was taken.
+    x, y = np.meshgrid(np.linspace(0, 200, 300), np.linspace(0, 200, 200))
+    Image.fromarray(np.stack([x, y, 0 * x], axis=2).astype(np.uint8)).save(tmp_path / "a.png")
+    backgrounds = PhotoBackgrounds(tmp_path)
+    spans, mirrored = [], set()
+    for seed in range(60):
+        image = draw(backgrounds, seed).astype(float)
+        brightness = np.ptp(image[..., 1]) / np.ptp(image[..., 0])  # of equal pixels' ramps
+        spans.append(brightness)
+        mirrored.add(bool(image[0, 0, 0] > image[0, -1, 0]))
+        assert image[0, 0, 1] <= image[-1, 0, 1]  # never upside down
+    assert mirrored == {False, True}
+    # 24 rows of 200 / 200 against 32 columns of 200 / 300: a crop keeps the pixels square.
+    np.testing.assert_allclose(spans, 24 / 32 * 1.5, rtol=0.1)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (416, 416), (7, 5), (1, 1)])
+def test_procedural_pictures_depend_on_the_generator_only(size: tuple[int, int]) -> None:
+    one, other = ProceduralBackgrounds(), ProceduralBackgrounds()
+    images = [one.draw(np.random.default_rng(seed), *size) for seed in range(8)]
+    for seed in reversed(range(8)):
+        again = other.draw(np.random.default_rng(seed), *size)
+        assert again.shape == (size[1], size[0], 3)
+        np.testing.assert_array_equal(again, images[seed])
+
+
+def test_procedural_pictures_have_detail_at_every_size() -> None:
+    backgrounds = ProceduralBackgrounds()
+    for size in ((640, 480), (128, 128)):
+        images = [backgrounds.draw(np.random.default_rng(seed), *size) for seed in range(60)]
+        sharpness = [
+            cv2.Laplacian(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.CV_32F).std() for i in images
+        ]
+        assert np.median(sharpness) > 4
+        assert np.median([image.std() for image in images]) > 15

@@ -1,0 +1,177 @@
+"""The sensor: each step against SciPy, Pillow or a closed form; all of it pure."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scipy.ndimage
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from dopepp.errors import UserError
+from dopepp.virtual.scene import Sensor
+from dopepp.virtual.sensor import add_noise, capture, compress, defocus, motion_blur
+from dopepp.virtual.sensors import Sensors
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
+    return cv2.GaussianBlur(noise, (9, 9), 2)
+
+
+def test_a_zero_sensor_changes_nothing(picture: np.ndarray) -> None:
+    assert capture(picture, Sensor()) is picture
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    exposure=st.floats(-8, 8),
+    blur=st.floats(0, 5),
+    motion=st.tuples(st.floats(-12, 12), st.floats(-12, 12)),
+    read=st.floats(0, 60),
+    shot=st.floats(0, 60),
+    quality=st.none() | st.integers(1, 100),
+    seed=st.integers(0, 2**32 - 1),
+    size=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+)
+def test_capture_is_pure_and_keeps_the_shape(
+    exposure: float, blur: float, motion: tuple[float, float], read: float, shot: float,
+    quality: int | None, seed: int, size: tuple[int, int],
+) -> None:  # fmt: skip
+    image = np.random.default_rng(1).integers(0, 256, (*size, 3), np.uint8)
+    before, sensor = image.copy(), Sensor(exposure, blur, motion, read, shot, quality, seed)
+    first = capture(image, sensor)
+    np.testing.assert_array_equal(first, capture(image, sensor))
+    np.testing.assert_array_equal(image, before)
+    assert (first.dtype, first.shape) == (np.uint8, image.shape)
+
+
+def linear(codes: np.ndarray) -> np.ndarray:
+    share = codes / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.mark.parametrize("exposure", [-2.0, -0.3, 0.5, 1.0])
+def test_exposure_multiplies_the_light(exposure: float) -> None:
+    codes = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    exposed = capture(codes, Sensor(exposure_ev=exposure))
+    wanted = np.minimum(linear(codes) * 2**exposure, 1.0)
+    # Half a grey level is up to 0.45 % of white in linear light.
+    np.testing.assert_allclose(linear(exposed), wanted, atol=0.0046)
+    assert (np.diff(exposed[0, :, 0].astype(int)) >= 0).all()
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5])
+def test_defocus_is_scipys_gaussian(picture: np.ndarray, sigma: float) -> None:
+    expected = scipy.ndimage.gaussian_filter(
+        picture.astype(float), (sigma, sigma, 0), mode="mirror", truncate=4
+    )
+    assert np.abs(defocus(picture, sigma) - expected).max() < 2.5
+    assert np.abs(defocus(picture, sigma) - expected).mean() < 0.4
+
+
+@pytest.mark.parametrize("motion", [(7.0, 0.0), (0.0, -4.5), (3.0, 2.0), (0.3, 0.1), (-6.0, 9.0)])
+def test_motion_blur_is_the_mean_of_shifted_pictures(
+    picture: np.ndarray, motion: tuple[float, float]
+) -> None:
+    shifts = [
+        scipy.ndimage.shift(picture.astype(float), (t * motion[1], t * motion[0], 0), order=1,
+                            mode="mirror")
+        for t in np.linspace(-0.5, 0.5, 401)
+    ]  # fmt: skip
+    blurred = motion_blur(picture, motion)
+    assert np.abs(blurred - np.mean(shifts, axis=0)).max() < 2.0
+
+
+def test_motion_blur_stays_in_place() -> None:
+    point = np.zeros((41, 41, 3), np.uint8)
+    point[20, 20] = 255
+    blurred = motion_blur(point, (9.0, 4.0))[..., 0].astype(float)
+    rows, columns = np.mgrid[:41, :41]
+    assert (blurred * rows).sum() / blurred.sum() == pytest.approx(20, abs=0.05)
+    assert (blurred * columns).sum() / blurred.sum() == pytest.approx(20, abs=0.05)
+
+
+@pytest.mark.parametrize(("level", "read", "shot"), [(128, 6, 0), (40, 0, 8), (200, 3, 5)])
+def test_noise_has_the_stated_spread(level: int, read: float, shot: float) -> None:
+    flat = np.full((300, 400, 3), level, np.uint8)
+    noise = add_noise(flat, read, shot, 3).astype(float) - level
+    # Rounding to whole levels adds a variance of 1/12.
+    expected = np.sqrt(read**2 + shot**2 * level / 255 + 1 / 12)
+    assert noise.std() == pytest.approx(expected, rel=0.01)
+    assert abs(noise.mean()) < 4 * expected / np.sqrt(noise.size)
+    assert abs(scipy.stats.kurtosis(noise.reshape(-1))) < 0.05
+    assert abs(scipy.stats.skew(noise.reshape(-1))) < 0.03
+
+
+def test_noise_is_independent_of_place_channel_and_seed() -> None:
+    flat = np.full((300, 400, 3), 128, np.uint8)
+    noise = add_noise(flat, 8, 0, 3).astype(float) - 128
+    other = add_noise(flat, 8, 0, 4).astype(float) - 128
+    pairs = [
+        (noise, other), (noise[1:], noise[:-1]), (noise[:, 1:], noise[:, :-1]),
+        (noise[..., 0], noise[..., 1]), (noise[..., 0], noise[..., 2]),
+    ]  # fmt: skip
+    for a, b in pairs:
+        assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 0.015
+
+
+def test_jpeg_is_pillows(picture: np.ndarray) -> None:
+    for quality in (30, 90):
+        stream = io.BytesIO()
+        Image.fromarray(picture).save(stream, "jpeg", quality=quality, subsampling=2)
+        stream.seek(0)
+        theirs = np.asarray(Image.open(stream)).astype(int)
+        ours = compress(picture, quality).astype(int)
+        assert np.abs(ours - theirs).mean() < 1.0
+        assert np.abs(ours - picture).mean() > 0.3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exposure_ev": float("nan")}, {"blur_px": -1.0}, {"blur_px": float("inf")},
+        {"motion_px": (300.0, 0.0)}, {"read_noise": -1.0}, {"jpeg_quality": 0},
+        {"jpeg_quality": 101}, {"noise_seed": -1}, {"noise_seed": 2**32},
+    ],
+)  # fmt: skip
+def test_impossible_sensors_are_refused(picture: np.ndarray, change: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match="change the sensor's settings"):
+        capture(picture, Sensor(**change))
+
+
+def test_drawn_sensors_keep_to_their_ranges() -> None:
+    ranges, rng = Sensors(), np.random.default_rng(0)
+    drawn = [ranges.draw(rng) for _ in range(2000)]
+    for sensor in drawn:
+        assert ranges.exposure_ev[0] <= sensor.exposure_ev <= ranges.exposure_ev[1]
+        assert sensor.blur_px == 0 or ranges.blur_px[0] <= sensor.blur_px <= ranges.blur_px[1]
+        length = float(np.hypot(*sensor.motion_px))
+        low, high = ranges.motion_px
+        assert length == 0 or low - 1e-9 <= length <= high + 1e-9
+        assert sensor.jpeg_quality is None or 70 <= sensor.jpeg_quality <= 95
+    assert np.mean([s.blur_px > 0 for s in drawn]) == pytest.approx(0.2, abs=0.03)
+    assert np.mean([s.read_noise > 0 for s in drawn]) == pytest.approx(0.5, abs=0.04)
+    assert len({s.noise_seed for s in drawn}) > 1990
+
+
+def test_everything_off_is_the_zero_sensor() -> None:
+    off = Sensors(
+        exposure_probability=0, blur_probability=0, motion_probability=0, noise_probability=0,
+        jpeg_probability=0,
+    )  # fmt: skip
+    drawn = off.draw(np.random.default_rng(1))
+    assert drawn == Sensor(noise_seed=drawn.noise_seed)
+
+
+def test_a_resized_camera_blurs_in_proportion() -> None:
+    half = Sensors(blur_px=(0.4, 1.0), motion_px=(2.0, 6.0)).resized(0.5)
+    assert half.blur_px == (0.2, 0.5)
+    assert half.motion_px == (1.0, 3.0)
