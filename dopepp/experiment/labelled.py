@@ -108,6 +108,7 @@ def _ndds(
     sets = data["image_sets"]
     return NddsSource(
         Path(data["root"]) / sets[split], parts, part_of=share_of(sets, split),
+        classes=data.get("classes"),
         read_depth=split == "test",
     )  # fmt: skip
 
