@@ -104,7 +104,7 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     pose, points = poses(9, 4), cloud(64)
     K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     whole = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
-    monkeypatch.setattr("dopepp.metrics.functional._CHUNK_POINTS", 128)
+    monkeypatch.setattr("dopepp.metrics.functional.inputs._CHUNK_POINTS", 128)
     parts = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
     for a, b in zip(whole, parts, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=0)

@@ -1,0 +1,27 @@
+"""How this package compiles its inner loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+"""An argument of a compiled function; its docstring gives shape and type."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(**options: Any) -> Callable[[Function], Function]:
+    """Compile with numba, without the GIL and single-threaded, because data loaders fork.
+
+    A division by zero gives what IEEE 754 says, as in numpy; a check for it would also keep loops
+    from becoming vector loops.
+
+    The machine code is kept on disk beside the package, or in the user's cache folder where that
+    is read-only; ``NUMBA_CACHE_DIR`` moves it.
+    """
+    compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
+    return cast("Callable[[Function], Function]", compiler)

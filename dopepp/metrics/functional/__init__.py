@@ -1,0 +1,41 @@
+"""Pose errors and the rates made of them: pure, batched, float64 inside.
+
+Poses come as ``(R_est, t_est, R_gt, t_gt)`` with shapes (N, 3, 3), (N, 3), (N, 3, 3), (N, 3), in
+metres and ``T_cam_obj`` convention; object points as (V, 3). Every error is (N,). A pose that is
+not finite has an infinite error: it is a miss, and no function here returns NaN.
+
+To add an error, write one function of this form, its formula in ``docs/metrics.md`` and a test
+against an independent implementation.
+"""
+
+from dopepp.metrics.functional.distances import add, add_s, mssd
+from dopepp.metrics.functional.matching import MATCH_DISTANCE, average_precision, match
+from dopepp.metrics.functional.offsets import rotation_error_deg, translation_error
+from dopepp.metrics.functional.projections import mspd, reprojection_error
+from dopepp.metrics.functional.rates import (
+    BOP_MSPD_THRESHOLDS,
+    BOP_THRESHOLDS,
+    auc,
+    average_recall,
+    pass_rate,
+)
+from dopepp.metrics.functional.visible_surface import vsd
+
+__all__ = [
+    "BOP_MSPD_THRESHOLDS",
+    "BOP_THRESHOLDS",
+    "MATCH_DISTANCE",
+    "add",
+    "add_s",
+    "auc",
+    "average_precision",
+    "average_recall",
+    "match",
+    "mspd",
+    "mssd",
+    "pass_rate",
+    "reprojection_error",
+    "rotation_error_deg",
+    "translation_error",
+    "vsd",
+]

@@ -1,0 +1,174 @@
+"""MSSD, MSPD, symmetric rotation error, ADD-S and the symmetry group against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg
+from dopepp.metrics.functional.distances import compare_all_pairs
+
+Array = NDArray[np.float64]
+K = np.array([[520.0, 0, 311], [0, 530, 252], [0, 0, 1]])
+
+
+def poses(n: int, seed: int) -> tuple[Array, Array, Array, Array]:
+    rng = np.random.default_rng(seed)
+    R_gt = Rotation.random(n, random_state=rng)
+    R_est = R_gt * Rotation.from_rotvec(rng.normal(0, 0.4, (n, 3)))
+    t_gt = rng.normal([0, 0, 1], 0.1, (n, 3))
+    return R_est.as_matrix(), t_gt + rng.normal(0, 0.02, (n, 3)), R_gt.as_matrix(), t_gt
+
+
+def cloud(n: int, seed: int = 0) -> Array:
+    return np.random.default_rng(seed).uniform(-0.05, 0.05, (n, 3)) * [1, 0.7, 0.3]
+
+
+def tensors(*arrays: Array) -> list[Tensor]:
+    return [torch.from_numpy(np.asarray(array)) for array in arrays]
+
+
+def half_turn() -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.diag([-1.0, -1.0, 1.0]), [0.01, -0.02, 0.0]
+    return T
+
+
+def moved(R: Array, t: Array, points: Array) -> Array:
+    return np.array([R @ point + t for point in points])
+
+
+def pixels(points: Array) -> Array:
+    return np.array([(K @ point)[:2] / point[2] for point in points])
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), turns=st.integers(0, 3))
+def test_mssd_and_mspd_are_their_formulas(seed: int, turns: int) -> None:
+    group = symmetry_group(half_turn()[None] if turns else None)
+    R_est, t_est, R_gt, t_gt = poses(4, seed)
+    points = cloud(30, seed)
+    surface, image = [], []
+    for n in range(4):
+        estimated = moved(R_est[n], t_est[n], points)
+        true = [moved(R_gt[n], t_gt[n], moved(S[:3, :3], S[:3, 3], points)) for S in group]
+        surface.append(min(np.linalg.norm(estimated - T, axis=1).max() for T in true))
+        image.append(min(np.linalg.norm(pixels(estimated) - pixels(T), axis=1).max() for T in true))
+    arguments = tensors(R_est, t_est, R_gt, t_gt, points)
+    symmetries = torch.from_numpy(group)
+    np.testing.assert_allclose(mssd(*arguments, symmetries), surface, rtol=1e-9)
+    np.testing.assert_allclose(mspd(*arguments, torch.from_numpy(K), symmetries), image, rtol=1e-9)
+
+
+def test_the_convex_hull_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = tensors(*poses(50, 0), cloud(2000))
+    group = torch.from_numpy(symmetry_group(half_turn()[None]))
+    whole = mssd(*arguments, group)
+    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 1)
+    np.testing.assert_allclose(mssd(*arguments, group), whole, rtol=1e-12)
+    flat = arguments[4] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 10**9)
+    expected = mssd(*arguments[:4], flat)
+    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 1)
+    np.testing.assert_array_equal(mssd(*arguments[:4], flat), expected)
+
+
+def test_a_symmetric_pose_has_no_error() -> None:
+    R, t = Rotation.random(5, random_state=1).as_matrix(), np.tile([0.1, 0.0, 0.8], (5, 1))
+    S = half_turn()
+    turned = tensors(R @ S[:3, :3], t + R @ S[:3, 3], R, t)
+    group = torch.from_numpy(symmetry_group(S[None]))
+    points = torch.from_numpy(cloud(40))
+    assert float(mssd(*turned, points).min()) > 0.01
+    assert float(mssd(*turned, points, group).max()) < 1e-12
+    assert float(mspd(*turned, points, torch.from_numpy(K), group).max()) < 1e-9
+    np.testing.assert_allclose(rotation_error_deg(turned[0], turned[2]), 180, rtol=1e-9)
+    assert float(rotation_error_deg(turned[0], turned[2], group).max()) < 1e-6
+
+
+def test_symmetries_are_taken_as_they_are() -> None:
+    R, t = torch.eye(3).double()[None], torch.tensor([[0.0, 0.0, 1.0]])
+    only_half_turn = torch.from_numpy(half_turn()[None])
+    assert float(mssd(R, t, R, t, torch.from_numpy(cloud(9)), only_half_turn)[0]) > 0.01
+    rotations = only_half_turn[:, :3, :3]
+    assert float(rotation_error_deg(R, R, rotations)[0]) == pytest.approx(180)
+    for wrong in (torch.eye(4), torch.zeros(0, 4, 4), torch.zeros(2, 3, 4)):
+        with pytest.raises(ValueError, match="symmetries must be"):
+            mssd(R, t, R, t, torch.from_numpy(cloud(9)), wrong)
+
+
+def test_misses_are_infinite_and_behind_the_camera_is_a_miss() -> None:
+    R_est, t_est, R_gt, t_gt = tensors(*poses(3, 3))
+    points = torch.from_numpy(cloud(10))
+    t_est[0], t_est[1, 2] = torch.nan, -1.0
+    far = mspd(R_est, t_est, R_gt, t_gt, points, torch.from_numpy(K))
+    assert far.isinf().tolist() == [True, True, False]
+    assert mssd(R_est, t_est, R_gt, t_gt, points).isinf().tolist() == [True, False, False]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.sampled_from([1, 2, 7, 8, 9, 16, 17, 33, 200, 1000]),
+    scale=st.floats(0.5, 2.0),
+)
+def test_add_s_is_exact_for_any_matrix(seed: int, count: int, scale: float) -> None:
+    """Rotations, scaled ones, skewed ones, and one that is flat."""
+    R_est, t_est, R_gt, t_gt = poses(5, seed)
+    R_est[1] *= scale
+    R_est[2] += 0.3 * np.random.default_rng(seed).normal(size=(3, 3))
+    R_est[3, :, 0] = 0.0
+    R_est[4] = 0.0
+    points = cloud(count, seed)
+    points[count // 2 :] = points[: count - count // 2]  # ties
+    expected = [
+        KDTree(moved(R_est[n], t_est[n], points)).query(moved(R_gt[n], t_gt[n], points))[0].mean()
+        for n in range(5)
+    ]
+    inputs = tensors(R_est, t_est, R_gt, t_gt, points)
+    np.testing.assert_allclose(add_s(*inputs), expected, rtol=1e-9, atol=1e-15)
+    R_est, t_est, R_gt, t_gt, points = inputs
+    pairs = compare_all_pairs(R_est, R_gt, t_gt - t_est, points)
+    np.testing.assert_allclose(pairs, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_add_s_never_exceeds_add() -> None:
+    inputs = tensors(*poses(50, 5), cloud(300))
+    assert bool((add_s(*inputs) <= add(*inputs) + 1e-12).all())
+
+
+def test_group_of_a_can() -> None:
+    """A can: any turn about its axis, and upside down. The axis misses the origin."""
+    axis_point = np.array([0.02, -0.01, 0.0])
+    upside_down = np.eye(4)
+    upside_down[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    upside_down[:3, 3] = axis_point - upside_down[:3, :3] @ axis_point
+    group = symmetry_group(upside_down[None], [((0.0, 0.0, 2.0), tuple(axis_point))], 0.01)
+    assert group.shape == (2 * 315, 4, 4)
+    np.testing.assert_array_equal(group[0], np.eye(4))
+    np.testing.assert_allclose(
+        group[:, :3, :3] @ group[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (630, 1, 1)),
+        atol=1e-12,
+    )  # fmt: skip
+    on_axis = group[:, :3, :3] @ axis_point + group[:, :3, 3]
+    np.testing.assert_allclose(on_axis, np.tile(axis_point, (630, 1)), atol=1e-12)
+    angles = Rotation.from_matrix(group[:315, :3, :3]).magnitude()
+    assert np.diff(np.sort(angles)).max() < 2 * 0.01
+    # It is a group: the product of two of its members is one of them.
+    product = group[7] @ group[400]
+    assert np.abs(group - product).max(axis=(1, 2)).min() < 1e-12
+
+
+def test_a_bad_axis_or_step_is_refused() -> None:
+    with pytest.raises(ValueError, match="axis of symmetry"):
+        symmetry_group(None, [((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match="max_step"):
+        symmetry_group(max_step=0.0)
