@@ -1,8 +1,8 @@
 """Perspective-n-point: nine or fewer keypoints and K in, one trustworthy pose or a reason out.
 
-OpenCV supplies the closed-form start (SQPnP); our own part is what it lacks: per-point standard
-deviations, robust weights, the mirrored start that thin plates need, and checks that no returned
-pose is NaN, behind the camera or at a wild distance.
+OpenCV supplies the closed-form start (SQPnP); our own part is what it lacks: per-point
+covariances, robust weights, the pose's own covariance, the mirrored start that thin plates need,
+and checks that no returned pose is NaN, behind the camera or at a wild distance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.refine import GATE, Correspondences, Poses, refine
+from dopepp.geometry.refine import GATE, NO_GATE, Correspondences, Poses, refine
 from dopepp.geometry.rotation import is_rotation, rotation_vector_to_matrix
 
 MIN_POINTS: Final = 4
@@ -55,12 +55,16 @@ class PnPResult:
         inliers: Which of the given points agree with the pose within
             :data:`~dopepp.geometry.refine.GATE` standard deviations.
         reason: Why there is no pose; empty when there is one.
+        covariance: Of a small turn of the object about its origin (rotation vector in the camera
+            frame, radians) and a small shift (camera frame, metres), from the inliers'
+            covariances; None without a pose.
     """
 
     T_cam_obj: Float[np.ndarray, "4 4"] | None
     reprojection_error_px: float
     inliers: Bool[np.ndarray, "n"]
     reason: str = ""
+    covariance: Float[np.ndarray, "6 6"] | None = None
 
 
 def solve_pnp(
@@ -68,6 +72,7 @@ def solve_pnp(
     image_points: Float[np.ndarray, "n 2"],
     K: Float[np.ndarray, "3 3"],
     sigma_px: Float[np.ndarray, "n"] | float = 1.0,
+    covariance_px: Float[np.ndarray, "n 2 2"] | None = None,
 ) -> PnPResult:
     """Estimate a pose from point correspondences, tolerating missing and wild points.
 
@@ -77,6 +82,8 @@ def solve_pnp(
         K: Camera matrix, pixels; it may have skew.
         sigma_px: Standard deviation of each pixel position (isotropic), pixels; a point whose
             deviation is not finite and positive is missing.
+        covariance_px: Covariance of each pixel position, pixels²; where given it replaces
+            ``sigma_px``. A point whose covariance is not finite and positive definite is missing.
 
     Returns:
         The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
@@ -91,17 +98,34 @@ def solve_pnp(
         raise ValueError(
             f"got {len(object_points)} object points, {len(image_points)} image points"
         )
-    sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), len(object_points))
+    n = len(object_points)
     K = _checked_pinhole(K)
     # Any number may come in and squares may overflow: what comes of it is looked at instead.
     with np.errstate(all="ignore"):
         rays = (image_points - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        if covariance_px is None:
+            sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
+            whitening = np.eye(2) / np.where(sigma > 0, sigma, np.nan)[:, None, None]
+        else:
+            whitening = _inverse_root(np.asarray(covariance_px, np.float64).reshape(n, 2, 2))
         usable = np.isfinite(object_points).all(1) & (np.abs(rays) < MAX_TANGENT).all(1)
-        usable &= np.isfinite(sigma) & (sigma > 0)
-        result = _solve(object_points[usable], rays[usable], K[:2, :2], sigma[usable])
-    inliers = np.zeros(len(usable), bool)
+        usable &= np.isfinite(whitening).all((1, 2)) & (whitening[:, 0, 0] > 0)
+        result = _solve(object_points[usable], rays[usable], K[:2, :2], whitening[usable])
+    inliers = np.zeros(n, bool)
     inliers[usable] = result.inliers
     return replace(result, inliers=inliers)
+
+
+def _inverse_root(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 2 2"]:
+    """Return W with WᵀW = Σ⁻¹ (W = L⁻¹ of Cholesky's Σ = LLᵀ); NaN where Σ is no covariance."""
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    first = np.sqrt(a)
+    second = np.sqrt(c - (b / first) ** 2)
+    roots = np.zeros(covariance.shape)
+    roots[:, 0, 0] = 1 / first
+    roots[:, 1, 0] = -b / (a * second)
+    roots[:, 1, 1] = 1 / second
+    return roots
 
 
 def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -116,26 +140,53 @@ def _solve(
     object_points: Float[np.ndarray, "n 3"],
     rays: Float[np.ndarray, "n 2"],
     to_px: Float[np.ndarray, "2 2"],
-    sigma: Float[np.ndarray, "n"],
+    whitening: Float[np.ndarray, "n 2 2"],
 ) -> PnPResult:
     """Solve for points that are all there; rays are their (x/z, y/z)."""
     nothing = PnPResult(None, np.inf, np.zeros(len(rays), bool))
+    # The mean deviation over both directions: (det W)^(−1/2).
+    sigma = (whitening[:, 0, 0] * whitening[:, 1, 1]) ** -0.5
     reason = _degenerate(object_points, rays @ to_px.T, sigma)
     if reason:
         return replace(nothing, reason=reason)
     centre, size = object_points.mean(0), float(np.linalg.norm(np.ptp(object_points, axis=0)))
-    points = Correspondences((object_points - centre) / size, rays, to_px, sigma)
+    points = Correspondences((object_points - centre) / size, rays, whitening @ to_px)
     poses = _best_first(points)
     if not len(poses):
         return replace(nothing, reason="no start led to a pose in front of the camera")
-    distance = np.linalg.norm(points.residuals(poses[:1])[0], axis=-1)
-    agree = distance <= GATE
+    agree = np.linalg.norm(points.residuals(poses[:1])[0], axis=-1) <= GATE
     if agree.sum() < MIN_POINTS:
         reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
         return replace(nothing, reason=reason)
-    rotation, translation = poses.rotations[0], poses.translations[0]
+    # The gate has done its work: among points that agree, least squares is the better estimate.
+    best = refine(points[agree], poses[:1], NO_GATE)
+    rotation, translation = best.rotations[0], best.translations[0]
     T = make_transform(rotation, size * translation - rotation @ centre)
-    return PnPResult(T, float(np.sqrt(np.mean((distance * sigma)[agree] ** 2))), agree)
+    off = np.linalg.solve(whitening[agree], points[agree].residuals(best)[0, :, :, None])
+    error = float(np.sqrt(np.mean((off**2).sum((1, 2)))))
+    return PnPResult(
+        T, error, agree, covariance=_covariance(points[agree], best, size, rotation @ centre)
+    )
+
+
+def _covariance(
+    points: Correspondences, pose: Poses, size: float, centre: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6 6"]:
+    """Invert the information and carry it from the points' centre to the object's origin.
+
+    A turn ω about the centre is the same turn about the origin and a shift by centre × ω.
+
+    Args:
+        points: The inliers.
+        pose: Their pose, translation in sizes.
+        size: Metres per unit of the points.
+        centre: Origin to centre in camera axes, metres.
+    """
+    carry = np.zeros((6, 6))
+    carry[:3, :3], carry[3:, 3:] = np.eye(3), size * np.eye(3)
+    carry[3:, :3] = np.cross(np.eye(3), centre)
+    # Four points that agree but lie on a line leave a direction open: its variance is huge.
+    return np.asarray(carry @ np.linalg.pinv(points.information(pose), rcond=1e-15) @ carry.T)
 
 
 def _degenerate(
@@ -170,7 +221,7 @@ def _best_first(points: Correspondences) -> Poses:
     """
     count = len(points.rays)
     normal = _thin_axis(points.object_points)
-    poses = _sqpnp(points, [])
+    poses = Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
     for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
         starts = _sqpnp(points, list(combinations(range(count), left_out)))
         starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]

@@ -1,4 +1,4 @@
-"""Robust refinement of poses: damped Gauss–Newton on SE(3), several starts in one batch.
+"""Robust refinement of poses: damped Gauss–Newton on SE(3), compiled.
 
 Object points are centred and of unit size and pixels are rays here, so that one set of numerical
 tolerances serves every part and camera. A pose is (R, t) with x_cam = R x_obj + t.
@@ -6,6 +6,7 @@ tolerances serves every part and camera. A pose is (R, t) with x_cam = R x_obj +
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.compiled import Array, compiled
 
 GATE: Final = 3.0
 """Points beyond this many standard deviations are outliers (99.7 % of a Gaussian lies within)."""
@@ -32,6 +33,12 @@ LEAST_DAMPING: Final = 1e-9
 
 MOST_DAMPING: Final = 1e6
 """Where steps are a millionth of Gauss–Newton's and still do not help, the pose has arrived."""
+
+NO_GATE: Final = 1e3
+"""So wide a gate that the cost is that of least squares."""
+
+_TINY_ANGLE: Final = 1e-8
+"""Radians below which a turn's second-order term is below float64's rounding."""
 
 
 @dataclass(frozen=True)
@@ -66,102 +73,211 @@ class Correspondences:
     Attributes:
         object_points: Points in the object frame, centred and of unit size.
         rays: (x/z, y/z) of their pixels.
-        to_px: Upper left block of K: turns a difference of rays into pixels.
-        sigma: Standard deviation of each pixel position (isotropic), pixels.
+        whitening: Turns a difference of rays into standard deviations of the pixel's position.
     """
 
     object_points: Float[np.ndarray, "n 3"]
     rays: Float[np.ndarray, "n 2"]
-    to_px: Float[np.ndarray, "2 2"]
-    sigma: Float[np.ndarray, "n"]
+    whitening: Float[np.ndarray, "n 2 2"]
+
+    def __getitem__(self, chosen: NDArray[Any]) -> Correspondences:
+        return Correspondences(
+            self.object_points[chosen], self.rays[chosen], self.whitening[chosen]
+        )
 
     def residuals(self, poses: Poses) -> Float[np.ndarray, "s n 2"]:
         """Return reprojection errors in standard deviations; NaN behind the camera."""
-        points = self.object_points @ poses.rotations.transpose(0, 2, 1)
-        points = points + poses.translations[:, None]
-        depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        differences = points[..., :2] / depth - self.rays
-        return np.asarray(differences @ self.to_px.T / self.sigma[:, None])
+        residuals = np.empty((len(poses), len(self.rays), 2))
+        for number in range(len(poses)):
+            _residuals(
+                self.object_points, self.rays, self.whitening, poses.rotations[number],
+                poses.translations[number], residuals[number],
+            )  # fmt: skip
+        return residuals
+
+    def information(self, pose: Poses) -> Float[np.ndarray, "6 6"]:
+        """Return one pose's Fisher information, all points taken at their word.
+
+        It is about a left increment (rotation vector, translation).
+        """
+        hessian, gradient = np.empty((6, 6)), np.empty(6)
+        residuals = self.residuals(pose)[0]
+        _normal_equations(
+            self.object_points, self.rays, self.whitening, pose.rotations[0],
+            pose.translations[0], residuals, NO_GATE, hessian, gradient,
+        )  # fmt: skip
+        return hessian
 
 
-def refine(points: Correspondences, poses: Poses) -> Poses:
-    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from each start; r in standard deviations.
+def refine(points: Correspondences, poses: Poses, gate: float = GATE) -> Poses:
+    """Minimise the Geman–McClure cost Σ r²/(r² + gate²) from each start; r in deviations.
 
     A step that does not lower the cost is undone and damped more (Levenberg–Marquardt). A start
     with points behind the camera is returned as it is.
     """
-    poses = Poses(poses.rotations.copy(), poses.translations.copy())
-    residuals = points.residuals(poses)
-    cost = _robust_cost(residuals)
-    damping = np.full(len(cost), FIRST_DAMPING)
-    active = np.isfinite(residuals).all((1, 2))
+    refined = Poses(poses.rotations.copy(), poses.translations.copy())
+    for rotation, translation in zip(refined.rotations, refined.translations, strict=True):
+        _refine(points.object_points, points.rays, points.whitening, rotation, translation, gate)
+    return refined
+
+
+@compiled()
+def _refine(
+    object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, gate: float
+) -> None:
+    """Refine one pose in place."""
+    n = len(rays)
+    residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
+    moved_R, moved_t = np.empty((3, 3)), np.empty(3)
+    hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    if not _residuals(object_points, rays, whitening, R, t, residuals):
+        return
+    cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
+    _normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
-        if not active.any():
-            break
-        moved = _move(poses, _step(points, poses, residuals, damping))
-        moved_residuals = points.residuals(moved)
-        moved_cost = _robust_cost(moved_residuals)
-        better = active & (moved_cost < cost)
-        arrived = better & (cost - moved_cost <= CONVERGED * cost + ROUNDING)
-        poses.rotations[better] = moved.rotations[better]
-        poses.translations[better] = moved.translations[better]
-        residuals[better], cost[better] = moved_residuals[better], moved_cost[better]
-        damping = np.where(better, np.maximum(damping / 10, LEAST_DAMPING), damping * 10)
-        active &= ~arrived & (damping < MOST_DAMPING)
-    return poses
+        _solve(hessian, gradient, damping, step)
+        _turn(step, R, moved_R)
+        for r in range(3):
+            moved_t[r] = t[r] + step[3 + r]
+        _residuals(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
+        moved_cost = _robust_cost(moved_residuals, gate)
+        if moved_cost < cost:
+            arrived = cost - moved_cost <= CONVERGED * cost + ROUNDING
+            R[:], t[:], residuals[:], cost = moved_R, moved_t, moved_residuals, moved_cost
+            if arrived:
+                return
+            damping = max(damping / 10, LEAST_DAMPING)
+            _normal_equations(
+                object_points, rays, whitening, R, t, residuals, gate, hessian, gradient
+            )
+        else:
+            damping *= 10
+            if damping >= MOST_DAMPING:
+                return
 
 
-def _move(poses: Poses, step: Float[np.ndarray, "s 6"]) -> Poses:
-    """Turn poses about their own origin and shift them: the update of the normal equations."""
-    turned = rotation_vector_to_matrix(step[:, :3]) @ poses.rotations
-    return Poses(turned, poses.translations + step[:, 3:])
+@compiled()
+def _residuals(
+    object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, out: Array
+) -> bool:
+    """Write reprojection errors, NaN behind the camera; tell whether all are in front."""
+    in_front = True
+    for i in range(len(rays)):
+        x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
+        depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        if not depth > 0.0:
+            out[i, 0] = out[i, 1] = math.nan
+            in_front = False
+            continue
+        u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth - rays[i, 0]
+        v = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth - rays[i, 1]
+        out[i, 0] = whitening[i, 0, 0] * u + whitening[i, 0, 1] * v
+        out[i, 1] = whitening[i, 1, 0] * u + whitening[i, 1, 1] * v
+    return in_front
 
 
-def _robust_cost(residuals: Float[np.ndarray, "s n 2"]) -> Float[np.ndarray, "s"]:
-    """Return Σ r²/(r² + g²), written so that an infinite or unknown r counts as 1."""
-    squared = (residuals**2).sum(-1)
-    return np.asarray(residuals.shape[1] - np.nansum(GATE**2 / (squared + GATE**2), axis=-1))
+@compiled()
+def _robust_cost(residuals: Array, gate: float) -> float:
+    """Return Σ r²/(r² + g²); an infinite or unknown r counts as 1."""
+    cost = 0.0
+    for i in range(len(residuals)):
+        squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        cost += squared / (squared + gate**2) if squared < math.inf else 1.0
+    return cost
 
 
-def _step(
-    points: Correspondences,
-    poses: Poses,
-    residuals: Float[np.ndarray, "s n 2"],
-    damping: Float[np.ndarray, "s"],
-) -> Float[np.ndarray, "s 6"]:
-    """Solve the damped normal equations for a left increment (rotation vector, translation)."""
-    squared = (residuals**2).sum(-1, keepdims=True)
-    # Square root of Geman–McClure's weight, the derivative of r²/(r² + g²) by r², up to g².
-    weight = GATE**2 / (squared + GATE**2)
-    jacobian = _jacobian(points, poses) * weight[..., None]
-    jacobian = jacobian.reshape(len(poses), -1, 6)
-    transposed = jacobian.transpose(0, 2, 1)
-    gradient = transposed @ (residuals * weight).reshape(len(poses), -1, 1)
-    hessian = transposed @ jacobian
-    # Scaled to a unit diagonal, rotations and translations of any size are damped alike.
-    scale = 1 / np.sqrt(np.diagonal(hessian, axis1=1, axis2=2) + 1e-12)
-    scaled = hessian * scale[:, :, None] * scale[:, None, :] + damping[:, None, None] * np.eye(6)
-    return np.asarray(-scale * np.linalg.solve(scaled, scale[..., None] * gradient)[..., 0])
-
-
-def _jacobian(points: Correspondences, poses: Poses) -> Float[np.ndarray, "s n 2 6"]:
-    """Differentiate the residuals by a left increment of each pose.
+@compiled()
+def _normal_equations(
+    object_points: Array,
+    rays: Array,
+    whitening: Array,
+    R: Array,
+    t: Array,
+    residuals: Array,
+    gate: float,
+    hessian: Array,
+    gradient: Array,
+) -> None:
+    """Write JᵀJ and Jᵀr of a left increment (rotation vector, translation), robustly weighted.
 
     A ray (u, v) = (X, Y)/Z moves with x_cam by the rows [1, 0, −u]/Z and [0, 1, −v]/Z. Since
-    d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj.
+    d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
+    derivative of r²/(r² + g²) by r², up to g². Points behind the camera take no part.
     """
-    p = points.object_points @ poses.rotations.transpose(0, 2, 1)
-    camera = p + poses.translations[:, None]
-    inverse = 1 / camera[..., 2]
-    u, v = camera[..., 0] * inverse, camera[..., 1] * inverse
-    rows = np.zeros((*u.shape, 2, 6))
-    rows[..., 0, 0] = -u * p[..., 1]
-    rows[..., 0, 1] = p[..., 2] + u * p[..., 0]
-    rows[..., 0, 2] = -p[..., 1]
-    rows[..., 1, 0] = -v * p[..., 1] - p[..., 2]
-    rows[..., 1, 1] = v * p[..., 0]
-    rows[..., 1, 2] = p[..., 0]
-    rows[..., 0, 3] = rows[..., 1, 4] = 1
-    rows[..., 0, 5], rows[..., 1, 5] = -u, -v
-    rows *= (inverse / points.sigma)[..., None, None]
-    return np.asarray(points.to_px @ rows)
+    hessian[:], gradient[:] = 0.0, 0.0
+    rows, own = np.empty((2, 6)), np.empty(6)
+    for i in range(len(rays)):
+        squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        if not squared >= 0.0:
+            continue
+        x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        inverse = 1.0 / (pz + t[2])
+        u, v = (px + t[0]) * inverse, (py + t[1]) * inverse
+        rows[0, 0], rows[0, 1], rows[0, 2] = -u * py, pz + u * px, -py
+        rows[1, 0], rows[1, 1], rows[1, 2] = -v * py - pz, v * px, px
+        rows[0, 3], rows[0, 4], rows[0, 5] = 1.0, 0.0, -u
+        rows[1, 3], rows[1, 4], rows[1, 5] = 0.0, 1.0, -v
+        weight = (gate**2 / (squared + gate**2)) ** 2
+        for r in range(2):
+            a, b = whitening[i, r, 0] * inverse, whitening[i, r, 1] * inverse
+            for c in range(6):
+                own[c] = a * rows[0, c] + b * rows[1, c]
+            for c in range(6):
+                gradient[c] += weight * own[c] * residuals[i, r]
+                for d in range(c + 1):
+                    hessian[c, d] += weight * own[c] * own[d]
+    for c in range(6):
+        for d in range(c):
+            hessian[d, c] = hessian[c, d]
+
+
+@compiled()
+def _solve(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
+    """Solve (H + damping) step = −gradient by Cholesky's factors.
+
+    Scaled to a unit diagonal, rotations and translations of any size are damped alike.
+    """
+    L, scale = np.zeros((6, 6)), np.empty(6)
+    for i in range(6):
+        scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
+    for i in range(6):
+        for j in range(i + 1):
+            value = hessian[i, j] * scale[i] * scale[j]
+            if i == j:
+                value += damping
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            # Below the damping only by rounding.
+            L[i, j] = math.sqrt(max(value, LEAST_DAMPING**2)) if i == j else value / L[j, j]
+    for i in range(6):
+        step[i] = -scale[i] * gradient[i]
+        for k in range(i):
+            step[i] -= L[i, k] * step[k]
+        step[i] /= L[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            step[i] -= L[k, i] * step[k]
+        step[i] /= L[i, i]
+    for i in range(6):
+        step[i] *= scale[i]
+
+
+@compiled()
+def _turn(step: Array, R: Array, out: Array) -> None:
+    """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step."""
+    x, y, z = step[0], step[1], step[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    a, b = 1.0, 0.5
+    if angle > _TINY_ANGLE:
+        half = math.sin(0.5 * angle) / angle
+        a, b = math.sin(angle) / angle, 2.0 * half * half
+    # Exp(ω) p = p + a ω × p + b ω × (ω × p).
+    for c in range(3):
+        px, py, pz = R[0, c], R[1, c], R[2, c]
+        qx, qy, qz = y * pz - z * py, z * px - x * pz, x * py - y * px
+        out[0, c] = px + a * qx + b * (y * qz - z * qy)
+        out[1, c] = py + a * qy + b * (z * qx - x * qz)
+        out[2, c] = pz + a * qz + b * (x * qy - y * qx)

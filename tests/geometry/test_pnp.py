@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import least_squares
 
 from dopepp.geometry.camera import (
     camera_matrix,
@@ -309,3 +310,105 @@ def test_the_mirrored_start_saves_plates_from_the_wrong_tilt() -> None:
             for T in (truth, found)
         )
         assert at_found <= at_truth
+
+
+def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Ellipses of 0.5 to 4 px, turned any way."""
+    angle, sigma = rng.uniform(0, np.pi, n), rng.uniform(0.5, 4, (n, 2))
+    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.einsum("ijn,nj,kjn->nik", axes, sigma**2, axes)
+
+
+@pytest.mark.parametrize("name", ["box", "box off its origin", "plate"])
+def test_the_covariance_is_that_of_the_poses(name: str) -> None:
+    """Poses of many noisy observations scatter as each of them says."""
+    rng = np.random.default_rng(5)
+    cuboid = CUBOIDS[name]
+    truth = look_at(cuboid, rng)
+    pixels, sigma = project(transform(truth, cuboid), K), 0.02 * covariances(rng, 9)
+    root = np.linalg.cholesky(sigma)
+    steps, said = [], []
+    for _ in range(400):
+        noise = (root @ rng.normal(size=(9, 2, 1)))[..., 0]
+        result = solve_pnp(cuboid, pixels + noise, K, covariance_px=sigma)
+        if result.T_cam_obj is None or not result.inliers.all():
+            continue
+        assert result.covariance is not None
+        turn = cv2.Rodrigues(result.T_cam_obj[:3, :3] @ truth[:3, :3].T)[0][:, 0]
+        steps.append(np.concatenate([turn, (result.T_cam_obj - truth)[:3, 3]]))
+        said.append(result.covariance)
+    assert len(steps) > 350
+    expected = np.mean(said, axis=0)
+    scale = 1 / np.sqrt(np.diag(expected))
+    assert_allclose(
+        scale[:, None] * np.cov(np.transpose(steps)) * scale,
+        scale[:, None] * expected * scale,
+        atol=0.25,
+    )
+
+
+def test_a_covariance_that_is_a_circle_is_a_sigma() -> None:
+    rng = np.random.default_rng(9)
+    cuboid, sigma = CUBOIDS["can"], rng.uniform(0.5, 4, 9)
+    pixels = project(transform(look_at(cuboid, rng), cuboid), K) + rng.normal(0, 1, (9, 2))
+    by_sigma = solve_pnp(cuboid, pixels, K, sigma)
+    by_covariance = solve_pnp(
+        cuboid, pixels, K, covariance_px=sigma[:, None, None] ** 2 * np.eye(2)
+    )
+    assert by_sigma.T_cam_obj is not None
+    assert by_covariance.T_cam_obj is not None
+    assert_allclose(by_sigma.T_cam_obj, by_covariance.T_cam_obj, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((2, 2)),
+        -np.eye(2),
+        np.full((2, 2), np.nan),
+        [[1.0, 2.0], [2.0, 1.0]],
+        np.diag([np.inf, 1]),
+    ],
+)
+def test_a_point_without_a_proper_covariance_is_missing(bad: np.ndarray) -> None:
+    rng = np.random.default_rng(4)
+    cuboid = CUBOIDS["box"]
+    pixels = project(transform(look_at(cuboid, rng), cuboid), K)
+    pixels[3] += 100
+    covariance = np.tile(np.eye(2), (9, 1, 1))
+    covariance[3] = bad
+    result = solve_pnp(cuboid, pixels, K, covariance_px=covariance)
+    assert result.inliers.tolist() == [k != 3 for k in range(9)]
+
+
+@pytest.mark.parametrize("name", ["box", "can", "plate"])
+def test_known_covariances_do_as_well_as_a_start_at_the_truth(name: str) -> None:
+    """Against scipy's robust least squares, which is told the truth to start from."""
+    rng = np.random.default_rng(11)
+    cuboid, passed = CUBOIDS[name], np.zeros(2)
+    for _ in range(60):
+        truth, sigma = look_at(cuboid, rng), covariances(rng, 9)
+        root = np.linalg.cholesky(sigma)
+        pixels = project(transform(truth, cuboid), K) + (root @ rng.normal(size=(9, 2, 1)))[..., 0]
+        if rng.random() < 0.4:
+            pixels[rng.integers(8)] += rng.choice([-1, 1], 2) * rng.uniform(20, 60, 2)
+        result = solve_pnp(cuboid, pixels, K, covariance_px=sigma)
+        best = refined_from(truth, cuboid, pixels, np.linalg.inv(root))
+        passed += add(result.T_cam_obj, truth, cuboid) < 0.1, add(best, truth, cuboid) < 0.1
+    assert passed[0] >= passed[1] - 3
+
+
+def refined_from(
+    T: np.ndarray, cuboid: np.ndarray, pixels: np.ndarray, whitening: np.ndarray
+) -> np.ndarray:
+    def moved(step: np.ndarray) -> np.ndarray:
+        turn = rotation_vector_to_matrix(step[:3])
+        return make_transform(turn @ T[:3, :3], T[:3, 3] + step[3:])
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        off = project(transform(moved(step), cuboid), K) - pixels
+        return np.asarray(np.linalg.norm((whitening @ off[..., None])[..., 0], axis=1))
+
+    # "soft" enough to be the gate's neighbour: Cauchy's loss at three deviations.
+    solution = least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=3.0, x_scale="jac")
+    return moved(solution.x)
