@@ -15,12 +15,13 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dopepp.data.bop_images import decode_depth, decode_mask, decode_rgb, read_content
+from dopepp.data.bop_images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.bop_items import read_targets, share
 from dopepp.data.bop_models import parts_by_id
 from dopepp.data.bop_scene import Scene, read_scene, scene_folders
 from dopepp.data.bop_truth import ESTIMATED, make_instance
 from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.drawing.pictures import read_content
 from dopepp.errors import UserError
 from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part

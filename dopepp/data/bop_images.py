@@ -1,12 +1,7 @@
-"""BOP's images as bytes, in a file or in a tar member: PNG, JPEG and TIFF, read whole or refused.
-
-Pillow refuses an image that is cut short, where OpenCV returns the part it has.
-"""
+"""BOP's images as bytes, in a file or in a tar member, read whole or refused."""
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
 from typing import Any, Final
 
 import cv2
@@ -15,37 +10,16 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image
 
+from dopepp.drawing.pictures import MAX_PIXELS, whole_picture
 from dopepp.errors import UserError
 
 FORMATS: Final = ("PNG", "JPEG", "TIFF")
-
-MAX_PIXELS: Final = 64_000_000
-"""Twice the largest industrial cameras; a small file can claim far more."""
-
-MAX_BYTES: Final = 256_000_000
-"""Of an image file: as many pixels without compression."""
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
 """Millimetres a unit of the depth images that are written: up to 6.5 m, and up to 65 m."""
 
 _MAX_UNITS: Final = 65_535
 _DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
-
-
-def read_content(path: Path) -> bytes:
-    """Return an image file's bytes.
-
-    Raises:
-        UserError: The file is missing or too large.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise _bad(str(path), f"{error.strerror}", "a readable file") from error
-    if len(content) > MAX_BYTES:
-        raise _bad(str(path), "a larger file", f"at most {MAX_BYTES / 1e6:.0f} MB")
-    return content
 
 
 def encode_png(pixels: NDArray[Any]) -> bytes:
@@ -143,13 +117,9 @@ def _check_shape(image: Image.Image, where: str, shape: tuple[int, int]) -> None
 def _decode(content: bytes, where: str) -> Image.Image:
     allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
     try:
-        image = Image.open(io.BytesIO(content), formats=FORMATS)
-        if image.width * image.height > MAX_PIXELS:
-            raise ValueError(f"{image.width}×{image.height} pixels")
-        image.load()
-    except Exception as error:  # Pillow raises a different type for every way to be damaged
+        return whole_picture(content, FORMATS)
+    except ValueError as error:
         raise _bad(where, f"{len(content)} bytes: {error}", allowed) from error
-    return image
 
 
 def _bad(where: str, got: str, allowed: str) -> UserError:

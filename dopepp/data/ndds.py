@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.data.bop_items import share
-from dopepp.data.images import read_rgb
 from dopepp.data.ndds_conventions import Finding, check_observation, find_convention
 from dopepp.data.ndds_fields import bad, objects_of, parse_object, read_record, stated
 from dopepp.data.ndds_files import Settings, find_items, image_of
@@ -27,6 +26,7 @@ from dopepp.data.ndds_images import Masks, read_depth
 from dopepp.data.ndds_poses import Observation
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.silhouette import hull_areas
+from dopepp.drawing.pictures import read_rgb
 from dopepp.errors import UserError
 from dopepp.geometry.camera import check_camera, project_keypoints
 from dopepp.parts.part import Part

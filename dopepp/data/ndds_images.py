@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from numpy.typing import NDArray
 
-from dopepp.data.images import read_image
 from dopepp.data.ndds_fields import bad, objects_of, stated
 from dopepp.data.ndds_files import Settings, companion
+from dopepp.drawing.pictures import read_image
 
 DEPTH_UNIT: Final = 0.0001
 """Metres per value of a 16-bit ``.depth.png``: FAT's unit, and what we write; 0 is unknown."""

@@ -11,7 +11,6 @@ from typing import Final, Literal
 import numpy as np
 
 from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
@@ -69,18 +68,12 @@ class RenderedSource:
             "split": self.split,
             "seed": self.factory.seed,
             "preset": repr(self.factory.preset),
-            "backgrounds": background_identity(self.factory.backgrounds),
+            "backgrounds": self.factory.backgrounds.identity(),
             "renderer": self.factory.renderer,
             "parts": {part.name: part.mesh_hash for part in self.factory.parts},
             "negatives": {part.name: part.mesh_hash for part in self.factory.negatives},
         }
         return [SourceInfo(self.name, self._num_items, identity)]
-
-
-def background_identity(backgrounds: Backgrounds) -> list[str]:
-    """Say which backgrounds these are: their kind and, of photos, the file names."""
-    photos = backgrounds.paths if isinstance(backgrounds, PhotoBackgrounds) else []
-    return [type(backgrounds).__name__, *(path.name for path in photos)]
 
 
 def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 from numpy.typing import NDArray
 
-from dopepp.data.images import read_image
 from dopepp.data.ycb_layout import FOLDERS, Subset
 from dopepp.data.ycb_meta import read_meta
+from dopepp.drawing.pictures import read_image
 from dopepp.errors import UserError
 from dopepp.geometry.camera import camera_matrix, check_camera
 

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
 from dopepp.data.draws import Purpose, item_rng
-from dopepp.data.rendered import background_identity
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.silhouette import hull_areas
 from dopepp.data.ycb_frame import read_frame
@@ -181,7 +180,7 @@ class YcbVideoSource:
         }
         if self._backgrounds is not None and self.subset == "synthetic":
             identity["background_seed"] = self._seed
-            identity["backgrounds"] = background_identity(self._backgrounds)
+            identity["backgrounds"] = self._backgrounds.identity()
         return [SourceInfo(self.name, len(self.frames), identity, self._count_instances())]
 
     def _count_instances(self) -> dict[str, int]:

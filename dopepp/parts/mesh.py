@@ -1,7 +1,7 @@
 """Mesh files (STL, OBJ, PLY) and YCB-Video models, in metres, checked before they are used.
 
-To add a format, write a reader that returns vertices, faces, uv and texture, and one line in
-:data:`READERS`.
+To add a format, write a reader that returns a :data:`~dopepp.parts.measure.RawMesh` and raises for
+a damaged file, and one line in :data:`READERS`.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ from dopepp.errors import UserError
 from dopepp.parts.measure import face_areas
 from dopepp.parts.obj import read_obj
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
-from dopepp.parts.stl_ply import read_ply, read_stl
+from dopepp.parts.ply import read_ply
+from dopepp.parts.stl import read_stl
+from dopepp.parts.topology import find_topology, opposed_faces, turn_over
 
 logger = logging.getLogger(__name__)
 
 ASSUMED_UNIT: Final = "mm"
 """What CAD programs write into files that cannot state a unit."""
 
-MAX_BYTES: Final = 500_000_000
-"""Ten million triangles: far beyond any use here, and a bound on memory."""
+MAX_BYTES: Final = 250_000_000
+"""Five million triangles: far beyond any use here, and a bound on memory."""
 
 READERS: Final = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
 """The reader of each suffix."""
@@ -40,8 +42,9 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
         unit: The file's unit: mm, cm, m or inch. None takes millimetres and says so in the log.
 
     Returns:
-        The mesh in metres: duplicate STL vertices merged, flat triangles dropped, uv and texture
-        where an OBJ or PLY names a texture in its own folder.
+        The mesh in metres: duplicate STL vertices merged, flat triangles dropped, triangles turned
+        to face as their neighbours do, uv and texture where an OBJ or PLY names a texture in its
+        own folder. It may have open edges and triangles that intersect each other.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
@@ -55,20 +58,33 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     if reader is None:
         suffixes = ", ".join(READERS)
         raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
-    if not path.is_file():
+    if not _is_file(path):
         raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
     if path.stat().st_size > MAX_BYTES:
-        raise _damaged(path, f"{path.stat().st_size / 1e6:.0f} MB", "reduce its triangles")
+        raise _damaged(
+            path,
+            f"{path.stat().st_size / 1e6:.0f} MB",
+            "reduce its triangles, or write it as a binary file",
+        )
     try:
         vertices, faces, uv, texture = reader(path)
     except UserError:
         raise
+    except ValueError as error:
+        raise _damaged(path, str(error)) from error
     except Exception as error:  # whatever a parser makes of a damaged file
         raise _damaged(path, f"{type(error).__name__}: {error}") from error
     mesh = _checked(path, UNITS[unit or ASSUMED_UNIT] * vertices, faces, uv, texture)
     if unit is None:
         logger.warning("%s states no unit: taken as %s (unit=… changes it)", path, ASSUMED_UNIT)
     return mesh
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long, for one
+        return False
 
 
 def ycb_part(root: str | Path, name: str) -> Part:
@@ -118,8 +134,10 @@ def _checked(
     """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
     if not len(vertices) or not len(faces):
         raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
-    if not np.isfinite(vertices).all() or not (uv is None or np.isfinite(uv).all()):
-        raise _damaged(path, "a coordinate that is not a finite number")
+    for values in (vertices, uv):
+        if values is not None and not np.isfinite(values).all():
+            bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+            raise _damaged(path, f"a coordinate that is not a finite number, vertex {bad + 1}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise _damaged(path, f"a face index outside of its {len(vertices)} vertices")
     # A millionth of the mesh wide and long: such a triangle has no meaningful normal.
@@ -130,12 +148,29 @@ def _checked(
     if not proper.all():
         logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
     used, index = np.unique(faces[proper], return_inverse=True)
+    vertices = vertices[used]
     return Mesh(
-        vertices=vertices[used],
-        faces=index.reshape(-1, 3).astype(np.int32),
+        vertices=vertices,
+        faces=_outward(path, vertices, index.reshape(-1, 3)).astype(np.int32),
         uv=None if uv is None else np.asarray(uv, np.float64)[used],
         texture=texture,
     )
+
+
+def _outward(
+    path: Path, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Int[np.ndarray, "faces 3"]:
+    """Make neighbouring triangles face the same way, and say what is unusual about their edges."""
+    topology = find_topology(vertices, faces)
+    if not topology.is_closed:
+        logger.info(
+            "%s is not watertight, taken as it is: %d open edges, %d edges of over two triangles",
+            path, topology.num_open, topology.num_crowded,
+        )  # fmt: skip
+    turned = opposed_faces(vertices, faces, topology)
+    if turned.any():
+        logger.info("%s: turned over %d triangles that faced the wrong way", path, turned.sum())
+    return turn_over(faces, turned)
 
 
 def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,8 +11,11 @@ from jaxtyping import Float, Int, UInt8
 
 from dopepp.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.parts.decimate import MAX_FACES, decimate
 from dopepp.parts.measure import hash_triangles, largest_distance, sample_surface
 from dopepp.parts.record import check_name, check_record
+
+logger = logging.getLogger(__name__)
 
 UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 """Metres per unit of a mesh file."""
@@ -47,8 +51,8 @@ class Part:
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
         diameter: Largest distance between two vertices, metres.
         points: ADD points in the object frame, metres.
-        mesh: Its triangles; None when the part comes out of a checkpoint.
-        mesh_hash: SHA-256 of vertices and faces, hex.
+        mesh: Triangles to render, at most 200,000; None when the part comes out of a checkpoint.
+        mesh_hash: SHA-256 of the vertices and faces that the part was made from, hex.
         symmetries_discrete: BOP-style rigid transforms that map the part onto itself, without the
             identity, shape (S, 4, 4).
         symmetries_continuous: BOP-style axes of rotational symmetry as (axis, offset) pairs.
@@ -104,6 +108,9 @@ def make_part(
 ) -> Part:
     """Measure a mesh and make the part it describes.
 
+    A mesh of over 200,000 triangles is measured as it is, so that poses, errors and the hash do not
+    depend on it, and then decimated for rendering, which the log says.
+
     Args:
         name: The label of the part's instances.
         mesh: Triangles in metres; None for an object known by its points only.
@@ -113,7 +120,8 @@ def make_part(
         unit: The unit of the file the mesh was read from, named when the size is unlikely.
 
     Raises:
-        UserError: The name is empty or too long, or the diameter lies outside 5 mm – 5 m.
+        UserError: The name is empty or too long, the diameter lies outside 5 mm – 5 m, or the mesh
+            has too many triangles of which no larger ones can be made.
         ValueError: There is neither a mesh nor points.
     """
     check_name(name)
@@ -130,11 +138,28 @@ def make_part(
         cuboid=cuboid_keypoints(shape.min(axis=0), shape.max(axis=0)),
         diameter=diameter,
         points=np.asarray(points, np.float64),
-        mesh=mesh,
+        mesh=None if mesh is None else _renderable(mesh, name),
         mesh_hash="" if mesh is None else hash_triangles(shape, mesh.faces),
         symmetries_discrete=symmetries_discrete,
         symmetries_continuous=symmetries_continuous,
     )
+
+
+def _renderable(mesh: Mesh, name: str) -> Mesh:
+    """Return a mesh of at most ``MAX_FACES`` triangles."""
+    if len(mesh.faces) <= MAX_FACES:
+        return mesh
+    try:
+        vertices, faces, uv, moved = decimate(mesh.vertices, mesh.faces, mesh.uv)
+    except ValueError as error:
+        raise UserError(
+            f"part {name!r}: {error}", f"up to {MAX_FACES} triangles", "reduce its triangles"
+        ) from error
+    logger.warning(
+        "part %r: %d triangles decimated to %d to render; no point moved by more than %.2g mm",
+        name, len(mesh.faces), len(faces), 1000 * moved,
+    )  # fmt: skip
+    return Mesh(vertices, faces.astype(np.int32), uv, mesh.texture)
 
 
 def _check_diameter(diameter: float, name: str, unit: str) -> None:

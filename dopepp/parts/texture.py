@@ -7,15 +7,12 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
+from dopepp.drawing.pictures import FORMATS, MAX_SIDE, read_picture
 from dopepp.errors import UserError
 
-FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
-"""Formats that are nothing but pixels: PIL would hand EPS to another program."""
-
-MAX_SIDE: Final = 16_384
-"""Pixels; a larger texture takes over 0.8 GB, and a small file can claim it."""
+MAX_MATERIAL_BYTES: Final = 10_000_000
+"""Size of a material file: a hundred thousand materials, and a bound on memory."""
 
 
 def companion_path(mesh_path: Path, name: str, field: str) -> Path:
@@ -50,19 +47,17 @@ def companion_path(mesh_path: Path, name: str, field: str) -> Path:
 def read_texture(path: Path) -> UInt8[np.ndarray, "height width 3"]:
     """Return an image as RGB, first row on top.
 
-    PIL refuses an image that is cut short, where OpenCV returns the part it has.
-
     Raises:
-        UserError: It is no image, is damaged, or is larger than 16,384 pixels a side.
+        UserError: It is no image, is damaged, or is larger than 8,192 pixels a side.
     """
-    allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
     try:
-        with Image.open(path, formats=FORMATS) as image:
-            if max(image.size) > MAX_SIDE:
-                raise ValueError(f"{image.width}×{image.height} pixels")
-            return np.asarray(image.convert("RGB"))
-    except Exception as error:  # PIL raises a different type for every way to be damaged
-        raise UserError(f"texture {path}: {error}", allowed, "replace the image") from error
+        return read_picture(path)
+    except ValueError as error:
+        raise UserError(
+            f"texture {path}: {error}",
+            f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels",
+            "replace the image",
+        ) from error
 
 
 def read_text(path: Path) -> str:
@@ -74,8 +69,15 @@ def read_materials(path: Path) -> dict[str | None, str | None]:
     """Return the file name of each MTL material's colour map, None for one without.
 
     Raises:
-        UserError: A map has options, which would change how it lies on the part.
+        UserError: The file is too large, or a map has options, which would change how it lies on
+            the part.
     """
+    if path.stat().st_size > MAX_MATERIAL_BYTES:
+        raise UserError(
+            f"material file {path} of {path.stat().st_size / 1e6:.0f} MB",
+            f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB",
+            "keep only the materials that the mesh uses",
+        )
     maps: dict[str | None, str | None] = {}
     material: str | None = None
     for line in read_text(path).split("\n"):

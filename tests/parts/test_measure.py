@@ -54,6 +54,32 @@ def test_largest_distance_needs_more_than_one_block_of_a_hull() -> None:
     assert largest_distance(points) == pdist(points).max()
 
 
+@pytest.mark.parametrize("shape", ["ball", "noisy ball", "egg", "corner", "lens"])
+def test_largest_distance_of_rounded_sets_without_all_pairs(shape: str) -> None:
+    # More corners than are compared with each other; every point is one.
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(7000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    if shape == "noisy ball":
+        points *= rng.uniform(0.9999, 1, (7000, 1))
+    elif shape == "egg":
+        points *= [1, 1, 1.2 + 0.1 * (points[0, 2] > 0)]
+        points[:, 2] *= np.where(points[:, 2] > 0, 1.3, 1)
+    elif shape == "corner":
+        points = np.abs(points)  # an eighth of a ball: its longest lines join its three tips
+    elif shape == "lens":
+        points = points[np.abs(points[:, 0]) > 0.4] * [0.1, 1, 1]
+    exact = pdist(points).max()
+    assert exact * (1 - 9e-4) < largest_distance(points) <= exact * (1 + 1e-12)
+
+
+def test_largest_distance_of_many_points_in_a_plane_but_one() -> None:
+    x, y = np.meshgrid(np.linspace(0, 1, 100), np.linspace(0, 1, 100))
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    points[1] = [0.5, 0.5, 3]
+    assert largest_distance(points) == pytest.approx(np.sqrt(9.5), rel=1e-12)
+
+
 def test_face_areas_agree_with_trimesh() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
     areas = face_areas(np.asarray(mesh.vertices), np.asarray(mesh.faces))
@@ -125,3 +151,5 @@ def test_a_fan_over_a_dent_is_folded() -> None:
     polygons = np.array([3, 3, 8, 8])
     assert first_folded_polygon(np.vstack([square, dart]), faces, polygons) == 8
     assert first_folded_polygon(np.vstack([square, square]), faces, polygons) is None
+    bow_tie = square[[0, 2, 1, 3]]
+    assert first_folded_polygon(np.vstack([square, bow_tie]), faces, polygons) == 8

@@ -142,7 +142,7 @@ def test_a_photo_that_vanishes_counts_as_damaged(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("size", "message"),
-    [((9000, 200), "9000×200 pixels"), ((12_000, 12_000), "144000000 pixels")],
+    [((9000, 200), "9000×200 pixels"), ((12_000, 12_000), "12000×12000 pixels")],
 )
 def test_a_photo_of_absurd_size_is_not_decoded(
     tmp_path: Path, size: tuple[int, int], message: str

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dopepp.data.bop_images import FORMATS, MAX_PIXELS, read_content
+from dopepp.data.bop_images import FORMATS
 from dopepp.data.checking.report import CheckReport
 from dopepp.data.json_file import MAX_BYTES, parse_json
+from dopepp.drawing.pictures import MAX_PIXELS, read_content, whole_picture
 from dopepp.errors import UserError
 
 
@@ -121,12 +122,8 @@ def decode_map(
 def _decode(report: CheckReport, path: Path | str, content: bytes) -> NDArray[Any] | None:
     """Read a whole PNG, JPEG or TIFF within bounds."""
     try:
-        picture: Image.Image = Image.open(io.BytesIO(content), formats=FORMATS)
-        if picture.width * picture.height > MAX_PIXELS:
-            raise ValueError(f"{picture.width}×{picture.height} pixels are too many")
-        picture.load()
-        return np.asarray(picture)
-    except Exception as error:  # Pillow raises a different type for every way to be damaged
+        return np.asarray(whole_picture(content, FORMATS))
+    except ValueError as error:
         report.add(path, "image", f"unreadable or truncated, {len(content):,} bytes ({error})")
         return None
 

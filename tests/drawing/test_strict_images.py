@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dopepp.data.images import read_image, read_rgb
+from dopepp.drawing.pictures import read_image, read_rgb
 from dopepp.errors import UserError
 
 
@@ -64,5 +64,36 @@ def test_damage_missing_and_other_formats(tmp_path: Path, image: np.ndarray) -> 
     with pytest.raises(UserError, match="damaged at byte"):
         read_image(path)
     path.write_text("not an image")
-    with pytest.raises(UserError, match="neither PNG nor JPEG"):
+    with pytest.raises(UserError, match="none of PNG, JPEG"):
+        read_image(path)
+
+
+def test_rare_kinds_of_pixels_agree_with_opencv(tmp_path: Path, image: np.ndarray) -> None:
+    picture, path = Image.fromarray(image), tmp_path / "image.png"
+    for rare in (picture.convert("P"), picture.convert("1"), picture.convert("LA")):
+        rare.save(path)
+        expected = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        np.testing.assert_array_equal(read_rgb(path), expected[..., ::-1])
+    assert cv2.imwrite(str(path), image.astype(np.uint16) * 257)
+    with pytest.raises(UserError, match=r"image\.png of 16-bit colours; allowed: 8 bits"):
+        read_image(path)
+
+
+def test_a_jpeg_may_go_on_behind_its_end(tmp_path: Path, image: np.ndarray) -> None:
+    path = tmp_path / "image.jpg"
+    Image.fromarray(image).save(path)
+    expected = read_rgb(path)
+    path.write_bytes(path.read_bytes() + b"maker notes" * 1000)
+    np.testing.assert_array_equal(read_rgb(path), expected)
+
+
+def test_bombs_and_huge_files_are_not_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "image.png"
+    for side in (9000, 14_000):  # below and above Pillow's own limit
+        Image.new("1", (side, side)).save(path)
+        with pytest.raises(UserError, match=f"image.png of .*{side}|could be decompression bomb"):
+            read_image(path)
+    with path.open("wb") as file:
+        file.truncate(10**10)
+    with pytest.raises(UserError, match=r"more than 256 MB; allowed: at most 256 MB"):
         read_image(path)

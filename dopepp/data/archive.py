@@ -1,0 +1,162 @@
+"""Unpack archives from anywhere into a folder that is there completely or not at all.
+
+All members' names, kinds and sizes are checked before the first byte is written, the bytes are
+counted while they are written, and the folder appears under its name when it is complete. Only
+plain files and folders are unpacked, with permissions of their own: links, devices and other kinds
+are refused, for no data set needs them.
+"""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from dopepp.data.archive_members import CHUNK_BYTES, Member, archive_members, refused
+from dopepp.drawing.png import partial_path
+from dopepp.errors import UserError
+
+_SMALL_BYTES: Final = 10_000_000
+"""However well it compresses, so little is no bomb."""
+
+_HEADER_BYTES: Final = 4096
+"""A tar file has at most so many bytes around a member: its header, a long name, the padding."""
+
+_MAX_NAME: Final = 1000
+_MAX_PART: Final = 200
+"""Characters of a member's path and of each of its parts; file systems end at 255 bytes."""
+
+_RESERVED: Final = frozenset('<>:"|?*\\')
+"""Characters that mean something else, or nothing, in a path of another system."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an archive may unpack to.
+
+    Attributes:
+        num_members: Files and folders.
+        total_bytes: Bytes of all files together.
+        ratio: Bytes unpacked per byte of the archive, where they are over ten megabytes: text
+            compresses by 50 at most, pictures by far less, a bomb by a thousand.
+    """
+
+    num_members: int = 200_000
+    total_bytes: int = 20_000_000_000
+    ratio: float = 100.0
+
+    def most_bytes(self, archive_bytes: int) -> int:
+        """Return how many bytes the files in an archive of this size may have."""
+        return min(self.total_bytes, max(_SMALL_BYTES, int(self.ratio * archive_bytes)))
+
+
+def safe_extract(archive: Path | str, folder: Path | str, limits: Limits | None = None) -> Path:
+    """Unpack an archive into a new folder.
+
+    Args:
+        archive: A tar or zip file; its content tells which.
+        folder: Where to; it must not exist, or be empty.
+        limits: How much may be unpacked.
+
+    Returns:
+        The folder.
+
+    Raises:
+        UserError: The archive is missing, damaged, or of another format; a member's path leads out
+            of the folder, or is the same as another's; a member is no plain file or folder; a limit
+            is exceeded; or the folder is in use or cannot be written. Nothing is left of it then.
+    """
+    archive, folder = Path(archive), Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UserError(f"{folder}, which is in use", "a new or empty folder", "choose another")
+    if not archive.is_file():
+        raise UserError(f"archive {archive}, no such file", "a tar or zip file", "check the path")
+    partial = partial_path(folder.absolute())
+    limits = limits or Limits()
+    try:
+        longest = limits.most_bytes(archive.stat().st_size) + limits.num_members * _HEADER_BYTES
+        with archive_members(archive, longest) as members:
+            checked = _checked(archive, members, limits)
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            needed, free = sum(m.size for _, m in checked), shutil.disk_usage(partial).free
+            if needed > free:
+                raise OSError(errno.ENOSPC, f"{needed} bytes to unpack, {free} free")
+            for path, member in checked:
+                _unpack(archive, member, partial / path)
+        if folder.exists():
+            folder.rmdir()
+        partial.rename(folder)
+    except OSError as error:
+        raise UserError(
+            f"{archive}, which cannot be unpacked into {folder}: {error}",
+            "an archive to read and a folder with room to write",
+            "check both, and the space on the disk",
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return folder
+
+
+def _checked(
+    archive: Path, members: Iterator[Member], limits: Limits
+) -> list[tuple[PurePosixPath, Member]]:
+    """Return the members with the paths they get, or refuse the archive."""
+    most = limits.most_bytes(archive.stat().st_size)
+    checked: list[tuple[PurePosixPath, Member]] = []
+    kinds: dict[str, bool] = {}
+    total = 0
+    for member in members:
+        path = _path(archive, member)
+        total += member.size
+        if len(checked) == limits.num_members:
+            raise refused(archive, f"more than {limits.num_members} members")
+        if total > most:
+            raise refused(archive, f"more than {most} bytes to unpack from {archive.name}")
+        # Folders come and go twice; a file may not, nor have another one inside. Compared without
+        # case, as some file systems do.
+        for parent in (*path.parents, path) if member.is_folder else path.parents:
+            if kinds.setdefault(str(parent).casefold(), True) is False:
+                raise refused(archive, f"member {member.name[:100]!r} below or instead of a file")
+        if not member.is_folder:
+            if str(path).casefold() in kinds:
+                raise refused(archive, f"two members {member.name[:100]!r}")
+            kinds[str(path).casefold()] = False
+        checked.append((path, member))
+    return checked
+
+
+def _path(archive: Path, member: Member) -> PurePosixPath:
+    """Return a member's path inside of the folder."""
+    name = member.name
+    path = PurePosixPath(name)
+    if member.kind:
+        raise refused(archive, f"member {name[:100]!r}, a {member.kind}")
+    if path.is_absolute() or ".." in path.parts:
+        raise refused(archive, f"member {name[:100]!r}, which leads out of the folder")
+    odd = [c for c in name if c in _RESERVED or not c.isprintable()]
+    long = len(name) > _MAX_NAME or any(len(part) > _MAX_PART for part in path.parts)
+    if odd or long or (path == PurePosixPath() and not member.is_folder):
+        raise refused(archive, f"member {name[:100]!r}, no name that every system can write")
+    return path
+
+
+def _unpack(archive: Path, member: Member, path: Path) -> None:
+    """Write one member; its content may not be longer or shorter than it claims."""
+    if member.is_folder:
+        path.mkdir(parents=True, exist_ok=True)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written = 0
+    # "x": where a name passed the checks twice after all, nothing is overwritten.
+    with member.open() as source, path.open("xb") as target:
+        while chunk := source.read(CHUNK_BYTES):
+            written += len(chunk)
+            if written > member.size:
+                break
+            target.write(chunk)
+    if written != member.size:
+        raise refused(archive, f"member {member.name!r} of another size than it claims")

@@ -1,0 +1,200 @@
+"""Pictures from anybody's files: decoded whole or not at all, and never larger than expected.
+
+Every reader of photos, textures, frames, depth images and masks decodes here. Pillow refuses a file
+that is cut short, where OpenCV returns the part it has, and it tells a picture's size before it
+decodes it; a PNG's checksums and a JPEG's end, which it does not look at, are held to as well.
+
+To take a further format, name it in :data:`FORMATS`, if it is nothing but pixels.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from dopepp.errors import UserError
+
+FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
+"""Formats that are nothing but pixels: PIL would hand EPS to another program."""
+
+FRAME_FORMATS: Final = ("PNG", "JPEG")
+"""Formats of the frames of YCB-Video, NDDS and FAT."""
+
+MAX_SIDE: Final = 8192
+"""Pixels; such a picture takes 0.2 GB, and a small file can claim any size."""
+
+MAX_PIXELS: Final = 64_000_000
+"""Of a data set's image: twice the largest industrial cameras."""
+
+MAX_BYTES: Final = 256_000_000
+"""Of a picture's file: as many pixels as :data:`MAX_SIDE` allows, without compression."""
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG: Final = b"\xff\xd8"
+_JPEG_END: Final = b"\xff\xd9"
+
+
+def read_picture(path: Path, longest_px: int | None = None) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a picture as RGB, first row on top.
+
+    Args:
+        path: A file in one of :data:`FORMATS`, whatever its suffix.
+        longest_px: Reduce a picture whose longer side is longer than this; a JPEG file is then
+            decoded at a fraction of its size, which takes a fraction of the time.
+
+    Raises:
+        ValueError: It is missing, no picture, damaged, or over 8,192 pixels wide or high.
+    """
+    try:
+        with _opened(_content(path), FORMATS) as image:
+            if max(image.size) > MAX_SIDE:
+                raise ValueError(f"{image.width}×{image.height} pixels")
+            scale = 1.0 if longest_px is None else longest_px / max(image.size)
+            if scale >= 1:
+                return np.asarray(image.convert("RGB"))
+            size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
+            image.draft("RGB", size)
+            return np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
+    except Exception as error:  # PIL raises a different type for every way to be damaged
+        raise ValueError(_reason(error)) from error
+
+
+def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
+    """Decode a file that is in memory, with its own depth and channels.
+
+    Raises:
+        ValueError: It is none of the formats, damaged, or larger than :data:`MAX_PIXELS`.
+    """
+    try:
+        image = _opened(content, formats)
+        if image.width * image.height > MAX_PIXELS:
+            raise ValueError(f"{image.width}×{image.height} pixels")
+        image.load()
+    except Exception as error:  # as above
+        raise ValueError(_reason(error)) from error
+    return image
+
+
+def read_content(path: Path) -> bytes:
+    """Return an image file's bytes.
+
+    Raises:
+        UserError: The file is missing or too large.
+    """
+    try:
+        return _content(path)
+    except OSError as error:
+        raise UserError(
+            f"image {path}: {error.strerror}", "a readable file", "restore it"
+        ) from error
+    except ValueError as error:
+        raise UserError(
+            f"image {path}: {error}", f"at most {MAX_BYTES / 1e6:.0f} MB", "reduce it"
+        ) from error
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """Read a frame with its own depth and channels, colours as R, G, B(, A).
+
+    Raises:
+        UserError: The file is missing, is neither PNG nor JPEG, is incomplete or damaged, or has
+            colours of 16 bits.
+    """
+    content = read_content(path)
+    try:
+        image = whole_picture(content, FRAME_FORMATS)
+    except ValueError as error:
+        raise UserError(
+            f"image {path} of {len(content)} bytes: {error}",
+            "a complete PNG or JPEG file",
+            "copy or download the file again",
+        ) from error
+    if _is_deep_colour(content):
+        # Pillow would drop their lower half without a word.
+        raise UserError(f"image {path} of 16-bit colours", "8 bits a channel", "convert it")
+    if image.mode.startswith("I"):
+        return np.asarray(image, np.uint16)
+    if image.mode not in ("L", "RGB", "RGBA"):
+        # Palettes, greys with alpha, one bit a pixel, print colours.
+        plain = "L" if image.mode == "1" else "RGBA" if image.has_transparency_data else "RGB"
+        image = image.convert(plain)
+    return np.asarray(image)
+
+
+def read_rgb(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an 8-bit frame as RGB; an alpha channel is dropped, grey becomes three channels.
+
+    Raises:
+        UserError: As :func:`read_image`, or the image does not have 8 bits.
+    """
+    image = read_image(path)
+    if image.dtype != np.uint8:
+        raise UserError(f"image {path} of type {image.dtype}", "8 bits a channel", "convert it")
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., :3])
+
+
+def _content(path: Path) -> bytes:
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"more than {MAX_BYTES / 1e6:.0f} MB")
+    return content
+
+
+def _opened(content: bytes, formats: tuple[str, ...]) -> Image.Image:
+    """Open a picture and hold it to its format, without decoding it."""
+    damage = ""
+    if content.startswith(_PNG):
+        damage = _png_damage(content)
+    elif content.startswith(_JPEG) and _JPEG_END not in content:
+        damage = "no end marker"  # behind which cameras append anything
+    elif not content:
+        damage = "an empty file"
+    if damage:
+        raise ValueError(f"truncated or damaged, {damage}")
+    with warnings.catch_warnings():
+        # Of a picture above its limit PIL warns, in a line of its own; ours are lower.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            return Image.open(io.BytesIO(content), formats=formats)
+        except UnidentifiedImageError:
+            # PIL's own text shows an address in memory.
+            listed = ", ".join(formats)
+            raise ValueError(f"cannot identify the format, none of {listed}") from None
+
+
+def _png_damage(content: bytes) -> str:
+    """Walk the chunks (length, type, data, checksum) up to IEND; say what is wrong, if anything."""
+    start = len(_PNG)
+    while start + 12 <= len(content):
+        length = int.from_bytes(content[start : start + 4], "big")
+        end = start + 12 + length
+        if end > len(content):
+            break
+        checksum = int.from_bytes(content[end - 4 : end], "big")
+        if zlib.crc32(memoryview(content)[start + 4 : end - 4]) != checksum:
+            return f"damaged at byte {start}"
+        if content[start + 4 : start + 8] == b"IEND":
+            return ""
+        start = end
+    return f"cut short after byte {start}"
+
+
+def _is_deep_colour(content: bytes) -> bool:
+    """Tell whether a PNG's header (behind signature, length, type and size) says 16-bit colour."""
+    depth, colour = content[24:26]
+    return content.startswith(_PNG) and depth == 16 and colour != 0
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,197 @@
+"""Procedural backgrounds: textures made from noise, gradients, tiles, bricks, wood and shapes.
+
+To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+Field = Float32[np.ndarray, "height width"]
+
+_SHARP_WIDTH_PX: Final = 256
+"""Textures up to this width are drawn at full resolution."""
+
+_SMOOTH_CELL_PX: Final = 32
+"""Noise with larger cells than this loses nothing by being enlarged from a quarter of its size."""
+
+
+class ProceduralBackgrounds:
+    """Textures made from noise, gradients, tiles, bricks, wood and scattered shapes."""
+
+    def identity(self) -> list[str]:
+        """Return the kind: there are no files."""
+        return ["procedural"]
+
+    def draw(
+        self, rng: np.random.Generator, width: int, height: int
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Return one texture, or two blended by a third, with 0 to 12 shapes scattered over it."""
+        image = _texture(rng, width, height)
+        if rng.random() < 0.4:
+            columns, rows = max(width // 8, 1), max(height // 8, 1)
+            coarse = np.clip(_noise(rng, columns, rows, 2) * np.float32(3) - 1, 0, 1)
+            weight = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+            other = _texture(rng, width, height)
+            image = cv2.blendLinear(image, other, weight, 1 - weight)
+        _scatter(rng, image, int(rng.integers(0, 13)))
+        return np.asarray(image, np.uint8)
+
+
+def _texture(
+    rng: np.random.Generator, width: int, height: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a random pattern in a random palette of two to five colours."""
+    pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
+    # A background is out of focus, more or less: large ones are drawn coarser and enlarged.
+    scale = (
+        1.0 if width <= _SHARP_WIDTH_PX else max(rng.uniform(0.35, 0.75), _SHARP_WIDTH_PX / width)
+    )
+    columns, rows = round(width * scale), max(round(height * scale), 1)
+    field = pattern(rng, columns, rows)
+    grain = np.float32(rng.uniform(0.0, 0.25))
+    field = (1 - grain) * field + grain * _noise(rng, columns, rows, int(rng.integers(16, 64)))
+    codes = np.clip(field * 255, 0, 255).astype(np.uint8)
+    if scale < 1.0:
+        codes = np.asarray(cv2.resize(codes, (width, height), interpolation=cv2.INTER_LINEAR))
+    return np.asarray(cv2.applyColorMap(codes, _palette(rng)), np.uint8)
+
+
+def _palette(rng: np.random.Generator) -> UInt8[np.ndarray, "256 1 3"]:
+    """Return a colour map through random colours; most are muted or close to one colour."""
+    count = int(rng.integers(2, 6))
+    colours = rng.uniform(0, 255, (count, 3))
+    if rng.random() < 0.5:
+        colours = rng.uniform(20, 235, 3) + (colours - 127) * rng.uniform(0.1, 0.5)
+    # Rooms and workshops are greyer than random colours: pull most palettes towards grey.
+    grey = colours.mean(axis=1, keepdims=True)
+    colours = grey + (colours - grey) * rng.uniform(0.0, 1.0)
+    # From the first colour at code 0 to the last one at 255, straight between two of them.
+    place = np.arange(256) * ((count - 1) / 255)
+    before = np.minimum(place.astype(np.int64), count - 2)
+    share = (place - before)[:, None]
+    colours = (1 - share) * colours[before] + share * colours[before + 1]
+    return np.asarray(np.clip(colours, 0, 255), np.uint8)[:, None]
+
+
+def _noise(rng: np.random.Generator, width: int, height: int, cells: int) -> Field:
+    """Return smooth noise in [0, 1] with about ``cells`` cells along the image's width."""
+    rows = max(round(cells * height / width), 1)
+    grid = rng.random((rows + 1, cells + 1), np.float32)
+    if cells * _SMOOTH_CELL_PX <= width:
+        quarter = (width // 4, max(height // 4, 1))
+        grid = np.asarray(cv2.resize(grid, quarter, interpolation=cv2.INTER_CUBIC))
+        return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR))
+    # Large cells show the creases of linear interpolation; small ones do not.
+    smooth = cv2.INTER_CUBIC if cells * 8 <= width else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(grid, (width, height), interpolation=smooth))
+
+
+def _clouds(rng: np.random.Generator, width: int, height: int) -> Field:
+    """Return noise summed over several scales, each with a random share."""
+    field = np.zeros((height, width), np.float32)
+    total, cells, gain = 0.0, int(rng.integers(2, 8)), rng.uniform(0.4, 0.9)
+    for octave in range(5):
+        if octave > 0 and cells * 2**octave > width:
+            break
+        cv2.scaleAdd(_noise(rng, width, height, cells * 2**octave), gain**octave, field, field)
+        total += gain**octave
+    # A sum of noises bunches around its middle: spread it over the palette.
+    return np.asarray((field / total - 0.5) * 1.8 + 0.5)
+
+
+def _coordinates(rng: np.random.Generator, width: int, height: int) -> tuple[Field, Field]:
+    """Return image coordinates, turned, in perspective and bent; the width is about 1."""
+    angle, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.08)
+    x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[None]
+    y = (np.linspace(-0.5, 0.5, height, dtype=np.float32) * (height / width))[:, None]
+    depth = 1 + np.float32(rng.uniform(-0.8, 0.8)) * x + np.float32(rng.uniform(-0.8, 0.8)) * y
+    cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    near = 1 / depth
+    along, across = (cosine * x - sine * y) * near, (sine * x + cosine * y) * near
+    if rng.random() < 0.5:
+        along = along + np.float32(bend) * _noise(rng, width, height, 4)
+    return along, across
+
+
+def _gradient(rng: np.random.Generator, width: int, height: int) -> Field:
+    along, across = _coordinates(rng, width, height)
+    return np.asarray(along * np.float32(rng.uniform(0.5, 1.5)) + across * across + 0.5)
+
+
+def _checker(rng: np.random.Generator, width: int, height: int) -> Field:
+    along, across = _coordinates(rng, width, height)
+    tiles = np.float32(rng.uniform(2, 16))
+    odd = _whole(along * tiles) + _whole(across * tiles) & 1
+    return np.asarray(np.array([0.2, 0.8], np.float32)[odd])
+
+
+def _whole(values: Field) -> Int32[np.ndarray, "height width"]:
+    """Return the next integers below, on which remainders take a fraction of the time."""
+    return np.asarray(np.floor(values), np.int32)
+
+
+def _bricks(rng: np.random.Generator, width: int, height: int) -> Field:
+    """Return a running bond with mortar joints and a shade of its own for every brick."""
+    along, across = _coordinates(rng, width, height)
+    across = across * np.float32(rng.uniform(4, 14))
+    row = _whole(across)
+    along = along * np.float32(rng.uniform(2, 6)) + (row & 1) * np.float32(0.5)
+    column = _whole(along)
+    joint = np.float32(rng.uniform(0.03, 0.15))
+    mortar = (along - column < joint) | (across - row < 2 * joint)
+    shades = np.float32(0.3) + np.float32(0.5) * rng.random(256, np.float32)
+    shade = shades[(row * np.int32(17) + column * np.int32(31)).astype(np.uint8)]
+    return np.where(mortar, np.float32(rng.random()), shade)
+
+
+def _wood(rng: np.random.Generator, width: int, height: int) -> Field:
+    """Return year rings of a trunk cut lengthwise: bent stripes with fibres."""
+    along, across = _coordinates(rng, width, height)
+    rings = across * np.float32(rng.uniform(6, 30)) + 2 * _noise(rng, width, height, 3)
+    rings += np.float32(rng.uniform(0, 4)) * along * along
+    fibres = rng.random((max(height // 2, 1), max(width // 32, 1)), np.float32)
+    fibre = cv2.resize(fibres, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(0.7 * (rings - np.floor(rings)) + 0.3 * fibre)
+
+
+def _speckle(rng: np.random.Generator, width: int, height: int) -> Field:
+    """Return fine noise over coarse noise: concrete, carpet, terrazzo."""
+    cells = max(int(rng.integers(width // 4, width // 2 + 1)), 1)
+    share = np.float32(rng.uniform(0.2, 0.7))
+    return share * _noise(rng, width, height, cells) + (1 - share) * _clouds(rng, width, height)
+
+
+_PATTERNS: Final[tuple[Callable[[np.random.Generator, int, int], Field], ...]] = (
+    _clouds, _gradient, _checker, _bricks, _wood, _speckle,
+)  # fmt: skip
+
+
+def _scatter(
+    rng: np.random.Generator, image: UInt8[np.ndarray, "height width 3"], count: int
+) -> None:
+    """Draw random ellipses, polygons, lines and circles over an image in place."""
+    height, width = image.shape[:2]
+    # All of a shape's numbers in one draw: one by one they would take longer than the drawing.
+    for red, green, blue, x, y, size, kind, turn, more in rng.random((count, 9)).tolist():
+        colour = (256 * red, 256 * green, 256 * blue)
+        centre = (int(x * width), int(y * height))
+        radius = int(width * (0.02 + 0.18 * size)) + 1
+        thickness = 1 + int(more * max(width // 40 - 1, 1))
+        if kind < 0.25:
+            axes = (radius, int(radius * (0.3 + 0.7 * more)) + 1)
+            cv2.ellipse(image, centre, axes, 180 * turn, 0, 360, colour, -1, cv2.LINE_AA)
+        elif kind < 0.5:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, 3 + int(4 * more)))
+            outline = centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            cv2.fillPoly(image, [outline.astype(np.int32)], colour, cv2.LINE_AA)
+        elif kind < 0.75:
+            end = (int(turn * width), int(size * height))
+            cv2.line(image, centre, end, colour, thickness, cv2.LINE_AA)
+        else:
+            cv2.circle(image, centre, radius, colour, thickness, cv2.LINE_AA)

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import resource
+import struct
+import tarfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.data.archive import Limits, safe_extract
+from dopepp.errors import UserError
+
+Members = Sequence[tuple[str | tarfile.TarInfo, bytes]]
+GOOD: Members = [("set/a.txt", b"hello" * 1000), ("set/deep/b.bin", bytes(range(256))), ("c", b"")]
+
+
+def make_tar(members: Members, mode: str = "w") -> bytes:
+    pack = io.BytesIO()
+    with tarfile.open(fileobj=pack, mode=mode) as tar:  # type: ignore[call-overload]
+        for name, content in members:
+            info = tarfile.TarInfo(name) if isinstance(name, str) else name
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    return pack.getvalue()
+
+
+def make_zip(members: Sequence[tuple[str | zipfile.ZipInfo, bytes]]) -> bytes:
+    pack = io.BytesIO()
+    with zipfile.ZipFile(pack, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members:
+            archive.writestr(name, content)
+    return pack.getvalue()
+
+
+def special(kind: bytes, target: str = "") -> tarfile.TarInfo:
+    info = tarfile.TarInfo("set/special")
+    info.type, info.linkname = kind, target
+    return info
+
+
+def zip_link() -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo("link")
+    info.external_attr = 0o120777 << 16
+    return info
+
+
+def unpack(folder: Path, content: bytes, limits: Limits | None = None) -> Path:
+    archive = folder / "archive"
+    archive.write_bytes(content)
+    return safe_extract(archive, folder / "out", limits)
+
+
+def refused(folder: Path, content: bytes, message: str, limits: Limits | None = None) -> None:
+    """Nothing but one line: neither the folder nor a part of it is left."""
+    with pytest.raises(UserError, match=message) as caught:
+        unpack(folder, content, limits)
+    assert "\n" not in str(caught.value)
+    assert [path.name for path in folder.iterdir()] == ["archive"]
+
+
+@pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
+def test_every_format_is_unpacked_completely(tmp_path: Path, mode: str) -> None:
+    content = make_zip(GOOD) if mode == "zip" else make_tar(GOOD, mode)  # type: ignore[arg-type]
+    folder = unpack(tmp_path, content)
+    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
+    assert files == {str(name): data for name, data in GOOD if "." in str(name)}
+    assert (folder / "c").read_bytes() == b""
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["archive", "out"]
+
+
+def test_folders_may_come_after_their_files_and_twice(tmp_path: Path) -> None:
+    again = [special(tarfile.DIRTYPE), special(tarfile.DIRTYPE)]
+    for info in again:
+        info.name = "set"
+    folder = unpack(tmp_path, make_tar([("./set/a", b"1"), *((info, b"") for info in again)]))
+    assert (folder / "set" / "a").read_bytes() == b"1"
+
+
+def test_permissions_and_owners_are_not_taken_over(tmp_path: Path) -> None:
+    info = tarfile.TarInfo("run")
+    info.mode, info.uid = 0o6777, 0
+    folder = unpack(tmp_path, make_tar([(info, b"#!")]))
+    assert (folder / "run").stat().st_mode & 0o6111 == 0
+
+
+def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    unpack(tmp_path, make_tar(GOOD))
+    with pytest.raises(UserError, match=r"out, which is in use; allowed: a new or empty folder"):
+        unpack(tmp_path, make_tar(GOOD))
+    assert (tmp_path / "out" / "set" / "a.txt").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "set/../../x", "/etc/x", "set\\..\\x", "C:x", "a\nb", "x" * 300, "d/" * 900]
+)
+@pytest.mark.parametrize("kind", ["tar", "zip"])
+def test_a_path_out_of_the_folder_is_refused(tmp_path: Path, name: str, kind: str) -> None:
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    bad = make_tar if kind == "tar" else make_zip
+    message = "leads out of the folder|no name that every system can write"
+    refused(folder, bad([("good", b"1"), (name, b"2")]), message)
+    assert [path.name for path in tmp_path.iterdir()] == ["inner"]
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        (special(tarfile.SYMTYPE, "/etc/passwd"), "a link to '/etc/passwd'"),
+        (special(tarfile.SYMTYPE, "a"), "a link to 'a'"),
+        (special(tarfile.LNKTYPE, "set/a.txt"), "a link to 'set/a.txt'"),
+        (special(tarfile.CHRTYPE), "a device"),
+        (special(tarfile.FIFOTYPE), "a device or other special file"),
+    ],
+)
+def test_links_and_devices_are_refused(tmp_path: Path, info: tarfile.TarInfo, message: str) -> None:
+    refused(tmp_path, make_tar([*GOOD, (info, b"")]), message)
+
+
+def test_links_in_a_zip_are_refused(tmp_path: Path) -> None:
+    refused(tmp_path, make_zip([(zip_link(), b"/etc/passwd")]), "a link or special file")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["a", "a"], "two members 'a'"),
+        (["Photo.jpg", "photo.JPG"], "two members"),
+        (["a", "a/b"], "'a/b' below or instead of a file"),
+        (["a/b", "a"], "two members 'a'"),
+    ],
+)
+def test_two_members_at_one_place_are_refused(
+    tmp_path: Path, names: list[str], message: str
+) -> None:
+    refused(tmp_path, make_tar([(name, b"1") for name in names]), message)
+
+
+@pytest.mark.parametrize("mode", ["w:gz", "w:bz2", "w:xz", "zip"])
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, mode: str) -> None:
+    members = [("zeros", bytes(60_000_000))]
+    content = make_zip(members) if mode == "zip" else make_tar(members, mode)
+    refused(tmp_path, content, "more than 10000000 bytes to unpack")
+
+
+def test_limits(tmp_path: Path) -> None:
+    content = make_tar([(f"file{number}", bytes(10)) for number in range(10)])
+    refused(tmp_path, content, "more than 9 members", Limits(num_members=9))
+    refused(tmp_path, content, "more than 99 bytes", Limits(total_bytes=99))
+    assert unpack(tmp_path, content, Limits(num_members=10, total_bytes=100)).is_dir()
+
+
+def test_a_name_that_claims_gigabytes_takes_no_memory(tmp_path: Path) -> None:
+    info = tarfile.TarInfo("././@LongLink")
+    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 4_000_000_000
+    content = gzip.compress(info.tobuf(tarfile.GNU_FORMAT) + bytes(50_000_000), 1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(tmp_path, content, "a header of 4000000000 bytes")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 50_000  # kilobytes
+
+
+def test_a_zip_that_lies_about_a_size_is_refused(tmp_path: Path) -> None:
+    content = make_zip([("a", b"hello" * 1000)])
+    record = content.rfind(b"PK\x01\x02")  # its size field is 24 bytes on
+    lie = content[: record + 24] + struct.pack("<I", 10) + content[record + 28 :]
+    refused(tmp_path, lie, "damaged|another size than it claims")
+
+
+@pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
+def test_a_damaged_archive_is_refused(tmp_path: Path, mode: str) -> None:
+    members = [("a", os.urandom(5000)), ("b", os.urandom(5000))]
+    content = make_zip(members) if mode == "zip" else make_tar(members, mode)
+    for length in (0, 1, 7, 300, 4000, 7000):
+        refused(tmp_path, content[:length], "damaged")
+    refused(tmp_path, b"junk" * 500, "damaged")
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.data())
+def test_a_changed_byte_never_escapes_or_crashes(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("any")
+    good = data.draw(st.sampled_from([make_tar(GOOD, "w"), make_tar(GOOD, "w:gz"), make_zip(GOOD)]))  # type: ignore[arg-type]
+    content = bytearray(good)
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, min(len(content), 1600) - 1))
+        content[place] = data.draw(st.integers(0, 255))
+    try:
+        unpack(folder, bytes(content))
+    except UserError:
+        assert not (folder / "out").exists()
+    assert {path.name for path in folder.iterdir()} <= {"archive", "out"}
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    for archive in (tmp_path, tmp_path / "gone.tar"):
+        with pytest.raises(UserError, match="no such file"):
+            safe_extract(archive, tmp_path / "out")
+
+
+def test_an_interrupt_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dopepp.data.archive._unpack", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        unpack(tmp_path, make_tar(GOOD))
+    assert [path.name for path in tmp_path.iterdir()] == ["archive"]

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import socket
+import tarfile
+import threading
+import urllib.request
+from collections.abc import Iterator
+from http.client import HTTPMessage
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+
+from dopepp.data import download as downloads
+from dopepp.data.download import SOURCES, Source, download
+from dopepp.data.fetch import _Redirects, fetch
+from dopepp.errors import UserError
+
+CONTENT = np.random.default_rng(0).bytes(3_000_000)
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+def make_tar() -> bytes:
+    pack = io.BytesIO()
+    with tarfile.open(fileobj=pack, mode="w") as tar:
+        for name in ("set/photos/a.jpg", "set/photos/b.jpg", "set/labels/a.xml"):
+            info = tarfile.TarInfo(name)
+            info.size = 100
+            tar.addfile(info, io.BytesIO(bytes(100)))
+    return pack.getvalue()
+
+
+class Handler(BaseHTTPRequestHandler):
+    """What the path says: good, and every way to be bad."""
+
+    def do_GET(self) -> None:
+        server: Server = self.server  # type: ignore[assignment]
+        server.ranges.append(self.headers.get("Range"))
+        kind, content = self.path.strip("/"), server.content
+        if kind == "gone":
+            self.send_error(404)
+        elif kind.startswith("redirect:"):
+            self.send_response(302)
+            self.send_header("Location", kind.removeprefix("redirect:"))
+            self.end_headers()
+        elif kind == "endless":
+            self.send_response(200)
+            self.end_headers()
+            for _ in range(8):
+                self.wfile.write(content)
+        else:
+            start = 0
+            if self.headers.get("Range") and kind != "no-range":
+                start = int(self.headers["Range"].removeprefix("bytes=").removesuffix("-"))
+                self.send_response(206)
+                place = 0 if kind == "wrong-range" else start
+                self.send_header("Content-Range", f"bytes {place}-{len(content) - 1}/*")
+            else:
+                self.send_response(200)
+            body = content[start:]
+            body = bytes(len(body)) if kind == "other" else body
+            body = body + b"x" if kind == "longer" else body
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body[: len(body) // 2] if kind == "cut" else body)
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+
+class Server(ThreadingHTTPServer):
+    content = CONTENT
+    ranges: list[str | None]
+
+    def handle_error(self, *args: object) -> None:
+        """Say nothing of a client that hangs up: some of these tests do."""
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with Server(("127.0.0.1", 0), Handler) as server:
+        server.ranges = []
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def url(server: Server, kind: str) -> str:
+    return f"http://127.0.0.1:{server.server_port}/{kind}"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_arrives_whole(server: Server, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    path = tmp_path / "new" / "file.bin"
+    fetch(url(server, "good"), path, len(CONTENT), SHA256, lambda *at: seen.append(at))
+    assert path.read_bytes() == CONTENT
+    assert names(path.parent) == ["file.bin"]
+    assert seen[-1] == (len(CONTENT), len(CONTENT))
+    fetch(url(server, "good"), path, len(CONTENT), SHA256)
+    assert len(server.ranges) == 1  # a whole file is not fetched again
+
+
+def test_redirections_within_http_are_followed(server: Server, tmp_path: Path) -> None:
+    address = url(server, f"redirect:{url(server, 'good')}")
+    fetch(address, tmp_path / "f", len(CONTENT), SHA256)
+    assert (tmp_path / "f").read_bytes() == CONTENT
+
+
+def test_a_broken_connection_is_resumed(server: Server, tmp_path: Path) -> None:
+    path, half = tmp_path / "f", len(CONTENT) // 2
+    with pytest.raises(UserError, match=rf"broke after {half} of 3000000 bytes; .*goes on"):
+        fetch(url(server, "cut"), path, len(CONTENT), SHA256)
+    assert names(tmp_path) == ["f.partial"]
+    fetch(url(server, "good"), path, len(CONTENT), SHA256)
+    assert server.ranges == [None, f"bytes={half}-"]
+    assert path.read_bytes() == CONTENT
+    assert names(tmp_path) == ["f"]
+
+
+@pytest.mark.parametrize("there", [1000, len(CONTENT), len(CONTENT) + 5])
+def test_any_partial_file_ends_well(server: Server, tmp_path: Path, there: int) -> None:
+    (tmp_path / "f.partial").write_bytes((CONTENT + bytes(5))[:there])
+    fetch(url(server, "no-range"), tmp_path / "f", len(CONTENT), SHA256)
+    assert (tmp_path / "f").read_bytes() == CONTENT
+
+
+def test_a_server_that_goes_on_elsewhere_is_refused(server: Server, tmp_path: Path) -> None:
+    (tmp_path / "f.partial").write_bytes(CONTENT[:1000])
+    with pytest.raises(UserError, match=r"goes on at 'bytes 0-.* instead of byte 1000"):
+        fetch(url(server, "wrong-range"), tmp_path / "f", len(CONTENT), SHA256)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("other", f"a file with SHA-256 [0-9a-f]{{64}}; allowed: {SHA256}; fix: try again"),
+        ("longer", "3000001 bytes; allowed: 3000000 bytes"),
+        ("endless", "more than 3000000 bytes; allowed: 3000000 bytes"),
+        ("gone", "the server answers 404 Not Found"),
+        ("redirect:file:///etc/passwd", "302 .*file:///etc/passwd"),
+        ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
+    ],
+)
+def test_what_is_not_the_file_leaves_nothing(
+    server: Server, tmp_path: Path, kind: str, message: str
+) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        fetch(url(server, kind), tmp_path / "f", len(CONTENT), SHA256)
+    assert "\n" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("target", ["http://127.0.0.1/x", "HTTP://127.0.0.1/x", "ftp://a/x"])
+def test_https_is_never_left(target: str) -> None:
+    request = urllib.request.Request("https://host/file.tar")
+    with pytest.raises(UserError, match=r"file\.tar: redirected to .*, which is not https"):
+        _Redirects().redirect_request(request, io.BytesIO(), 302, "", HTTPMessage(), target)
+    safe = "https://mirror/x"
+    followed = _Redirects().redirect_request(request, io.BytesIO(), 302, "", HTTPMessage(), safe)
+    assert followed is not None
+    assert followed.full_url == safe
+
+
+def test_no_network_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for address in (f"http://127.0.0.1:{port}/x", "http://name.invalid/x"):
+        with pytest.raises(UserError, match=r"/x: no connection: .*check the network"):
+            fetch(address, tmp_path / "f", 1, SHA256)
+    with pytest.raises(UserError, match="unknown url type"):
+        fetch("file:///etc/passwd", tmp_path / "f", 1, SHA256)
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(server: Server, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match=r"file/f, which cannot be written"):
+        fetch(url(server, "good"), tmp_path / "file" / "f", len(CONTENT), SHA256)
+
+
+def test_a_data_set_is_unpacked_once(
+    server: Server,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    server.content = make_tar()
+    digest = hashlib.sha256(server.content).hexdigest()
+    photos = PurePosixPath("set/photos")
+    source = Source(url(server, "tiny.tar"), len(server.content), digest, photos, "free for tests")
+    monkeypatch.setitem(downloads.SOURCES, "tiny", source)
+    with caplog.at_level(logging.INFO):
+        folder = download("tiny", tmp_path / "data")
+    assert "free for tests" in caplog.text
+    assert folder == tmp_path / "data" / "tiny" / "set" / "photos"
+    assert names(folder) == ["a.jpg", "b.jpg"]
+    assert names(tmp_path / "data") == ["tiny"]
+    assert download("tiny", tmp_path / "data") == folder
+    assert len(server.ranges) == 1
+
+
+def test_voc2007_is_known_by_size_and_checksum() -> None:
+    source = SOURCES["voc2007"]
+    assert source.num_bytes == 460_032_000
+    assert len(source.sha256) == 64
+    assert source.filename == "VOCtrainval_06-Nov-2007.tar"
+    with pytest.raises(UserError, match=r"unknown data set 'voc'; allowed: voc2007"):
+        download("voc", ".")
