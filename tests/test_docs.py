@@ -1,0 +1,174 @@
+"""Documents name only what exists: linked files and headings, commands and options, config keys."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import pytest
+import typer.main
+import yaml
+
+from dopepp.cli import app
+from dopepp.virtual.presets import PRESETS
+
+ROOT: Final = Path(__file__).parents[1]
+CONF: Final = ROOT / "conf"
+DOCUMENTS: Final = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+FENCE: Final = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+SPAN: Final = re.compile(r"`([^`\n]+)`")
+LINK: Final = re.compile(r"\]\(([^)\s]+)\)")
+OTHER_TOOLS: Final = {"--cfg"}
+"""Options of Hydra's own that documents name alone."""
+
+COMMANDS: Final = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+OPTIONS: Final = {
+    name: {text for parameter in command.params for text in parameter.opts} | {"--help"}
+    for name, command in COMMANDS.items()
+}
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of every shell command in a document, of fenced blocks and of code spans."""
+    lines: list[str] = []
+    for language, content in FENCE.findall(text):
+        if language == "bash":
+            lines += content.replace("\\\n", " ").splitlines()
+    lines += SPAN.findall(FENCE.sub("", text))
+    for line in lines:
+        for command in line.split("&&"):
+            try:
+                words = shlex.split(command, comments=True)
+            except ValueError:  # an apostrophe in a span that is no command
+                continue
+            if words:
+                yield words
+
+
+def slug(heading: str) -> str:
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+
+
+def config_keys() -> set[str]:
+    """Return every key of every file in conf/, from the root of the composed configuration."""
+    keys: set[str] = set()
+    for path in CONF.rglob("*.yaml"):
+        text = path.read_text()
+        place = path.parent.relative_to(CONF).parts
+        in_root = not place or "@package _global_" in text
+        collect(yaml.safe_load(text), "" if in_root else ".".join(place), keys)
+    return keys
+
+
+def collect(node: object, start: str, keys: set[str]) -> None:
+    keys.add(start)
+    if isinstance(node, dict):
+        for key, value in node.items():
+            collect(value, f"{start}.{key}".lstrip("."), keys)
+
+
+def is_preset_field(path: list[str]) -> bool:
+    """Tell whether some preset has a field, given by its groups' names and its own."""
+
+    def has(value: object, names: list[str]) -> bool:
+        if not names:
+            return True
+        known = {entry.name for entry in fields(value)} if is_dataclass(value) else ()
+        return names[0] in known and has(getattr(value, names[0]), names[1:])
+
+    return any(has(preset, path) for preset in PRESETS.values())
+
+
+KEYS: Final = config_keys()
+
+
+def option_problem(override: str) -> str | None:
+    """Say what is wrong with ``key=value`` or ``group=file`` of train.py, None where nothing is."""
+    key, _, value = override.partition("=")
+    key = key.lstrip("+")
+    if key.startswith("virtual.scene."):
+        return None if is_preset_field(key.split(".")[2:]) else f"no preset has {key}"
+    if not (CONF / key).is_dir():
+        return None if key in KEYS or key.startswith("hydra.") else f"no option {key}"
+    files = [f"conf/{key}/{name}.yaml" for name in value.split(",") if name != "…"]
+    return next((f"no {file}" for file in files if not (ROOT / file).is_file()), None)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(path: Path) -> None:
+    bad = []
+    for target in LINK.findall(FENCE.sub("", path.read_text())):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (path.parent / name) if name else path
+        headings = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE) if anchor else []
+        if not file.exists() or (anchor and anchor not in map(slug, headings)):
+            bad.append(target)
+    assert not bad
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_console_commands_and_their_options_exist(path: Path) -> None:
+    bad = []
+    for words in commands(path.read_text()):
+        if words[0] == "dopepp" and len(words) > 1:
+            if words[1] not in COMMANDS:
+                bad.append(" ".join(words))
+                continue
+            named = [word.partition("=")[0] for word in words[2:] if re.match(r"--?[a-zA-Z]", word)]
+            bad += [f"{words[1]} {option}" for option in named if option not in OPTIONS[words[1]]]
+            bad += preset_problems(words)
+        elif words[0].startswith("--") and words[0] not in OTHER_TOOLS.union(*OPTIONS.values()):
+            bad.append(words[0])
+    assert not bad
+
+
+def preset_problems(words: list[str]) -> list[str]:
+    """Return the ``--set`` and ``--preset`` of a command that name no field or preset."""
+    pairs = list(pairwise(words))
+    changes = [value.partition("=")[0] for option, value in pairs if option == "--set"]
+    bad = [change for change in changes if not is_preset_field(change.split("."))]
+    return bad + [value for option, value in pairs if option == "--preset" and value not in PRESETS]
+
+
+GUIDES: Final = [path for path in DOCUMENTS if path.name != "CHANGELOG.md"]
+"""The change log also names options that are gone."""
+
+
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def test_options_of_training_and_evaluation_exist(path: Path) -> None:
+    groups = {key.split(".")[0] for key in KEYS if "." in key}
+    text, bad = path.read_text(), []
+    for words in commands(text):
+        entry = " ".join(words[:2]) in ("python train.py", "python evaluate.py")
+        # A span on its own: data/test=photoreal, virtual.backgrounds=DIR, data.cache_dir.
+        alone = re.match(r"(\w+)(/\w+)*=|(\w+)\.[\w.]+(=|$)", words[0])
+        if entry:
+            overrides = [word for word in words[2:] if "=" in word and not word.startswith("-")]
+        elif alone and (alone[1] or alone[3]) in groups:
+            overrides = [word for word in words if re.match(r"[\w./]+(=|$)", word)]
+        else:
+            continue
+        problems = [problem for one in overrides if (problem := option_problem(one))]
+        # A guide may tell its reader to write the file.
+        bad += [problem for problem in problems if f"`{problem.removeprefix('no ')}`" not in text]
+    assert not bad
+
+
+def test_it_finds_what_does_not_exist() -> None:
+    """The checks above would find nothing in an empty list, too."""
+    assert option_problem("data=cbp") == "no conf/data/cbp.yaml"
+    assert option_problem("data.preset=paper") == "no option data.preset"
+    assert option_problem("virtual.scene.lighting.lamps=3") is not None
+    assert option_problem("virtual.scene.table.tilt_deg=[0,5]") is None
+    starts = [words[:2] for words in commands((ROOT / "README.md").read_text())]
+    assert ["dopepp", "render"] in starts
+    assert ["python", "train.py"] in starts
+    assert "--unit" in OPTIONS["render"]
