@@ -1,0 +1,100 @@
+"""The renderers side by side: CPU time an image, and how far their labels agree.
+
+    python benchmarks/renderers.py [--images 6] [--size 640 480] [--admit-software-gl]
+
+Every renderer draws the same random scenes, in one run. Times are process time (all threads of the
+process, waiting left out) and wall time; the first image, which compiles kernels and uploads
+meshes, is left out of both. On a GPU the wall time counts. Depth is compared at all pixels (within
+1 mm), masks as instance numbers. Mitsuba's variant is fixed for the life of a process, so each of
+them runs in a process of its own, with the rasteriser beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+
+from dopepp.errors import UserError
+from dopepp.parts.catalogue import BUILTIN
+from dopepp.virtual import PRESETS, Factory, Rendered, Scene, render
+from dopepp.virtual.gl_context import SOFTWARE_SETTING
+from dopepp.virtual.photoreal_variant import VARIANT_SETTING, VARIANTS
+from dopepp.virtual.renderers import find_renderer
+
+SCENES = ("paper", "table")
+LIMIT_M = 1e-3
+SEED = 11
+ROWS = ("gl", *VARIANTS)
+
+
+def timed(
+    renderer: Callable[[Scene], Rendered], scenes: Sequence[Scene]
+) -> tuple[list[Rendered], float, float]:
+    """Return images, and CPU and wall seconds an image; the first scene only warms up."""
+    renderer(scenes[0])
+    cpu, wall = time.process_time(), time.perf_counter()
+    images = [renderer(scene) for scene in scenes[1:]]
+    count = len(images)
+    return images, (time.process_time() - cpu) / count, (time.perf_counter() - wall) / count
+
+
+def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> list[str]:
+    """Return one row of the table."""
+    renderer = find_renderer("gl" if name == "gl" else "photoreal")
+    parts = [make() for make in BUILTIN.values()]
+    factory = Factory(parts, PRESETS[preset].resized(*size), SEED)
+    scenes = [factory.scene(0, index) for index in range(num_images + 1)]
+    expected, base, _ = timed(render, scenes)
+    found, cpu, wall = timed(renderer, scenes)
+    pairs = list(zip(found, expected, strict=True))
+    depth = [(np.abs(one.depth - other.depth) < LIMIT_M).mean() for one, other in pairs]
+    masks = [(one.instances == other.instances).mean() for one, other in pairs]
+    return [
+        name, preset, f"{size[0]}×{size[1]}", f"{cpu:.3f}", f"{wall:.3f}", f"{1e3 * base:.1f}",
+        f"{cpu / base:.0f}×", f"{100 * min(depth):.3f} %", f"{100 * min(masks):.3f} %",
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Print the table, or, called by itself, one renderer's rows of it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--images", type=int, default=6, help="images per row")
+    parser.add_argument("--size", type=int, nargs=2, default=(640, 480), help="width and height")
+    parser.add_argument("--admit-software-gl", action="store_true", help="measure llvmpipe, too")
+    parser.add_argument("--only", choices=ROWS, help="this renderer's rows, without a header")
+    arguments = parser.parse_args()
+    if arguments.only is not None:
+        cv2.setNumThreads(1)
+        try:
+            for preset in SCENES:
+                row = compare(arguments.only, preset, tuple(arguments.size), arguments.images)
+                print("| " + " | ".join(row) + " |", flush=True)
+        except UserError as error:
+            print(f"{arguments.only}: not measured: {error}")
+        return
+    header = [
+        "renderer", "preset", "size", "CPU-s", "wall-s", "rasteriser CPU-ms", "ratio",
+        "depth within 1 mm (worst image)", "same mask (worst image)",
+    ]  # fmt: skip
+    print("| " + " | ".join(header) + " |")
+    print("| " + " | ".join("---" for _ in header) + " |", flush=True)
+    for name in ROWS:
+        settings = {"OMP_NUM_THREADS": "1"}
+        if name in VARIANTS:
+            settings[VARIANT_SETTING] = name
+        elif arguments.admit_software_gl:
+            settings[SOFTWARE_SETTING] = "1"
+        command = [sys.executable, __file__, "--only", name, "--images", str(arguments.images)]
+        command += ["--size", *map(str, arguments.size)]
+        subprocess.run(command, env={**os.environ, **settings}, check=True)
+
+
+if __name__ == "__main__":
+    main()
