@@ -1,21 +1,26 @@
-"""CPU time of the virtual factory per image, beside two plain renderers in the same run.
+"""CPU time of the virtual factory per image and its stages, and of the first image of a process.
 
     python benchmarks/render.py [--images 100] [--faces 20000]
 
 Times are process time (all threads of this process, waiting left out), so a busy machine disturbs
-them little; caches shared with other processes still do. An image is drawn (scene, background),
-rendered (2×2 anti-aliasing, shadow) and labelled (depth, instances, visible fractions). The plain
-renderers get the same scenes, already drawn, and do less: *painter* fills depth-sorted triangles
-with one colour each on a 2×2 canvas by OpenCV, without labels; *numpy* is a vectorised z-buffer
-with flat colours and depth, without anti-aliasing. Neither has shadows or textures.
+them little; caches shared with other processes still do. An image's scene is drawn (poses, light,
+background), rasterised and shaded (2×2 anti-aliasing, shadows) with its labels (depth, instances,
+visible fractions), and taken by the sensor. The *painter*, in the same process, gets the same
+scenes already drawn and does less: it fills depth-sorted triangles with one colour each on a 2×2
+canvas by OpenCV, without shadows, textures and labels.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -25,12 +30,32 @@ from manifold3d import Mesh as ManifoldMesh
 from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.parts.builtin import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, render
+from dopepp.virtual import PRESETS, Factory, Preset, Scene, make_surface, render
+from dopepp.virtual.sensor import capture
 
-SIZES = ((640, 480), (416, 416), (128, 128))
-NUM_DISTRACTORS = ((0, 0), (0, 4))
+Value = TypeVar("Value")
+
+PRESET_NAMES = ("paper", "quickstart", "table", "bin")
+NUM_DISTRACTORS = {"paper": (0, 4), "quickstart": (0, 4)}
+"""Where it is not the preset's own number: one part among 0 to 4 distractors."""
+
+SIZES = ((640, 480), (416, 416))
+WARM_UP = 3
 PLAIN_IMAGES = 3
-"""The plain renderers take long, and their time varies little."""
+"""The painter takes long, and its time varies little."""
+
+REFERENCES = """\
+Measured earlier on two cores, CPU-ms an image at 640×480 and 416×416: numba prototype 47 and 29;
+MuJoCo on EGL 47 and 35 (plain Phong); pyrender on OSMesa 52 and 37; moderngl on llvmpipe 98 and 80;
+Blender Cycles, 16 samples a pixel, 16,200 at 640×480."""
+
+FIRST_IMAGE = """\
+import sys
+from dopepp.parts.builtin import pivconnector
+from dopepp.virtual import PRESETS, Factory
+Factory([pivconnector()], PRESETS["paper"].resized(640, 480), seed=0).render(0, 0)
+assert "torch" not in sys.modules, "rendering has imported torch"
+"""
 
 
 def refined(part: Part, num_faces: int) -> Part:
@@ -48,7 +73,7 @@ def refined(part: Part, num_faces: int) -> Part:
     return make_part(part.name, Mesh(vertices, np.asarray(mesh.tri_verts, np.int32)))
 
 
-def flat_triangles(scene: Scene, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flat_triangles(scene: Scene, scale: float) -> list[np.ndarray]:
     """Return pixels (N, 3, 2), depths (N, 3) and colours (N, 3) of all front faces."""
     K = resize_camera(scene.K, scale, scale)
     towards = -np.array(scene.lights[0].position)
@@ -63,7 +88,7 @@ def flat_triangles(scene: Scene, scale: float) -> tuple[np.ndarray, np.ndarray, 
         light = np.clip(-normals @ towards, 0, 1) * 0.7 + 0.2
         colours = 255 * light[:, None] * np.array(item.material.colour)
         parts.append((project(corners, K), corners[..., 2], colours))
-    return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))  # type: ignore[return-value]
+    return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
 def painter(scene: Scene) -> np.ndarray:
@@ -77,58 +102,82 @@ def painter(scene: Scene) -> np.ndarray:
     return np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def numpy_zbuffer(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Rasterise each triangle's bounding box with array operations."""
-    width, height = scene.size
-    image, inverse_depth = scene.background.copy(), np.zeros((height, width))
-    for (a, b, c), depth, colour in zip(*flat_triangles(scene, 1.0), strict=True):
-        low = np.maximum(np.ceil(np.minimum(np.minimum(a, b), c)), 0).astype(int)
-        high = np.floor(np.maximum(np.maximum(a, b), c)).astype(int)
-        x = np.arange(low[0], min(high[0], width - 1) + 1)
-        y = np.arange(low[1], min(high[1], height - 1) + 1)[:, None]
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        if not x.size or not y.size or area == 0:
-            continue
-        first = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
-        second = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
-        third = 1 - first - second
-        inverse = first / depth[0] + second / depth[1] + third / depth[2]
-        window = np.s_[low[1] : low[1] + y.size, low[0] : low[0] + x.size]
-        nearer = (first >= 0) & (second >= 0) & (third >= 0) & (inverse > inverse_depth[window])
-        inverse_depth[window][nearer] = inverse[nearer]
-        image[window][nearer] = colour
-    return image, inverse_depth
-
-
-def cpu_ms(function: Callable[[int], object], count: int) -> float:
-    """Return the mean process time of ``function(0..count−1)``, milliseconds."""
+def timed(function: Callable[[], Value], times: list[float]) -> Value:
+    """Call a function and append its process time, milliseconds."""
     start = time.process_time()
-    for index in range(count):
-        function(index)
-    return (time.process_time() - start) / count * 1e3
+    value = function()
+    times.append((time.process_time() - start) * 1e3)
+    return value
+
+
+def preset_of(name: str, size: tuple[int, int]) -> Preset:
+    """Return a preset in a size with the benchmark's number of distractors."""
+    preset = PRESETS[name].resized(*size)
+    number = NUM_DISTRACTORS.get(name, preset.distractors.number)
+    return replace(preset, distractors=replace(preset.distractors, number=number))
 
 
 def measure(part: Part, preset: Preset, num_images: int) -> list[str]:
     """Return one row of the table."""
     factory = Factory([part], preset, seed=0)
-    for index in range(3):
+    for index in range(WARM_UP):
         factory.render(1, index)
-    total = cpu_ms(lambda index: factory.render(0, index), num_images)
-    scenes = [factory.scene(0, index) for index in range(num_images)]
-    drawn = cpu_ms(lambda index: render(scenes[index]), num_images)
-    ours = cpu_ms(lambda index: render(scenes[index]), PLAIN_IMAGES)
-    painted = cpu_ms(lambda index: painter(scenes[index]), PLAIN_IMAGES)
-    plain = cpu_ms(lambda index: numpy_zbuffer(scenes[index]), PLAIN_IMAGES)
+    drawn: list[float] = []
+    rendered: list[float] = []
+    captured: list[float] = []
+    painted: list[float] = []
+    for index in range(num_images):
+        scene = timed(partial(factory.scene, 0, index), drawn)
+        picture = timed(partial(render, scene), rendered)
+        timed(partial(capture, picture.image, scene.sensor), captured)
+        if index < PLAIN_IMAGES:
+            timed(partial(painter, scene), painted)
+    stages = np.array([drawn, rendered, captured])
+    totals = stages.sum(axis=0)
+    shares = stages.sum(axis=1) / stages.sum()
     low, high = preset.distractors.number
     return [
         preset.name, f"{preset.width}×{preset.height}", f"{low}–{high}" if high else "0",
-        f"{total:.1f}", f"{drawn:.1f}", f"{painted:.0f}", f"{plain:.0f}",
-        f"{painted / ours:.0f}×", f"{plain / ours:.0f}×",
+        f"{np.median(totals):.1f}", f"{totals.mean():.1f}",
+        *(f"{share:.0%}" for share in shares), f"{np.mean(painted):.0f}",
     ]  # fmt: skip
 
 
+def first_image() -> tuple[float, float]:
+    """Return wall and CPU seconds of a fresh process that renders one image and ends."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run([sys.executable, "-c", FIRST_IMAGE], check=True)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def bake_rows(part: Part, num_images: int) -> list[list[str]]:
+    """Return what a surface costs once: ambient occlusion and all, and a texture's pyramid."""
+    mesh = part.mesh
+    assert mesh is not None
+    image = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
+    uv = np.ptp(mesh.vertices[:, :2], axis=0)
+    uv = (mesh.vertices[:, :2] - mesh.vertices[:, :2].min(axis=0)) / uv
+    textured = Mesh(mesh.vertices, mesh.faces, uv.astype(np.float32), image)
+    rows = []
+    for name, each in (("plain", mesh), ("with a texture of 1024×1024", textured)):
+        times: list[float] = []
+        for _ in range(num_images):
+            timed(partial(make_surface, each), times)
+        rows.append([name, f"{np.median(times):.0f}"])
+    return rows
+
+
+def show(header: list[str], rows: Iterable[list[str]]) -> None:
+    """Print a table, row by row as it comes."""
+    print("\n| " + " | ".join(header) + " |")
+    print("| " + " | ".join("---" for _ in header) + " |")
+    for row in rows:
+        print("| " + " | ".join(row) + " |", flush=True)
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=100, help="images per row")
     parser.add_argument("--faces", type=int, default=20_000, help="triangles of the part")
@@ -136,18 +185,18 @@ def main() -> None:
     cv2.setNumThreads(1)
     part = refined(pivconnector(), arguments.faces)
     assert part.mesh is not None
-    print(f"{part.name}, {len(part.mesh.faces):,} faces, CPU-ms per image (process time)")
+    print(f"{part.name}, {len(part.mesh.faces):,} faces, CPU-ms an image (process time)")
     header = [
-        "preset", "size", "distractors", "total", "of it rendering", "painter", "numpy",
-        "painter / ours", "numpy / ours",
+        "preset", "size", "distractors", "median", "mean", "scene", "rasterise and shade",
+        "sensor", "painter",
     ]  # fmt: skip
-    print("| " + " | ".join(header) + " |")
-    print("| " + " | ".join("---" for _ in header) + " |")
-    for name, sizes in (("paper", SIZES), ("quickstart", SIZES)):
-        for size in sizes:
-            for number in NUM_DISTRACTORS:
-                preset = replace(PRESETS[name].resized(*size), distractors=Distractors(number))
-                print("| " + " | ".join(measure(part, preset, arguments.images)) + " |", flush=True)
+    presets = (preset_of(name, size) for name in PRESET_NAMES for size in SIZES)
+    show(header, (measure(part, preset, arguments.images) for preset in presets))
+    print(f"\n{REFERENCES}")
+    show(["a surface, once", "CPU-ms"], bake_rows(part, WARM_UP))
+    first_image()  # compiles what is not compiled yet
+    wall, cpu = first_image()
+    print(f"\nFirst image of a fresh process, without torch: {wall:.2f} s, {cpu:.2f} CPU-s")
 
 
 if __name__ == "__main__":

@@ -11,13 +11,20 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 """An argument of a compiled function; its docstring gives shape and type."""
 
+Scalar = Any
+"""A number of a compiled function that is float32 or float64, as its caller's arrays are."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
     """Compile with numba, without the GIL and single-threaded, because data loaders fork.
 
+    A division by zero gives what IEEE 754 says, as in numpy; a check for it would also keep loops
+    from becoming vector loops.
+
     The machine code is kept on disk beside the package, or in the user's cache folder where that
     is read-only; ``NUMBA_CACHE_DIR`` moves it.
     """
-    return cast("Callable[[Function], Function]", numba.njit(cache=True, nogil=True, **options))
+    compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
+    return cast("Callable[[Function], Function]", compiler)

@@ -1,27 +1,27 @@
-"""A mesh made ready for rendering: smooth normals with sharp creases, texture levels, hull."""
+"""A mesh made ready for rendering: smooth normals with sharp creases, texture, open sky, hull."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.errors import UserError
 from dopepp.parts.part import Mesh
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.virtual.normals import corner_normals, is_closed, merge_vertices, smooth_patches
+from dopepp.virtual.occlusion import OpenSky, bake_open_sky, spread_directions
+from dopepp.virtual.texture import Texture, make_texture
 
 CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
 
-_MERGE_SHARE: Final = 1e-7
-"""Vertices closer than this share of the mesh's size are one (STL and UV seams split them)."""
-
 _HULL_DIRECTIONS: Final = 400
 """Extreme points along so many directions stand for a mesh when its image size is measured."""
+
+_NUM_POINTS: Final = 400
+"""Points that stand for a mesh where a plane is darkened beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,43 +32,77 @@ class Surface:
         vertices: Object frame, metres, float64.
         faces: Vertex indices, int32.
         normals: Unit normal of every face's corner, object frame, float32.
+        patches: Number of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
-        textures: RGB texture and its halvings down to one texel; one unread texel without uv.
+        texture: The texture; None without one.
+        sky: Baked ambient occlusion.
         closed: Watertight with outward winding, so back faces can be dropped.
         hull: Extreme vertices that bound the mesh's image, object frame, metres.
-        area: Surface area, m².
-        uv_area: Area of the faces in texture space (1 = the whole texture).
+        points: Points spread evenly over the surface, object frame, metres.
+        spacing: About the distance between neighbours among them, metres.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
     normals: Float[np.ndarray, "faces 3 3"]
+    patches: Int[np.ndarray, "faces"]
     uv: Float[np.ndarray, "uvs 2"]
-    textures: tuple[UInt8[np.ndarray, "_ _ 3"], ...]
+    texture: Texture | None
+    sky: OpenSky
     closed: bool
     hull: Float[np.ndarray, "hull 3"]
-    area: float
-    uv_area: float
+    points: Float[np.ndarray, "points 3"]
+    spacing: float
 
     @property
     def radius(self) -> float:
         """Largest distance of a vertex from the object frame's origin, metres."""
         return float(np.linalg.norm(self.hull, axis=1).max())
 
+    @property
+    def area(self) -> float:
+        """Surface area, m²."""
+        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+    @property
+    def uv_area(self) -> float:
+        """Area of the faces in texture space (1 = the whole texture)."""
+        if self.texture is None:
+            return 0.0
+        a, b, c = self.uv[self.faces].transpose(1, 0, 2)
+        (along, across) = (b - a).T, (c - a).T
+        return float(np.abs(along[0] * across[1] - along[1] * across[0]).sum() / 2)
+
+    @property
+    def textures(self) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
+        """The texture and its halvings as images, the finest first; empty without one."""
+        return () if self.texture is None else self.texture.images
+
     def scaled(self, scale: Float[np.ndarray, "3"]) -> Surface:
-        """Return the surface stretched along its axes by positive factors."""
+        """Return the surface stretched along its axes by positive factors.
+
+        The open sky stays that of the unstretched surface, which is near enough for stretches up
+        to two.
+        """
         normals = self.normals / np.asarray(scale, np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)
         return replace(
-            self, vertices=self.vertices * scale, hull=self.hull * scale, normals=normals
+            self,
+            vertices=self.vertices * scale,
+            hull=self.hull * scale,
+            normals=normals,
+            points=self.points * scale,
+            spacing=self.spacing * float(np.max(scale)),
         )
 
 
 def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surface:
-    """Prepare a mesh for rendering (milliseconds; do it once per part).
+    """Prepare a mesh for rendering (a quarter of a second; do it once per part).
 
     Raises:
-        UserError: The mesh has no faces, or a vertex that is not finite.
+        UserError: The mesh has no faces, a vertex or a texture coordinate that is not finite, or a
+            face with a vertex that does not exist.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
@@ -78,124 +112,64 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
             "at least one face and finite vertices",
             "repair the mesh or export it again",
         )
-    merged = _merge(vertices)[faces]
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        # Compiled code does not check indices.
+        raise UserError(
+            f"a mesh with a face of vertices {faces.min()} to {faces.max()}",
+            f"vertices 0 to {len(vertices) - 1}",
+            "repair the mesh or export it again",
+        )
+    merged = merge_vertices(vertices)[faces]
     edges = vertices[faces[:, [1, 2, 0]]] - vertices[faces]
     doubled = np.cross(edges[:, 0], edges[:, 1])
     length = np.linalg.norm(doubled, axis=1)
-    has_texture = mesh.uv is not None and mesh.texture is not None
-    uv = np.ascontiguousarray(mesh.uv, np.float32) if has_texture else np.zeros((0, 2), np.float32)
-    textures = _halvings(mesh.texture) if has_texture else (np.zeros((1, 1, 3), np.uint8),)
-    uv_area = 0.0
-    if has_texture:
-        along, across = uv[faces[:, 1]] - uv[faces[:, 0]], uv[faces[:, 2]] - uv[faces[:, 0]]
-        uv_area = float(np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).sum() / 2)
+    normals = corner_normals(merged, doubled, length, edges, crease_angle_deg)
+    closed = is_closed(merged, vertices[faces])
+    uv, texture = np.zeros((0, 2), np.float32), None
+    if mesh.uv is not None and mesh.texture is not None:
+        uv = np.ascontiguousarray(mesh.uv, np.float32)
+        if len(uv) != len(vertices) or not np.isfinite(uv).all():
+            raise UserError(
+                f"{len(uv)} texture coordinates of a mesh of {len(vertices)} vertices",
+                "one finite texture coordinate per vertex",
+                "export the mesh again",
+            )
+        texture = make_texture(mesh.texture, uv, faces)
     return Surface(
         vertices=vertices,
         faces=faces,
-        normals=_normals(merged, doubled, length, edges, crease_angle_deg),
+        normals=normals,
+        # Texture coordinates may differ where positions do not.
+        patches=smooth_patches(merged if texture is None else faces, normals, length > 0),
         uv=uv,
-        textures=textures,
-        closed=_is_closed(merged, vertices[faces]),
+        texture=texture,
+        sky=bake_open_sky(vertices, faces, normals, closed),
+        closed=closed,
         hull=_extremes(vertices[np.unique(faces)]),
-        area=float(length.sum() / 2),
-        uv_area=uv_area,
+        points=_spread_points(vertices[faces], length),
+        spacing=float(np.sqrt(length.sum() / 2 / _NUM_POINTS)),
     )
-
-
-def _merge(vertices: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray, "vertices"]:
-    """Number vertices so that equal positions share a number."""
-    step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) * _MERGE_SHARE
-    keys = np.round((vertices - vertices.min(axis=0)) / step).astype(np.int64)
-    return np.asarray(np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1), np.int64)
-
-
-def _normals(
-    merged: Int[np.ndarray, "faces 3"],
-    doubled: Float[np.ndarray, "faces 3"],
-    length: Float[np.ndarray, "faces"],
-    edges: Float[np.ndarray, "faces 3 3"],
-    crease_angle_deg: float,
-) -> Float[np.ndarray, "faces 3 3"]:
-    """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases."""
-    face_normals = doubled / np.maximum(length, 1e-300)[:, None]
-    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
-    cosines = -(unit * unit[:, [2, 0, 1]]).sum(axis=2)
-    weights = np.arccos(np.clip(cosines, -1.0, 1.0)) * (length > 0)[:, None]
-    corners = np.argsort(merged.reshape(-1), kind="stable")
-    counts = np.bincount(merged.reshape(-1), minlength=int(merged.max()) + 1)
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    normals = np.empty((len(merged), 3, 3), np.float32)
-    cosine = float(np.cos(np.radians(crease_angle_deg)))
-    _average_normals(face_normals, weights, offsets, corners, cosine, normals)
-    return normals
-
-
-@compiled()
-def _average_normals(
-    face_normals: Array, weights: Array, offsets: Array, corners: Array, cosine: float, out: Array
-) -> None:
-    """Average, at every corner, the normals of the faces around its vertex within an angle.
-
-    Args:
-        face_normals: Unit normal of every face, shape (F, 3), zero for degenerate ones.
-        weights: Weight of every corner (its angle in the triangle), shape (F, 3).
-        offsets: Start of every vertex's corners in ``corners``, shape (V + 1,).
-        corners: Corner numbers 3·face + k sorted by vertex, shape (3F,).
-        cosine: Cosine of the crease angle; faces that differ by more are not averaged.
-        out: Normals, shape (F, 3, 3), float32.
-    """
-    for vertex in range(offsets.shape[0] - 1):
-        for p in range(offsets[vertex], offsets[vertex + 1]):
-            face, k = corners[p] // 3, corners[p] % 3
-            nx, ny, nz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
-            sx, sy, sz = 0.0, 0.0, 0.0
-            for q in range(offsets[vertex], offsets[vertex + 1]):
-                other, m = corners[q] // 3, corners[q] % 3
-                ox, oy, oz = face_normals[other, 0], face_normals[other, 1], face_normals[other, 2]
-                if nx * ox + ny * oy + nz * oz >= cosine:
-                    sx += weights[other, m] * ox
-                    sy += weights[other, m] * oy
-                    sz += weights[other, m] * oz
-            norm = math.sqrt(sx * sx + sy * sy + sz * sz)
-            if norm > 0.0:
-                out[face, k, 0], out[face, k, 1], out[face, k, 2] = sx / norm, sy / norm, sz / norm
-            else:
-                out[face, k, 0], out[face, k, 1], out[face, k, 2] = nx, ny, nz
-
-
-def _is_closed(
-    merged: Int[np.ndarray, "faces 3"], triangles: Float[np.ndarray, "faces 3 3"]
-) -> bool:
-    """Tell whether every directed edge has exactly one opposite and the volume is positive."""
-    collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
-    start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
-    count = int(merged.max()) + 1
-    forward, backward = (start * count + end).reshape(-1), (end * count + start).reshape(-1)
-    if len(np.unique(forward)) != len(forward):
-        return False
-    if not np.array_equal(np.sort(forward), np.sort(backward)):
-        return False
-    a, b, c = (triangles - triangles.reshape(-1, 3).mean(axis=0)).transpose(1, 0, 2)
-    return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)
 
 
 def _extremes(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "hull 3"]:
     """Return the vertices that are extreme along directions spread over the sphere."""
     if len(vertices) <= _HULL_DIRECTIONS:
         return vertices
-    # A Fibonacci spiral spreads directions evenly.
-    k = np.arange(_HULL_DIRECTIONS) + 0.5
-    z, angle = 1 - 2 * k / _HULL_DIRECTIONS, k * np.pi * (1 + np.sqrt(5))
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z])
-    return np.asarray(vertices[np.unique((vertices @ directions).argmax(axis=0))])
+    # One direction after the other: all at once would take gigabytes for a large mesh.
+    extreme = [int((vertices @ along).argmax()) for along in spread_directions(_HULL_DIRECTIONS)]
+    return np.asarray(vertices[np.unique(extreme)])
 
 
-def _halvings(texture: UInt8[np.ndarray, "_ _ 3"] | None) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-    """Return a texture and its successive halvings (mip levels), the finest first."""
-    levels = [np.ascontiguousarray(texture, np.uint8)]
-    while max(levels[-1].shape[:2]) > 1:
-        height, width = (max(side // 2, 1) for side in levels[-1].shape[:2])
-        level = cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(np.ascontiguousarray(level))
-    return tuple(levels)
+def _spread_points(
+    corners: Float[np.ndarray, "faces 3 3"], weights: Float[np.ndarray, "faces"]
+) -> Float[np.ndarray, "points 3"]:
+    """Return points evenly spread over triangles, by area; the corners of a mesh without any."""
+    if weights.sum() <= 0.0:
+        return corners.reshape(-1, 3)[:_NUM_POINTS]
+    places = (np.arange(_NUM_POINTS) + 0.5) / _NUM_POINTS * weights.sum()
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    # A low-discrepancy sequence within the triangles (Roberts' R2), folded into each.
+    share = (np.arange(1, _NUM_POINTS + 1)[:, None] * (0.7548776662466927, 0.5698402909980532)) % 1
+    share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
+    a, b, c = corners[chosen].transpose(1, 0, 2)
+    return np.asarray(a + share[:, :1] * (b - a) + share[:, 1:] * (c - a))

@@ -1,4 +1,4 @@
-"""Compiled visibility: which triangle every sample of a pixel sees, and the final composition.
+"""Compiled visibility: which triangle every sample of a pixel sees.
 
 Visibility uses homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D
 homogeneous coordinates", 1997): with the projected vertices ``p = K x_cam`` of a triangle,
@@ -173,49 +173,3 @@ def rasterise(
                 w0 += e0x
                 w1 += e1x
                 w2 += e2x
-
-
-@compiled()
-def composite(
-    origin: tuple[int, int],
-    ids: Array,
-    inverse_depth: Array,
-    colour: Array,
-    first_ids: Array,
-    image: Array,
-    depth: Array,
-    instances: Array,
-) -> None:
-    """Put a window of samples over the background and read its centre samples as labels.
-
-    Args:
-        origin: Image pixel (x, y) of the window's first element.
-        ids: Triangle ids per sample; the last sample is the pixel's centre.
-        inverse_depth: 1/m per sample.
-        colour: Sum of the covered samples' sRGB values.
-        first_ids: First triangle id of every object, ascending.
-        image: Background on entry, result on return, uint8.
-        depth: Metres at pixel centres, float32.
-        instances: Object index at pixel centres, int16.
-    """
-    height, width, num_samples = ids.shape
-    centre = num_samples - 1
-    for j in range(height):
-        y = origin[1] + j
-        for i in range(width):
-            x = origin[0] + i
-            empty = 0
-            for s in range(NUM_COLOUR_SAMPLES):
-                if ids[j, i, s] < 0:
-                    empty += 1
-            if empty < NUM_COLOUR_SAMPLES:
-                for c in range(3):
-                    level = (colour[j, i, c] + empty * image[y, x, c]) / NUM_COLOUR_SAMPLES
-                    image[y, x, c] = np.uint8(level + 0.5)
-            triangle = ids[j, i, centre]
-            if triangle >= 0:
-                depth[y, x] = np.float32(1.0 / inverse_depth[j, i, centre])
-                owner = first_ids.shape[0] - 1
-                while first_ids[owner] > triangle:
-                    owner -= 1
-                instances[y, x] = owner

@@ -13,7 +13,14 @@ from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts.part import Mesh
 from dopepp.virtual import (
-    Ambient, Grooves, Light, Material, Scene, SceneObject, make_surface, render,
+    Ambient,
+    Grooves,
+    Light,
+    Material,
+    Scene,
+    SceneObject,
+    make_surface,
+    render,
 )  # fmt: skip
 from dopepp.virtual.placement import FACING
 
@@ -43,7 +50,8 @@ def test_metal_has_no_diffuse_light_and_a_coloured_mirror(scene_of: MakeScene) -
     room = linear(render(scene_of(sheet(gold), lights=(), ambient=EVEN)).image[60, 79])
     np.testing.assert_allclose(room, 0.3 * np.array(gold.colour), atol=0.004)
     flash = Light((0, 0, 0), (0.1, 0.1, 0.1), 0.4)
-    glint = linear(render(scene_of(sheet(gold), lights=(flash,), ambient=DARK)).image[60, 79])
+    rough = replace(gold, roughness=0.9)
+    glint = linear(render(scene_of(sheet(rough), lights=(flash,), ambient=DARK)).image[60, 79])
     np.testing.assert_allclose(glint / glint[0], np.array(gold.colour) / 0.9, atol=0.05)
 
 

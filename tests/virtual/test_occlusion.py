@@ -23,7 +23,12 @@ def looked_up(surface: Surface, face: np.ndarray, share: np.ndarray) -> np.ndarr
     out = np.empty(len(face), np.float32)
     sky = surface.sky
     look_up_sky(
-        face.astype(np.int32), share.astype(np.float32), sky.steps, sky.firsts, sky.values, out
+        face.astype(np.int32),
+        np.ascontiguousarray(share.T, np.float32),
+        sky.steps,
+        sky.firsts,
+        sky.values,
+        out,
     )
     return out
 
@@ -80,7 +85,9 @@ def test_a_bracket_agrees_with_ray_casting(bracket: Surface) -> None:
 def test_beside_a_long_wall_half_the_sky_is_hidden(bracket: Surface) -> None:
     # A point at distance d from a long wall of height h sees (1 + d/√(d² + h²))/2 of the sky.
     corners = bracket.vertices[bracket.faces]
-    up = (corners[:, :, 2] > 0.003 - 1e-6).all(axis=1) & (corners[:, :, 2] < 0.003 + 1e-6).all(axis=1)
+    up = (corners[:, :, 2] > 0.003 - 1e-6).all(axis=1) & (corners[:, :, 2] < 0.003 + 1e-6).all(
+        axis=1
+    )
     for d in (0.003, 0.01, 0.025):
         place = np.array([0.012 + d, 0.0, 0.003])
         for face in np.nonzero(up)[0]:

@@ -13,7 +13,15 @@ from dopepp.geometry.camera import make_transform, project
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts.part import Mesh
 from dopepp.virtual import (
-    Ambient, Light, Plane, Rendered, Scene, SceneObject, make_surface, render, visible_fractions,
+    Ambient,
+    Light,
+    Plane,
+    Rendered,
+    Scene,
+    SceneObject,
+    make_surface,
+    render,
+    visible_fractions,
 )  # fmt: skip
 
 MakeScene = Callable[..., Scene]

@@ -1,0 +1,128 @@
+"""Meshes and places that nobody should send: compiled code must neither crash nor take for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import random_rotation
+from dopepp.parts.part import Mesh
+from dopepp.virtual import (
+    Ambient,
+    Grooves,
+    Light,
+    Material,
+    Plane,
+    Rendered,
+    Scene,
+    SceneObject,
+    make_surface,
+    render,
+    silhouette,
+    visible_fractions,
+)  # fmt: skip
+
+MakeScene = Callable[..., Scene]
+FLOOR = Plane((0.0, -1.0, 0.0), -0.3)
+
+
+def check(scene: Scene) -> Rendered:
+    for plane in (None, FLOOR):
+        rendered = render(replace(scene, plane=plane))
+        assert np.isfinite(rendered.depth).all()
+        assert (rendered.depth >= 0).all()
+        assert ((rendered.visible_fractions >= 0) & (rendered.visible_fractions <= 1)).all()
+        assert rendered.instances.max(initial=-1) < len(scene.objects)
+        fractions = visible_fractions(replace(scene, plane=plane))
+        np.testing.assert_allclose(fractions, rendered.visible_fractions)
+    for item in scene.objects:
+        assert silhouette(item, scene.K, scene.size).num_px >= 0
+    return rendered
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 100_000))
+def test_any_triangle_soup(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(30, 3)) * 10 ** rng.uniform(-3, 1, 3)
+    # Repeated vertices make faces without area, equal faces, and edges of many faces.
+    faces = rng.integers(0, 30, (60, 3)).astype(np.int32)
+    uv = rng.normal(size=(30, 2)).astype(np.float32)
+    texture = rng.integers(0, 256, (5, 9, 3)).astype(np.uint8)
+    textured = bool(rng.random() < 0.5)
+    surface = make_surface(
+        Mesh(vertices, faces, uv, texture) if textured else Mesh(vertices, faces)
+    )
+    pose = make_transform(random_rotation(rng), rng.normal(size=3))
+    material = Material((0.9, 0.5, 0.1), 0.1, metallic=0.7, noise=0.1, grooves=Grooves())
+    lights = tuple(Light(tuple(rng.normal(size=3))) for _ in range(int(rng.integers(0, 4))))
+    K = np.array([[60.0, 0, 31.2], [0, 60.0, 24.1], [0, 0, 1]])
+    background = np.full((48, 64, 3), 100, np.uint8)
+    check(Scene(K, background, (SceneObject(surface, pose, material),), lights, Ambient()))
+
+
+def test_vertices_on_the_camera_plane_and_at_the_camera(scene_of: MakeScene) -> None:
+    corners = np.array([(0, 0, 0), (0.2, 0, 0), (0, 0.2, 0.5), (-0.2, -0.2, 1e-9), (0.1, 0, 1)])
+    faces = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (0, 4, 1)], np.int32)
+    check(scene_of(SceneObject(make_surface(Mesh(corners, faces)), np.eye(4))))
+
+
+def test_a_mesh_around_camera_and_lights(scene_of: MakeScene) -> None:
+    room = trimesh.creation.box((0.5, 0.4, 1.0))
+    vertices, faces = np.asarray(room.vertices), np.asarray(room.faces, np.int32)
+    lights = (Light((0, 0, 0)), Light(tuple(vertices[0])), Light((0.1, 0.1, 0.2)))
+    for winding in (1, -1):
+        surface = make_surface(Mesh(vertices, faces[:, ::winding]))
+        rendered = check(scene_of(SceneObject(surface, np.eye(4)), lights=lights))
+        assert rendered.visible_fractions[0] == 0 or winding == -1
+
+
+def test_extreme_sizes(scene_of: MakeScene) -> None:
+    ball = trimesh.creation.icosphere(2, 1.0)
+    for size, depth in ((1e-7, 0.1), (1e4, 3e4), (1e-3, 1e6), (0.1, 0.1001)):
+        surface = make_surface(Mesh(np.asarray(ball.vertices) * size, np.asarray(ball.faces)))
+        pose = make_transform(np.eye(3), np.array([0.0, 0.0, depth]))
+        check(scene_of(SceneObject(surface, pose, Material(grooves=Grooves(), noise=0.1))))
+
+
+def test_nothing_but_faces_without_area(scene_of: MakeScene) -> None:
+    flat = Mesh(np.zeros((3, 3)), np.array([(0, 1, 2), (0, 0, 0)], np.int32))
+    line = Mesh(np.array([(0, 0, 0), (1, 0, 0), (2, 0, 0)], float), np.array([(0, 1, 2)], np.int32))
+    pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+    for mesh in (flat, line):
+        with np.errstate(all="raise"):
+            surface = make_surface(mesh)
+        assert check(scene_of(SceneObject(surface, pose))).visible_fractions[0] == 0
+
+
+@pytest.mark.parametrize("index", [-1, 3, 2**31 - 1])
+def test_faces_of_missing_vertices_are_refused(index: int) -> None:
+    with pytest.raises(UserError, match="vertices 0 to 2"):
+        make_surface(Mesh(np.eye(3), np.array([(0, 1, index)], np.int32)))
+
+
+def test_texture_coordinates_must_be_finite() -> None:
+    uv = np.array([(0, 0), (np.nan, 0), (0, 1)], np.float32)
+    mesh = Mesh(np.eye(3), np.array([(0, 1, 2)], np.int32), uv, np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(UserError, match="texture coordinate"):
+        make_surface(mesh)
+
+
+def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of: MakeScene) -> None:
+    # All pairs of these faces would take minutes.
+    count = 150_000
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    around = np.arange(1, count + 1)
+    faces = np.stack([np.zeros(count), around, np.roll(around, -1)], axis=1).astype(np.int32)
+    surface = make_surface(Mesh(np.vstack([[0, 0, 0.2], rim]) * 0.1, faces))
+    pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.4]))
+    assert check(scene_of(SceneObject(surface, pose))).depth.max() > 0.3
