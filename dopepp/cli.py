@@ -4,22 +4,69 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from dopepp.errors import UserError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
-
+_STOPPED = 1
+_DEFECTS = 1
 _USERS_MISTAKE = 2
+
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+"""Of the click that this version of Typer brings along or imports."""
+
+
+class _OneLine(TyperGroup):
+    """Tells a wrong option or a missing argument in one line, as any other mistake."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except _UsageError as error:
+            line = " ".join(error.format_message().split())  # type: ignore[attr-defined]
+            typer.echo(f"{line.rstrip('.')}; --help lists what there is", err=True)
+            raise typer.Exit(_USERS_MISTAKE) from error
+
+
+app = typer.Typer(cls=_OneLine, no_args_is_help=True, add_completion=False, help=__doc__)
 
 
 @app.callback()
 def _configure() -> None:
-    """Poses of weakly textured parts: predict and compare."""
+    """Poses of weakly textured parts: render, check, predict and compare."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+
+
+@contextmanager
+def _mistakes_told() -> Iterator[None]:
+    """End the command with one line for a user's mistake."""
+    try:
+        yield
+    except UserError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(_USERS_MISTAKE) from error
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """End the command with one line when it is interrupted or cannot go on, too."""
+    from dopepp.data.production.stopping import Interruption, StoppedError, interruptible
+
+    try:
+        with _mistakes_told(), interruptible():
+            yield
+    except StoppedError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(_STOPPED) from error
+    except Interruption as interruption:
+        typer.echo(str(interruption), err=True)
+        raise typer.Exit(interruption.exit_code) from interruption
 
 
 @app.command()
@@ -33,18 +80,16 @@ def predict(
     device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
 ) -> None:
     """Print the poses on one picture as JSON, a line per detection."""
-    from dopepp.data.images import read_rgb
     from dopepp.drawing.overlay import YELLOW, Wireframe
     from dopepp.drawing.overlay import overlay as draw
+    from dopepp.drawing.pictures import read_rgb
     from dopepp.drawing.png import write_png
     from dopepp.geometry.camera import camera_matrix
     from dopepp.inference.estimator import PoseEstimator
 
-    try:
+    with _mistakes_told():
         picture = read_rgb(image)
         found = PoseEstimator.load(checkpoint, device).predict(picture, camera_matrix(*intrinsics))
-    except UserError as error:
-        _fail(error)
     for one in found:
         record = {
             "object": one.object,
@@ -60,6 +105,103 @@ def predict(
 
 
 @app.command()
+def render(
+    parts: Annotated[
+        list[str], typer.Argument(help="mesh files (STL, OBJ, PLY), built-in parts, or NAME=FILE")
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the data set; with --preview also a .png")],
+    num: Annotated[int | None, typer.Option("-n", help="number of images")] = None,
+    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
+    layout: Annotated[str, typer.Option("--format", help="bop, ndds or webdataset")] = "bop",
+    preset: Annotated[str, typer.Option(help="paper, bin, table, quickstart or ycb")] = "paper",
+    size: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT (or W,H), pixels; the preset's if left out")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="processes; all cores of this process if left out")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="another seed, other images")] = 0,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="write OUT.preview.png, a contact sheet, and stop")
+    ] = False,
+    shard: Annotated[
+        str, typer.Option(help="i/n: only the i-th of n parts, counted from 0")
+    ] = "0/1",
+    engine: Annotated[str, typer.Option(help="local or ray")] = "local",
+    ray_address: Annotated[
+        str | None, typer.Option(help="of a running Ray cluster; a local one if left out")
+    ] = None,
+    renderer: Annotated[str, typer.Option(help="raster, photoreal or gl")] = "raster",
+    backgrounds: Annotated[
+        str, typer.Option(help="procedural, skimage, or a folder of photos")
+    ] = "procedural",
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="change a field of the preset: lighting.num_lights=[1,3]"),
+    ] = None,
+    negatives: Annotated[
+        list[str] | None, typer.Option(help="further parts shown as distractors")
+    ] = None,
+) -> None:
+    """Render labelled images of parts; the same command goes on after any interruption.
+
+    Exit codes: 0 done; 1 stopped (disk full, a worker died); 2 wrong input; 130, 143 interrupted.
+    """
+    with _resumable():
+        from dopepp.data.production.job import make_job
+        from dopepp.data.production.order import Order, carry_out, write_preview
+
+        job = make_job(
+            parts, unit=unit, preset=preset, changes=changes or (), size=size, seed=seed,
+            backgrounds=backgrounds, negatives=negatives or (), renderer=renderer, layout=layout,
+        )  # fmt: skip
+        if preview:
+            typer.echo(write_preview(job, out))
+        else:
+            order = Order(out, num, shard, workers, engine, ray_address)
+            typer.echo(carry_out(job, order))
+
+
+@app.command()
+def check(
+    folder: Annotated[Path, typer.Argument(help="BOP, BOP-WebDataset, NDDS/FAT or YCB-Video")],
+    most: Annotated[int, typer.Option(min=0, help="defects that are listed, at most")] = 10_000,
+) -> None:
+    """Check a data set and list every defect with its file and field, a line each.
+
+    Exit codes: 0 nothing is wrong; 1 something is; 2 there is no data set.
+    """
+    from dopepp.data.checking.check import check_dataset
+
+    with _mistakes_told():
+        report = check_dataset(folder)
+    typer.echo("\n".join(report.lines(most)))
+    if not report.ok:
+        raise typer.Exit(_DEFECTS)
+
+
+@app.command()
+def download(
+    name: Annotated[str, typer.Argument(help="voc2007: photos for --backgrounds, 460 MB")],
+    out: Annotated[Path, typer.Option(help="folder to keep it in")] = Path("data"),
+) -> None:
+    """Download a public data set, verify its checksum, and print the folder of its photos."""
+    from rich.console import Console
+    from rich.progress import DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+    from dopepp.data.download import download as fetch_and_unpack
+
+    columns = (DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with _resumable(), Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        photos = fetch_and_unpack(
+            name, out, lambda there, total: bar.update(task, completed=there, total=total)
+        )
+    typer.echo(photos)
+
+
+@app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="run folders; a model `dope` comes first")],
     out: Annotated[Path, typer.Option(help="folder for table and figure")] = Path("compare"),
@@ -68,17 +210,10 @@ def compare(
     from dopepp.experiment.compare import compare as compare_results
     from dopepp.experiment.sweep import read_job
 
-    try:
+    with _mistakes_told():
         results = [read_job(run) for run in runs]
         names = [result.name for result in results]
         for run, result in zip(runs, results, strict=True):
             if names.count(result.name) > 1:
                 result.name = f"{result.name} {run.name}"
         compare_results(results, out)
-    except UserError as error:
-        _fail(error)
-
-
-def _fail(error: UserError) -> None:
-    typer.echo(str(error), err=True)
-    raise typer.Exit(_USERS_MISTAKE)

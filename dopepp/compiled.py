@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 """An argument of a compiled function; its docstring gives shape and type."""
 
+Scalar = Any
+"""A number of a compiled function that is float32 or float64, as its caller's arrays are."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 

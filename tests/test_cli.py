@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -68,3 +72,222 @@ def test_compare_tells_an_unfinished_run(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["compare", str(tmp_path / "run"), "--out", str(out)])
     assert done.exit_code == 0, done.output
     assert "unfinished" in (out / "compare.md").read_text()
+
+
+PLATE = "Seeedstudio_Mounting_Plate_SO101.stl"
+
+RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]
+
+
+def test_render_writes_goes_on_and_says_so(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = [*RENDER, "--workers", "1", "--out", str(out)]
+    done = CliRunner().invoke(app, [*arguments, "-n", "2", "--shard", "1/2"])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("1 of 1 images rendered in ")
+    assert [path.name for path in sorted(out.glob("0*.json"))] == ["000001.json"]
+    done = CliRunner().invoke(app, [*arguments, "-n", "2"])
+    assert done.stdout.startswith("1 of 2 images rendered in ")
+    assert "CPU-ms an image" in done.stdout
+    assert len(list(out.glob("0*.json"))) == 2
+
+
+def test_render_previews_and_stops(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, [*RENDER, "-n", "5000", "--preview", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"{out.resolve()}.preview.png\n"
+    assert not out.exists()
+    assert cv2.imread(f"{out}.preview.png").shape[2] == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-n", "0"], "got -n 0; allowed: 1 to"),
+        ([], "got no -n; allowed: the number of images, or --preview"),
+        (["-n", "5", "--size", "4x4"], "got width=4 of "),
+        (["-n", "5", "--size", "big"], "got --size big; allowed: WIDTHxHEIGHT"),
+        (["-n", "5", "--size", "0x0"], "got width=0 of "),
+        (["-n", "5", "--size", "64,0"], "got height=0 of "),
+        (["-n", "many"], "Invalid value for '-n'"),
+        (["-n", "5", "--colour"], "No such option: --colour"),
+        (["-n", "5", "--backgrounds", "skimag"], "got no photo in the background folder skimag"),
+        (["-n", "5", "--unit", "furlong", "part.stl"], "got unit='furlong' for part.stl"),
+        (["-n", "5", "servoholder"], "got parts ['servoholder', 'servoholder'] to render"),
+        (["-n", "5", "--set", "horizontal_fov_deg=1"], "got horizontal_fov_deg=1.0 of quickstart"),
+        (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: paper, "),
+        (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
+        (["-n", "5", "--renderer", "blender"], "got renderer 'blender'; allowed: raster, "),
+        (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),
+        (["-n", "5", "--workers", "0"], "got --workers 0; allowed: 1 to 1024"),
+        (["-n", "5", "--engine", "slurm"], "got --engine slurm; allowed: local, ray"),
+        (["-n", "5", "--ray-address", "a:1"], "got --ray-address a:1 with --engine local"),
+        (["-n", "5", "--set", "lighting"], "got --set lighting; allowed: FIELD"),
+        (["-n", "5", "--seed", "-1"], "got seed -1; allowed: an integer >= 0"),
+        (["-n", "5", "/nowhere/part.stl"], "got mesh /nowhere/part.stl, no such file"),
+        (["-n", "5", "screw"], "got unknown part 'screw'"),
+        (["-n", "5", "--negatives", "servoholder"], "got negative servoholder"),
+        (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
+    ],
+)
+def test_a_wrong_render_option_is_one_line_and_code_2(
+    arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, [*RENDER, "--out", str(out), *arguments])
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(message)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "--out", "x", "-n", "5"], "Missing argument"),
+        (["render", "servoholder", "-n", "5"], "Missing option '--out'"),
+        (["rendr"], "No such command 'rendr'"),
+        (["check", "/nowhere"], "got /nowhere, which is no folder"),
+        (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
+    ],
+)
+def test_a_wrong_command_is_one_line_and_code_2(arguments: list[str], message: str) -> None:
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(message)
+
+
+def test_download_tells_where_the_photos_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = tmp_path / "voc2007" / "VOCdevkit" / "VOC2007" / "JPEGImages"
+    photos.mkdir(parents=True)
+    done = CliRunner().invoke(app, ["download", "voc2007", "--out", str(tmp_path)])
+    assert (done.exit_code, done.stdout) == (0, f"{photos}\n")
+
+    def refuse(*_: object) -> None:
+        raise OSError("Network is unreachable")
+
+    monkeypatch.setattr("socket.getaddrinfo", refuse)
+    done = CliRunner().invoke(app, ["download", "voc2007", "--out", str(tmp_path / "other")])
+    assert done.exit_code == 2
+    assert "no connection: Network is unreachable" in done.stderr
+
+
+def plate(shared_data: Path) -> Path:
+    return shared_data / "parts" / "so_arm100" / PLATE
+
+
+def test_millimetres_given_as_metres_name_the_likely_unit(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = [str(plate(shared_data)), "--unit", "m", "-n", "5", "--out", str(out)]
+    done = CliRunner().invoke(app, ["render", *arguments])
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert "allowed: a diameter of 5 mm – 5 m; fix: state the file's unit: unit=mm" in done.stderr
+    assert not out.exists()
+
+
+def test_an_inch_file_comes_out_in_its_size_and_checked(shared_data: Path, tmp_path: Path) -> None:
+    import trimesh
+
+    mesh = trimesh.load_mesh(plate(shared_data))
+    inches, out = tmp_path / "plate.stl", tmp_path / "out"
+    corners = mesh.vertices.copy()
+    mesh.apply_scale(1 / 25.4).export(inches)
+    done = CliRunner().invoke(
+        app,
+        ["render", str(inches), "--unit", "inch", "--out", str(out), "-n", "2", "--size", "96,72",
+         "--preset", "table", "--backgrounds", "skimage", "--workers", "1"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    (record,) = json.loads((out / "models" / "models_info.json").read_text()).values()
+    sizes = [record[f"size_{axis}"] for axis in "xyz"]
+    assert sizes == pytest.approx(np.ptp(corners, axis=0).tolist(), rel=1e-5)  # millimetres
+    assert cv2.imread(str(next(out.rglob("rgb/*")))).shape == (72, 96, 3)
+    done = CliRunner().invoke(app, ["check", str(out)])
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert done.stdout == f"{out}: BOP, 2 images, 0 defects\n"
+    (path,) = out.rglob("scene_gt.json")
+    path.write_text(path.read_text().replace('"obj_id": 1', '"obj_id": 7'))
+    done = CliRunner().invoke(app, ["check", str(out)])
+    assert done.exit_code == 1
+    assert f"{path.relative_to(out)}: " in done.stdout
+    listed = done.stdout.splitlines()
+    few = CliRunner().invoke(app, ["check", str(out), "--most", "1"]).stdout.splitlines()
+    assert (few[0], few[-1]) == (listed[0], listed[-1])
+    assert few[1] == f"… and {len(listed) - 2} more"
+
+
+@pytest.mark.parametrize("damage", ["nan", "empty", "flat"])
+def test_a_mesh_that_is_none_is_one_line(damage: str, tmp_path: Path) -> None:
+    corner = {"nan": "nan nan nan", "flat": "30 0 0", "empty": ""}[damage]
+    facet = (
+        "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 60 0 0\n"
+        f"vertex {corner}\nendloop\nendfacet\n"
+    )
+    path, out = tmp_path / "part.stl", tmp_path / "out"
+    path.write_text(f"solid part\n{'' if damage == 'empty' else facet}endsolid part\n")
+    arguments = [str(path), "--unit", "mm", "-n", "5", "--out", str(out)]
+    done = CliRunner().invoke(app, ["render", *arguments])
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("got ")
+    assert str(path) in done.stderr
+    assert not out.exists()
+
+
+def test_a_file_without_a_unit_is_taken_as_millimetres_and_says_so(
+    shared_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    arguments = [str(plate(shared_data)), "-n", "0", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, ["render", *arguments]).exit_code == 2
+    assert "states no unit: taken as mm" in caplog.text
+
+
+@pytest.mark.parametrize("layout", ["bop", pytest.param("ndds", marks=pytest.mark.slow)])
+def test_neither_render_nor_check_imports_torch(layout: str, tmp_path: Path) -> None:
+    # One interpreter does everything a worker does, too: workers are other processes.
+    code = f"""
+import sys
+from typer.testing import CliRunner
+from dopepp.cli import app
+from dopepp.data.production.job import make_job
+from dopepp.data.production.order import write_preview
+from dopepp.data.production.work import Task, Work, Worker
+from pathlib import Path
+import pickle
+out = {str(tmp_path / "out")!r}
+arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24",
+             "--format", {layout!r}, "--workers", "1", "-n", "2", "--out", out]
+done = CliRunner().invoke(app, arguments)
+assert done.exit_code == 0, done.output
+job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
+worker = Worker(pickle.dumps(Work(job.factory, {layout!r}, Path(out))))
+for task in (Task(0, range(2)), Task(0, range(2), seals=True)):
+    assert worker.perform(task).error is None
+write_preview(job, Path(out))
+done = CliRunner().invoke(app, ["check", out])
+assert done.exit_code == 0, done.output
+print(sorted({{"torch", "lightning", "torchmetrics", "ray"}} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.returncode) == ("[]\n", 0), done.stderr
+
+
+def test_a_full_disk_is_one_line_and_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", write)
+    done = CliRunner().invoke(app, [*RENDER, "-n", "5", "--out", str(tmp_path / "out")])
+    assert done.exit_code == 1
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("no space left for ")
+    assert list((tmp_path / "out").iterdir()) == []

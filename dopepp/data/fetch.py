@@ -39,7 +39,6 @@ def fetch(
     partial = path.with_name(f"{path.name}.partial")
     try:
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
             _receive(url, partial, num_bytes, progress)
             _verify(partial, url, sha256)
             partial.replace(path)
@@ -83,6 +82,7 @@ def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None)
         # None where the server does not tell.
         if response.length is not None and there + response.length != num_bytes:
             raise _other_file(url, f"{there + response.length} bytes", f"{num_bytes} bytes")
+        partial.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("ab" if resumed else "wb") as file:
             while chunk := response.read(_CHUNK_BYTES):
                 there += len(chunk)

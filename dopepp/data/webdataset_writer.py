@@ -90,38 +90,36 @@ class WebdatasetWriter:
             staged = {int(path.stem): path for path in self._staged(chunk)}
             staged = {image: path for image, path in staged.items() if image in wanted}
             if staged:
-                keys = self._write_shard(chunk, staged)
-                self._write_keys(chunk, keys)
+                self._write_shard(chunk, staged)
+            # Also of a shard that was sealed elsewhere and copied here.
+            self._write_keys(chunk)
             for path in staged.values():
                 path.unlink()
             with suppress(OSError):  # there is none, or not all items were sealed
                 self._staging(chunk).rmdir()
 
-    def _write_shard(self, chunk: int, staged: dict[int, Path]) -> list[str]:
-        # Imports torch where it is installed, so only sealing does.
-        from webdataset.writer import TarWriter
-
+    def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
+        # The webdataset library's TarWriter writes the same archive but imports torch.
         path = self._shard(chunk)
-        partial, keys = partial_path(path), []
+        partial = partial_path(path)
         try:
-            with (
-                partial.open("wb") as file,
-                TarWriter(file, user=_OWNER, group=_OWNER, encoder=False, mtime=0) as archive,
-            ):
+            with tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive:
                 for key, content in _merged(path, chunk, staged):
-                    archive.write({"__key__": key, **content})
-                    keys.append(key)
+                    _add(archive, key, content)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
-        return keys
 
-    def _write_keys(self, chunk: int, keys: list[str]) -> None:
+    def _write_keys(self, chunk: int) -> None:
+        if not self._shard(chunk).exists():
+            return
         path = self.root / self.split / KEY_FILE
         shards = read_json(path) if path.exists() else {}
         if not isinstance(shards, dict):
             raise UserError(f"{path}", "the object that this writer wrote", "remove it")
-        merged = shards | dict.fromkeys(keys, chunk)
+        merged = shards | {member.key: chunk for member in members(self._shard(chunk))}
+        if merged == shards:
+            return
         lines = [f"  {json.dumps(key)}: {json.dumps(merged[key])}" for key in sorted(merged)]
         write_whole(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
@@ -153,11 +151,16 @@ def _merged(path: Path, chunk: int, staged: dict[int, Path]) -> Iterator[tuple[s
 def _archive(key: str, content: Content) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
-        for extension, data in content.items():
-            info = tarfile.TarInfo(f"{key}.{extension}")
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
+        _add(archive, key, content)
     return buffer.getvalue()
+
+
+def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
+    for extension, data in sorted(content.items()):
+        info = tarfile.TarInfo(f"{key}.{extension}")
+        info.size, info.mode = len(data), 0o444
+        info.uname = info.gname = _OWNER
+        archive.addfile(info, io.BytesIO(data))
 
 
 def _key(chunk: int, image: int) -> str:

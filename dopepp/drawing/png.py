@@ -1,15 +1,27 @@
-"""PNG files that are there completely or not at all."""
+"""PNG files, and any others, that are there completely or not at all.
+
+A file is written beside its place under a name of :func:`partial_path` and renamed when it is
+whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
+Nothing is synced: a file survives the death of its process, but not a power cut in the seconds
+after.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import socket
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
@@ -28,7 +40,7 @@ def write_whole(path: Path | str, content: bytes) -> None:
     """Write a file beside its place and rename it, so that a crash leaves no half of one."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_path(path)
     try:
         partial.write_bytes(content)
         partial.replace(path)
@@ -36,8 +48,68 @@ def write_whole(path: Path | str, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+PARTIAL_SUFFIX: Final = ".partial"
+
+_PARTIAL: Final = re.compile(r"\..+\.([0-9a-f]{8})-([0-9]+)\.partial")
+
+_ABANDONED_S: Final = 600.0
+"""Seconds after which a partial file of another machine is nobody's: no file takes that long."""
+
+
+def partial_path(path: Path) -> Path:
+    """Return a name beside a file that no other process uses, on whichever machine it runs."""
+    return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}{PARTIAL_SUFFIX}")
+
+
+def is_abandoned(path: Path, now: float) -> bool:
+    """Tell whether a partial file's process is gone, so that nobody will complete it.
+
+    Args:
+        path: A file that is named like a partial file.
+        now: The present by the clock of the file system, seconds.
+    """
+    match = _PARTIAL.fullmatch(path.name)
+    if match and match[1] == _machine() and not _is_running(int(match[2])):
+        return True
+    try:
+        # A number may have passed on to another process, so age decides as well.
+        return now - path.stat().st_mtime > _ABANDONED_S
+    except FileNotFoundError:  # completed by its process in this moment
+        return False
+
+
+def _is_running(process: int) -> bool:
+    """Tell whether a process of this machine exists; where that cannot be asked, that it does."""
+    if os.name != "posix":  # elsewhere, signal 0 is not a question
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # somebody else's
+        return True
+    return True
+
+
+@cache
+def _machine() -> str:
+    """Return eight hex digits for the set of processes among which a process id is unique.
+
+    Containers may share a host's name and hosts may all be called ``localhost``, so on Linux the
+    boot and the process namespace count as well.
+    """
+    facts = [socket.gethostname()]
+    boot, namespace = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")
+    if boot.is_file() and namespace.is_symlink():
+        facts += [boot.read_text(), str(namespace.readlink())]
+    return hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
+
+
 def figure_image(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
     """Render a figure to RGB without a window, for files and loggers."""
+    # Whoever writes images only does not wait a third of a second for this.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.scene import SceneObject
 
 _CELLS: Final = 80

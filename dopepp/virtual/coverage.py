@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int16
 
+from dopepp.compiled import Array
 from dopepp.geometry.camera import resize_camera
-from dopepp.virtual.compiled import Array
 from dopepp.virtual.projection import Box, Projected, project_object
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.visibility import CENTRE_SAMPLE, bounds, rasterise

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.scratch import scratch
 from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES
 

@@ -19,17 +19,16 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 
-from dopepp.virtual.compiled import Array
+from dopepp.compiled import Array
 from dopepp.virtual.coverage import fractions_of
 from dopepp.virtual.gl_context import check_process, open_context, require_moderngl
 from dopepp.virtual.gl_memory import Memory, MeshMemory, Targets
 from dopepp.virtual.gl_shaders import FULL_SCREEN, HEADER, LABELS, RESOLVE, SHADING, VERTEX
 from dopepp.virtual.plane import darken_plane, inverse_depth_of, plane_depth
 from dopepp.virtual.projection import project_object
-from dopepp.virtual.rasteriser import _lights
 from dopepp.virtual.scene import NEAR, Rendered, Scene, SceneObject
-from dopepp.virtual.shading import _LIFT_TEXELS, _SHARPEST, ambient_row
-from dopepp.virtual.shadow import ShadowMap
+from dopepp.virtual.shading import LIFT_TEXELS, SHARPEST, ambient_row
+from dopepp.virtual.shadow import ShadowMap, shadow_maps
 
 require_moderngl()
 
@@ -91,7 +90,7 @@ class Renderer:
             plane_depth(inverse_depth_of(scene.plane, scene.K), NEAR, depth)
         projected = [project_object(item, scene.K) for item in scene.objects]
         if scene.objects:
-            lights = _lights(scene, projected)
+            lights = shadow_maps(scene, projected)
             if scene.plane is not None:
                 nothing = np.empty((0, 0, 0), np.int32)
                 darken_plane(scene, scene.plane, lights, ambient_row(scene), (0, 0), nothing, image)
@@ -144,7 +143,7 @@ class Renderer:
         program["up"], program["above"], program["below"] = ambient.up, ambient.above, ambient.below
         program["num_lights"] = len(lights)
         program["image"], program["shadows"], program["lattice"] = 0, 1, 2
-        table, maps = self._memory.shadows(lights, _LIFT_TEXELS)
+        table, maps = self._memory.shadows(lights, LIFT_TEXELS)
         table.bind_to_storage_buffer(0)
         maps.use(1)
         self._memory.lattice.use(2)
@@ -190,7 +189,7 @@ def _set_material(program: Any, item: SceneObject) -> None:
     """Set what an object is made of."""
     material = item.material
     program["colour"] = material.colour
-    program["alpha0"] = max(material.roughness**2, _SHARPEST)
+    program["alpha0"] = max(material.roughness**2, SHARPEST)
     program["specular"], program["metallic"] = material.specular, material.metallic
     program["noise"] = material.noise, material.noise_pitch
     grooves = material.grooves

@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from dopepp.compiled import Array
 from dopepp.errors import UserError
-from dopepp.virtual.compiled import Array
 from dopepp.virtual.noise import NOISE
 from dopepp.virtual.shadow import ShadowMap
 from dopepp.virtual.surface import Surface

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.noise import streak_noise
 
 

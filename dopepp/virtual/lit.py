@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, Scalar, compiled
+from dopepp.compiled import Array, Scalar, compiled
 from dopepp.virtual.scratch import scratch
 
 _ZERO, _ONE = np.float32(0), np.float32(1)

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, Scalar, compiled
+from dopepp.compiled import Array, Scalar, compiled
 
 _SIDE: Final = 32
 _MASK: Final = _SIDE - 1

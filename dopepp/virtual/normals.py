@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 
 _MERGE_STEPS: Final = 2**21 - 1
 """Vertices of one cell of a grid so fine across the mesh are one (STL and UV seams split them);

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.lit import lit_share
 from dopepp.virtual.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.contact import hidden_sky
 from dopepp.virtual.projection import Box
 from dopepp.virtual.scene import NEAR, Plane, Scene

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array
+from dopepp.compiled import Array
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.visibility import PIXEL_SAMPLES, bounds, project_vertices
 

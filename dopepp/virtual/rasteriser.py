@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.virtual.compiled import Array
+from dopepp.compiled import Array
 from dopepp.virtual.coverage import Silhouette, fractions_of, silhouette
 from dopepp.virtual.picture import composite
 from dopepp.virtual.plane import clear_to_plane, darken_plane, inverse_depth_of, plane_depth
 from dopepp.virtual.projection import Projected, project_object
 from dopepp.virtual.scene import NEAR, Rendered, Scene
 from dopepp.virtual.scratch import scratch
-from dopepp.virtual.shading import ambient_row, light_row, shade_object
-from dopepp.virtual.shadow import TEXELS_PER_PX, ShadowMap, shadow_map
+from dopepp.virtual.shading import ambient_row, shade_object
+from dopepp.virtual.shadow import shadow_maps
 from dopepp.virtual.visibility import CENTRE_SAMPLE, PIXEL_SAMPLES, rasterise
 
 __all__ = ["Silhouette", "render", "silhouette", "visible_fractions"]
-
-_FILL_RESOLUTION: Final = 0.5
-"""Resolution of the shadows of all lights but the first, relative to the first one's."""
 
 
 def render(scene: Scene) -> Rendered:
@@ -35,7 +31,7 @@ def render(scene: Scene) -> Rendered:
         plane_depth(inverse_depth_of(scene.plane, scene.K), NEAR, depth)
     projected = [project_object(item, scene.K) for item in scene.objects]
     boxes = [box for item in projected if (box := item.box(scene.size)) is not None]
-    lights = _lights(scene, projected) if scene.objects else []
+    lights = shadow_maps(scene, projected) if scene.objects else []
     left = min((box[0] for box in boxes), default=0)
     top = min((box[1] for box in boxes), default=0)
     right = max((box[2] for box in boxes), default=0)
@@ -94,14 +90,3 @@ def _draw(
 def _first_ids(scene: Scene) -> Array:
     counts = [len(item.surface.faces) for item in scene.objects]
     return np.concatenate([[0], np.cumsum(counts)])[: len(counts)].astype(np.int64)
-
-
-def _lights(scene: Scene, projected: Sequence[Projected]) -> list[tuple[Array, ShadowMap]]:
-    """Return every light with its shadow map."""
-    boxes = [box for seen in projected if (box := seen.box(scene.size)) is not None]
-    extent = max((max(box[2] - box[0], box[3] - box[1]) for box in boxes), default=0)
-    lights = []
-    for number, light in enumerate(scene.lights):
-        texels = TEXELS_PER_PX * extent * (_FILL_RESOLUTION if number else 1.0)
-        lights.append((light_row(light), shadow_map(light, scene.objects, projected, texels)))
-    return lights

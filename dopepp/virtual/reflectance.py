@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 
 # Plain literals would turn the arithmetic into float64.
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))

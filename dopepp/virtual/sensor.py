@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from dopepp.compiled import Array, compiled
 from dopepp.errors import UserError
-from dopepp.virtual.compiled import Array, compiled
 from dopepp.virtual.scene import Sensor
 
 Image = UInt8[np.ndarray, "height width 3"]

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array
+from dopepp.compiled import Array
 from dopepp.virtual.fragments import Fragments, gather_fragments
 from dopepp.virtual.grooves import tilt_normals
 from dopepp.virtual.lit import lit_shares
@@ -22,23 +22,18 @@ from dopepp.virtual.occlusion import look_up_sky
 from dopepp.virtual.picture import add_colour
 from dopepp.virtual.projection import Projected
 from dopepp.virtual.reflectance import reflect_ambient, reflect_light
-from dopepp.virtual.scene import Light, Scene, SceneObject
+from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.scratch import scratch
 from dopepp.virtual.shadow import ShadowMap
 from dopepp.virtual.texture import sample_texture
 from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 
-_SHARPEST: Final = 0.002
+SHARPEST: Final = 0.002
 """Smallest width of a highlight: one under a point light would be narrower than any pixel."""
 
-_LIFT_TEXELS: Final = 1.5
+LIFT_TEXELS: Final = 1.5
 """Lift of a point before it is looked up in a shadow map; √2 keeps a plane from shadowing itself,
 the rest is for rounding."""
-
-
-def light_row(light: Light) -> Array:
-    """Return a light's position and its linear RGB at one metre, for compiled code."""
-    return np.array([*light.position, *(light.reach**2 * np.array(light.intensity))], np.float32)
 
 
 def ambient_row(scene: Scene) -> Array:
@@ -64,7 +59,7 @@ def shade_object(
         item: The object.
         seen: Its projected vertices.
         scene: Its camera and ambient light.
-        lights: Every light as :func:`light_row`, and its shadow map.
+        lights: As of :func:`~dopepp.virtual.shadow.shadow_maps`.
         window: Pixels to visit as (left, top, right, bottom) of the buffer, right/bottom excluded.
         origin: Image pixel (x, y) of the buffer's first element.
         ids: Triangle ids per sample, shape (height, width, S).
@@ -83,7 +78,7 @@ def shade_object(
         return
     albedo = _albedo(item, seen, scene, fragments)
     alpha = scratch("alpha", (count,), np.float32)
-    alpha.fill(max(material.roughness**2, _SHARPEST))
+    alpha.fill(max(material.roughness**2, SHARPEST))
     if material.grooves is not None:
         _cut_grooves(item, scene, fragments, alpha)
     sky, lit = scratch("sky", (count,), np.float32), scratch("lit", (count,), np.float32)
@@ -99,7 +94,7 @@ def shade_object(
     for light, shadow in lights:
         lit_shares(
             position, normal, fragments.bulge, light, shadow.inverse_depth, shadow.P,
-            _LIFT_TEXELS * shadow.texel, lit,
+            LIFT_TEXELS * shadow.texel, lit,
         )  # fmt: skip
         reflect_light(
             position, normal, albedo, alpha, lit, light, material.specular, material.metallic,

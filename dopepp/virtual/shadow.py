@@ -10,13 +10,16 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.virtual.compiled import Array
+from dopepp.compiled import Array
 from dopepp.virtual.projection import Projected
-from dopepp.virtual.scene import NEAR, Light, SceneObject
+from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
 from dopepp.virtual.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 
 TEXELS_PER_PX: Final = 1.0
 """Resolution of a shadow map, relative to the objects' image."""
+
+_FILL_RESOLUTION: Final = 0.5
+"""Resolution of the shadows of all lights but the first, relative to the first one's."""
 
 _SIDES: Final = (64, 768)
 """Smallest and largest side of a shadow map, texels."""
@@ -39,6 +42,22 @@ class ShadowMap:
     inverse_depth: Array
     P: Array
     texel: float
+
+
+def light_row(light: Light) -> Array:
+    """Return a light's position and its linear RGB at one metre, for compiled code."""
+    return np.array([*light.position, *(light.reach**2 * np.array(light.intensity))], np.float32)
+
+
+def shadow_maps(scene: Scene, projected: Sequence[Projected]) -> list[tuple[Array, ShadowMap]]:
+    """Return every light of a scene as :func:`light_row`, with its shadow map."""
+    boxes = [box for seen in projected if (box := seen.box(scene.size)) is not None]
+    extent = max((max(box[2] - box[0], box[3] - box[1]) for box in boxes), default=0)
+    lights = []
+    for number, light in enumerate(scene.lights):
+        texels = TEXELS_PER_PX * extent * (_FILL_RESOLUTION if number else 1.0)
+        lights.append((light_row(light), shadow_map(light, scene.objects, projected, texels)))
+    return lights
 
 
 def shadow_map(

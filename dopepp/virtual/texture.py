@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 from dopepp.virtual.fragments import edge_functions
 from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.visibility import CENTRE_SAMPLE, rasterise

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from dopepp.virtual.compiled import Array, compiled
+from dopepp.compiled import Array, compiled
 
 NUM_COLOUR_SAMPLES = 4
 """The first samples of a pixel make its colour; the last one, its centre, makes the labels."""

@@ -1,0 +1,127 @@
+"""What a render job makes: everything that decides its bytes, as a factory and as a record."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from dopepp.data.production.record import record_of
+from dopepp.data.production.work import find_writer
+from dopepp.errors import UserError
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Part
+from dopepp.parts.record import check_name
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.customise import customised_preset
+from dopepp.virtual.factory import Factory
+
+_NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")
+"""``NAME=FILE``; a name is not a path."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is rendered, whoever renders how much of it.
+
+    Attributes:
+        factory: Renders image (0, index).
+        layout: Name of the data set's layout.
+        record: The settings as plain values; equal records give equal bytes.
+    """
+
+    factory: Factory
+    layout: str
+    record: Mapping[str, Any]
+
+
+def make_job(
+    parts: Sequence[str],
+    *,
+    unit: str | None = None,
+    preset: str = "paper",
+    changes: Sequence[str] = (),
+    size: str | None = None,
+    seed: int = 0,
+    backgrounds: str | Path | None = None,
+    negatives: Sequence[str] = (),
+    renderer: str = "raster",
+    layout: str = "bop",
+) -> Job:
+    """Make a job from what a user writes.
+
+    Args:
+        parts: Built-in names, mesh files, or ``NAME=FILE`` where the file's name will not do.
+        unit: The files' unit.
+        preset: Name of a preset.
+        changes: ``field.field=value``, the value as YAML.
+        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels; None for the preset's own.
+        seed: Of the whole job.
+        backgrounds: As :func:`~dopepp.virtual.backgrounds.find_backgrounds` takes it.
+        negatives: Parts among the distractors, written as ``parts``.
+        renderer: Name of a renderer.
+        layout: Name of a layout.
+
+    Raises:
+        UserError: Any of it cannot be used.
+    """
+    find_writer(layout)
+    scenes = customised_preset(preset, _nested(changes))
+    factory = Factory(
+        [named_part(text, unit) for text in parts],
+        scenes if size is None else scenes.resized(*_sides(size)),
+        seed,
+        find_backgrounds(backgrounds),
+        renderer=renderer,
+        negatives=[named_part(text, unit) for text in negatives],
+    )
+    return Job(factory, layout, record_of(factory, layout, unit))
+
+
+def named_part(text: str, unit: str | None) -> Part:
+    """Load a part that is written as in :func:`make_job`.
+
+    Raises:
+        UserError: There is no such part, or the name cannot be one.
+    """
+    match = None if Path(text).exists() else _NAMED.fullmatch(text)
+    if match is None:
+        return load_part(text, unit)
+    return replace(load_part(match[2], unit), name=check_name(match[1]))
+
+
+def _sides(size: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
+    if match is None:
+        raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels, e.g. 640x480", "change --size")
+    return int(match[1]), int(match[2])
+
+
+def _nested(changes: Sequence[str]) -> dict[str, Any]:
+    """Turn ``a.b=1`` into ``{"a": {"b": 1}}``."""
+    tree: dict[str, Any] = {}
+    for change in changes:
+        path, sign, text = change.partition("=")
+        *groups, field = path.split(".")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            sign, value = "", error
+        if not sign or not all((*groups, field)):
+            raise UserError(
+                f"--set {change}", "FIELD.FIELD=VALUE, the value in YAML",
+                "write it like lighting.num_lights=[1,3]",
+            )  # fmt: skip
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+            if not isinstance(node, dict):
+                break
+        if not isinstance(node, dict) or field in node:
+            raise UserError(f"--set {change} after another --set of {path}", "one each", "drop one")
+        node[field] = value
+    return tree

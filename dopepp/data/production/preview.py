@@ -1,0 +1,94 @@
+"""The first images of a job on one sheet, to look at before rendering thousands."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dopepp.data.rendered import rendered_sample
+from dopepp.data.sample import Instance, Sample
+from dopepp.drawing.overlay import Wireframe, overlay
+from dopepp.drawing.preview import COLOURS, depth_panel, draw_axes, mask_panel
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.geometry.camera import project, resize_points, transform
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.scene import Rendered
+
+NUM_SCENES: Final = 8
+
+_PANELS: Final = 4
+_LISTED: Final = 4
+"""Visible fractions in a caption, at most."""
+
+_AXIS_LENGTH: Final = 0.5
+"""Of the part's diameter."""
+
+
+def preview_sheet(
+    factory: Factory, num_scenes: int = NUM_SCENES
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Render a job's first images and draw, in a row each, the image and its labels.
+
+    Raises:
+        UserError: The preset cannot show the part.
+    """
+    tiles: list[Tile] = []
+    for index in range(num_scenes):
+        tiles += scene_tiles(factory.render(0, index), f"image {index}")
+    return contact_sheet(tiles, columns=_PANELS)
+
+
+def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:
+    """Yield an image, its cuboids and axes, its masks and its depth."""
+    sample = rendered_sample(rendered, "virtual", name)
+    width, height = sample.size
+    scene = rendered.scene
+    lights = f"{len(scene.lights)} lights" if len(scene.lights) != 1 else "1 light"
+    others = len(scene.objects) - len(scene.targets)
+    plane = ", on a plane" if scene.plane is not None else ""
+    yield Tile(rendered.image, f"{name}: {width}×{height}, {lights}{plane}")
+    counts = Counter(instance.label for instance in sample.instances)
+    names = [label if count == 1 else f"{count} {label}" for label, count in counts.items()]
+    yield Tile(_posed(rendered, sample), ", ".join(names) or "no target")
+    masks = [instance.mask for instance in sample.instances]
+    seen = _seen([round(100 * instance.visible_fraction) for instance in sample.instances])
+    yield Tile(mask_panel(rendered.image, masks), f"{seen}; distractors: {others}")
+    yield Tile(*depth_panel(rendered.depth, rendered.instances >= 0))
+
+
+def _seen(percents: list[int]) -> str:
+    """Say how much of each target is visible; of many, the least and the most."""
+    if not percents:
+        return "nothing to find"
+    if len(percents) > _LISTED:
+        return f"visible: {min(percents)} to {max(percents)} % of {len(percents)} targets"
+    return f"visible: {', '.join(f'{percent} %' for percent in percents)}"
+
+
+def _posed(rendered: Rendered, sample: Sample) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw cuboids in the masks' colours, and the object frames' axes."""
+    frames = [
+        Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])
+        for number, instance in enumerate(sample.instances)
+    ]
+    drawn = overlay(sample.image, frames)
+    factor = drawn.shape[1] / sample.size[0]
+    objects = rendered.scene.objects
+    for instance, number in zip(sample.instances, rendered.scene.targets, strict=True):
+        part = objects[number].part
+        assert part is not None
+        ends = _axes(instance, sample.K, _AXIS_LENGTH * part.diameter)
+        draw_axes(drawn, resize_points(ends, factor, factor))
+    return drawn
+
+
+def _axes(
+    instance: Instance, K: Float[np.ndarray, "3 3"], length: float
+) -> Float[np.ndarray, "4 2"]:
+    """Return where the object's origin and the ends of its axes (metres long) are seen."""
+    points = transform(instance.T_cam_obj, np.vstack([np.zeros(3), length * np.eye(3)]))
+    return np.asarray(project(points, K))

@@ -1,0 +1,58 @@
+"""How a job ends early: by a signal, or because the machine cannot go on; both can be resumed."""
+
+from __future__ import annotations
+
+import errno
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Final, NoReturn
+
+NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
+"""The disk is full, or the user's share of it."""
+
+_RESUME: Final = "the same command goes on where this one stopped"
+
+
+class StoppedError(RuntimeError):
+    """A job that ended early through nobody's mistake, said in one line."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"{reason}; {_RESUME}")
+
+
+def stopped(error: OSError, root: Path) -> StoppedError:
+    """Say in one line what the operating system refused."""
+    if error.errno in NO_SPACE:
+        return StoppedError(f"no space left for {root}: free some")
+    return StoppedError(f"{error.filename or root}: {error.strerror or error}")
+
+
+class Interruption(KeyboardInterrupt):
+    """Ctrl-C, or a scheduler's SIGTERM.
+
+    Attributes:
+        exit_code: 128 plus the signal's number, as shells count.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"interrupted; {_RESUME}")
+        self.exit_code = 128 + number
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only)."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    kept = {number: signal.signal(number, _interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, _: FrameType | None) -> NoReturn:
+    raise Interruption(number)
