@@ -20,15 +20,15 @@ import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 
 from dopepp.compiled import Array
-from dopepp.virtual.coverage import fractions_of
 from dopepp.virtual.gl_context import check_process, open_context, require_moderngl
 from dopepp.virtual.gl_memory import Memory, MeshMemory, Targets
 from dopepp.virtual.gl_shaders import FULL_SCREEN, HEADER, LABELS, RESOLVE, SHADING, VERTEX
-from dopepp.virtual.plane import darken_plane, inverse_depth_of, plane_depth
-from dopepp.virtual.projection import project_object
+from dopepp.virtual.raster.coverage import fractions_of
+from dopepp.virtual.raster.plane import darken_plane, inverse_depth_of, plane_depth
+from dopepp.virtual.raster.projection import project_object
+from dopepp.virtual.raster.shading import LIFT_TEXELS, SHARPEST, ambient_row
+from dopepp.virtual.raster.shadow import ShadowMap, shadow_maps
 from dopepp.virtual.scene import NEAR, Rendered, Scene, SceneObject
-from dopepp.virtual.shading import LIFT_TEXELS, SHARPEST, ambient_row
-from dopepp.virtual.shadow import ShadowMap, shadow_maps
 
 require_moderngl()
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from dopepp.compiled import Array
 from dopepp.errors import UserError
-from dopepp.virtual.noise import NOISE
-from dopepp.virtual.shadow import ShadowMap
+from dopepp.virtual.raster.noise import NOISE
+from dopepp.virtual.raster.shadow import ShadowMap
+from dopepp.virtual.raster.texture import Texture
 from dopepp.virtual.surface import Surface
-from dopepp.virtual.texture import Texture
 
 _SRGB8: Final = 0x8C41
 """``GL_SRGB8``: decoded to linear light before it is filtered."""

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, rasterise
 from dopepp.virtual.surface import Surface
-from dopepp.virtual.visibility import CENTRE_SAMPLE, rasterise
 
 _MAX_CELLS: Final = 1024
 """Cells along a footprint, at most; an object that needs more finds no place."""

@@ -22,11 +22,11 @@ from dopepp.virtual.photoreal_scene import bounding_sphere, make_shapes, make_su
 from dopepp.virtual.photoreal_table import TableTop, shadowed, split_light
 from dopepp.virtual.photoreal_variant import mitsuba, require
 from dopepp.virtual.photoreal_view import View, Window, cast, make_view, pixel_rays
-from dopepp.virtual.plane import inverse_depth_of, plane_depth
-from dopepp.virtual.projection import project_object
+from dopepp.virtual.raster.plane import inverse_depth_of, plane_depth
+from dopepp.virtual.raster.projection import project_object
+from dopepp.virtual.raster.tone import CODE_STEPS, TONE_CURVE
 from dopepp.virtual.rasteriser import visible_fractions
 from dopepp.virtual.scene import NEAR, Rendered, Scene
-from dopepp.virtual.tone import CODE_STEPS, TONE_CURVE
 
 require("mitsuba", "pyoidn")
 

@@ -1,7 +1,7 @@
 """A scene as Mitsuba takes it: meshes, reflectance, lamps and the sky.
 
 Everything stands in the camera frame, as in the rest of the package. Light is matched to
-:mod:`dopepp.virtual.shading`: a lamp is a sphere that gives a surface what the point light gives
+``raster.shading``: a lamp is a sphere that gives a surface what the point light gives
 it, and the sky is two hemispheres. What differs is what path tracing adds: soft shadows, light
 from object to object, reflections of the lamps and the surroundings.
 
@@ -19,9 +19,9 @@ from jaxtyping import Float, Float32
 
 from dopepp.geometry.camera import transform
 from dopepp.virtual.material import Material
+from dopepp.virtual.raster.tone import SRGB_TO_LINEAR
 from dopepp.virtual.scene import Ambient, Light, Scene, SceneObject
 from dopepp.virtual.surface import Surface
-from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 Sphere = tuple[Float[np.ndarray, "3"], float]
 """Centre and radius, camera frame, metres."""

@@ -14,8 +14,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from dopepp.virtual.photoreal_scene import bounding_sphere, rgb
 from dopepp.virtual.photoreal_view import Window, pixel_rays
+from dopepp.virtual.raster.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.scene import Scene
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 
 _REACH: Final = 6.0
 """Radius of the disc, in radii of the sphere around all objects."""

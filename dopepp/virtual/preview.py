@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from dopepp.geometry.camera import resize_camera
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, bounds, project_vertices, rasterise
 from dopepp.virtual.scene import NEAR, SceneObject
-from dopepp.virtual.visibility import CENTRE_SAMPLE, bounds, project_vertices, rasterise
 
 _WIDTH_PX: Final = 160
 """Width of the depth image; smaller images are looked at as they are."""

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.compiled import Array
-from dopepp.virtual.coverage import Silhouette, fractions_of, silhouette
-from dopepp.virtual.picture import composite
-from dopepp.virtual.plane import clear_to_plane, darken_plane, inverse_depth_of, plane_depth
-from dopepp.virtual.projection import Projected, project_object
+from dopepp.virtual.raster.coverage import Silhouette, fractions_of, silhouette
+from dopepp.virtual.raster.picture import composite
+from dopepp.virtual.raster.plane import clear_to_plane, darken_plane, inverse_depth_of, plane_depth
+from dopepp.virtual.raster.projection import Projected, project_object
+from dopepp.virtual.raster.scratch import scratch
+from dopepp.virtual.raster.shading import ambient_row, shade_object
+from dopepp.virtual.raster.shadow import shadow_maps
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, PIXEL_SAMPLES, rasterise
 from dopepp.virtual.scene import NEAR, Rendered, Scene
-from dopepp.virtual.scratch import scratch
-from dopepp.virtual.shading import ambient_row, shade_object
-from dopepp.virtual.shadow import shadow_maps
-from dopepp.virtual.visibility import CENTRE_SAMPLE, PIXEL_SAMPLES, rasterise
 
 __all__ = ["Silhouette", "render", "silhouette", "visible_fractions"]
 

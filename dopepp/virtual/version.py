@@ -17,6 +17,6 @@ def code_hash() -> str:
     """Return a SHA-256 of the rendering code; kept renders of other code are not reused."""
     digest = hashlib.sha256()
     for folder in _FOLDERS:
-        for path in sorted((_PACKAGE / folder).glob("*.py")):
-            digest.update(f"{folder}/{path.name}\n".encode() + path.read_bytes())
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
     return digest.hexdigest()

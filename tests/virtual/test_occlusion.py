@@ -9,7 +9,7 @@ from manifold3d import Manifold
 
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Surface, make_surface
-from dopepp.virtual.occlusion import look_up_sky, spread_directions
+from dopepp.virtual.raster.occlusion import look_up_sky, spread_directions
 
 
 def surface_of(solid: Manifold) -> Surface:

@@ -14,8 +14,8 @@ from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Ambient, Light, Material, Scene, SceneObject, make_surface, render
 from dopepp.virtual import rasteriser as rasteriser_module
-from dopepp.virtual.fragments import _corner_heights
-from dopepp.virtual.shadow import ShadowMap, shadow_map
+from dopepp.virtual.raster.fragments import _corner_heights
+from dopepp.virtual.raster.shadow import ShadowMap, shadow_map
 
 MakeScene = Callable[..., Scene]
 BODIES = {

@@ -16,7 +16,7 @@ from dopepp.parts.mesh import ycb_part
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Ambient, Material, Scene, SceneObject, Surface, make_surface, render
 from dopepp.virtual.placement import FACING
-from dopepp.virtual.texture import Texture, make_texture
+from dopepp.virtual.raster.texture import Texture, make_texture
 
 MakeScene = Callable[..., Scene]
 SIDE = 0.3

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.compiled import Array
-from dopepp.virtual.projection import Projected
+from dopepp.virtual.raster.projection import Projected
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
-from dopepp.virtual.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 
 TEXELS_PER_PX: Final = 1.0
 """Resolution of a shadow map, relative to the objects' image."""

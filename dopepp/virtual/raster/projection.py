@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dopepp.compiled import Array
+from dopepp.virtual.raster.visibility import PIXEL_SAMPLES, bounds, project_vertices
 from dopepp.virtual.scene import NEAR, SceneObject
-from dopepp.virtual.visibility import PIXEL_SAMPLES, bounds, project_vertices
 
 Box = tuple[int, int, int, int]
 """(left, top, right, bottom) in pixels, right and bottom excluded."""

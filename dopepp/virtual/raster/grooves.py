@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.noise import streak_noise
+from dopepp.virtual.raster.noise import streak_noise
 
 
 @compiled(fastmath=True)
@@ -39,7 +39,7 @@ def tilt_normals(
     """Tilt the normals of grooved points, or widen their highlight where grooves are fine.
 
     Args:
-        noise: :data:`~dopepp.virtual.noise.NOISE`.
+        noise: :data:`~dopepp.virtual.raster.noise.NOISE`.
         position: Points in the camera frame, metres, shape (3, n).
         axis: Unit vector across the grooves, camera frame.
         phase_origin: ``axis · origin`` of the object's frame, metres.

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.contact import hidden_sky
-from dopepp.virtual.projection import Box
+from dopepp.virtual.raster.contact import hidden_sky
+from dopepp.virtual.raster.projection import Box
+from dopepp.virtual.raster.scratch import scratch
+from dopepp.virtual.raster.shadow import ShadowMap
+from dopepp.virtual.raster.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.raster.visibility import NUM_COLOUR_SAMPLES
 from dopepp.virtual.scene import NEAR, Plane, Scene
-from dopepp.virtual.scratch import scratch
-from dopepp.virtual.shadow import ShadowMap
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
-from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES
 
 _LAMP_ANGLE: Final = 0.04
 """Diameter of a lamp as seen from the plane, radians; it makes a high object's shadow soft."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopepp.compiled import Array, Scalar, compiled
-from dopepp.virtual.scratch import scratch
+from dopepp.virtual.raster.scratch import scratch
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 

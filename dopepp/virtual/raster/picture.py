@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES
+from dopepp.virtual.raster.visibility import NUM_COLOUR_SAMPLES
 
 
 @compiled(fastmath=True)

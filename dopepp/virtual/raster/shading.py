@@ -14,19 +14,19 @@ from typing import Final
 import numpy as np
 
 from dopepp.compiled import Array
-from dopepp.virtual.fragments import Fragments, gather_fragments
-from dopepp.virtual.grooves import tilt_normals
-from dopepp.virtual.lit import lit_shares
-from dopepp.virtual.noise import NOISE, tint_albedo
-from dopepp.virtual.occlusion import look_up_sky
-from dopepp.virtual.picture import add_colour
-from dopepp.virtual.projection import Projected
-from dopepp.virtual.reflectance import reflect_ambient, reflect_light
+from dopepp.virtual.raster.fragments import Fragments, gather_fragments
+from dopepp.virtual.raster.grooves import tilt_normals
+from dopepp.virtual.raster.lit import lit_shares
+from dopepp.virtual.raster.noise import NOISE, tint_albedo
+from dopepp.virtual.raster.occlusion import look_up_sky
+from dopepp.virtual.raster.picture import add_colour
+from dopepp.virtual.raster.projection import Projected
+from dopepp.virtual.raster.reflectance import reflect_ambient, reflect_light
+from dopepp.virtual.raster.scratch import scratch
+from dopepp.virtual.raster.shadow import ShadowMap
+from dopepp.virtual.raster.texture import sample_texture
+from dopepp.virtual.raster.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.scene import Scene, SceneObject
-from dopepp.virtual.scratch import scratch
-from dopepp.virtual.shadow import ShadowMap
-from dopepp.virtual.texture import sample_texture
-from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 
 SHARPEST: Final = 0.002
 """Smallest width of a highlight: one under a point light would be narrower than any pixel."""
@@ -59,7 +59,7 @@ def shade_object(
         item: The object.
         seen: Its projected vertices.
         scene: Its camera and ambient light.
-        lights: As of :func:`~dopepp.virtual.shadow.shadow_maps`.
+        lights: As of :func:`~dopepp.virtual.raster.shadow.shadow_maps`.
         window: Pixels to visit as (left, top, right, bottom) of the buffer, right/bottom excluded.
         origin: Image pixel (x, y) of the buffer's first element.
         ids: Triangle ids per sample, shape (height, width, S).

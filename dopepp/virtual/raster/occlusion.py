@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.lit import lit_share
-from dopepp.virtual.visibility import CENTRE_SAMPLE, project_vertices, rasterise
+from dopepp.virtual.raster.lit import lit_share
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 
 _DIRECTIONS: Final = (24, 256)
 """Fewest and most directions a mesh is drawn from."""

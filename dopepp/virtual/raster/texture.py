@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.fragments import edge_functions
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
-from dopepp.virtual.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.raster.fragments import edge_functions
+from dopepp.virtual.raster.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, rasterise
 
 _MOST_PROBES: Final = 16
 """Along a footprint's longer axis; beyond this stretch a texture blurs."""

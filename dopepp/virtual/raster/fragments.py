@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from dopepp.compiled import Array, compiled
-from dopepp.virtual.scratch import scratch
-from dopepp.virtual.visibility import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES
+from dopepp.virtual.raster.scratch import scratch
+from dopepp.virtual.raster.visibility import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES
 
 _DEPTH_GAP: Final = 0.01
 """Samples of a patch whose depths differ by a larger share are parts that hide one another."""

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int16
 
 from dopepp.compiled import Array
 from dopepp.geometry.camera import resize_camera
-from dopepp.virtual.projection import Box, Projected, project_object
+from dopepp.virtual.raster.projection import Box, Projected, project_object
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, bounds, rasterise
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
-from dopepp.virtual.visibility import CENTRE_SAMPLE, bounds, rasterise
 
 _MOST_PX: Final = 1_000_000
 """A full silhouette whose box is larger than this is counted at a reduced scale."""

@@ -1,0 +1,1 @@
+"""The steps of the rasteriser: visibility, shadows, fragments, light, picture."""
