@@ -115,14 +115,21 @@ def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> d
         )
     base = stored if isinstance(stored, dict) else {}
     data = dict(given) if whole else _changed(base, given, "data")
-    if data.get("virtual") is None:
-        data["virtual"] = base.get("virtual")
-    if data["virtual"] is None:
+    data["virtual"] = _chosen_virtual(config.get("virtual") or {}, base.get("virtual"), checkpoint)
+    return {**data, "test": {"renderer": None, "cache": "none", **(data.get("test") or {})}}
+
+
+def _chosen_virtual(
+    given: Mapping[str, Any], stored: Mapping[str, Any] | None, checkpoint: str
+) -> dict[str, Any]:
+    """Return how to render: a whole node as given, or the stored one with options changed."""
+    if "renderer" in given and "preset" in given:  # a file of conf/virtual, not single options
+        return dict(given)
+    if stored is None:
         raise UserError(
             f"{checkpoint}, which does not say how to render", "virtual=default", "add it"
         )
-    data["virtual"] = _changed(data["virtual"], config.get("virtual") or {}, "virtual")
-    return {**data, "test": {"renderer": None, "cache": "none", **(data.get("test") or {})}}
+    return _changed(stored, given, "virtual")
 
 
 def _changed(base: Mapping[str, Any], changes: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def train(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> Runner:
         (["modl=dope"], "override 'modl', which names no option"),
         (["model=dopeppp"], "model=dopeppp; allowed: dope dopepp"),
         (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
-        (["data=ycb"], "data=ycb; allowed: hybrid virtual ycb_video"),
+        (["data=ycb"], "data=ycb; allowed: bop hybrid ndds virtual webdataset ycb_video"),
         (["trainer.max_epochs"], "trainer.max_epochs"),
         (["trainer.max_epochs=1,2"], "Ambiguous value"),
         (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),

@@ -271,7 +271,7 @@ def test_inference_needs_no_training_and_no_data(code: str) -> None:
     loaded = loaded_after(code)
     assert "dopepp.inference.estimator" in loaded
     packages = {name.split(".")[0] for name in loaded}
-    assert not {"lightning", "hydra", "omegaconf", "wandb", "numba"} & packages
+    assert not {"lightning", "hydra", "omegaconf", "wandb", "mitsuba", "ray"} & packages
     above = ("training", "data", "virtual", "experiment", "metrics")
     assert not {name for name in loaded if name.startswith(tuple(f"dopepp.{p}" for p in above))}
 

@@ -13,7 +13,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Ambient, Light, Material, Scene, SceneObject, make_surface, render
-from dopepp.virtual import rasteriser as rasteriser_module
+from dopepp.virtual.raster import shadow as shadow_module
 from dopepp.virtual.raster.fragments import _corner_heights
 from dopepp.virtual.raster.shadow import ShadowMap, shadow_map
 
@@ -51,7 +51,7 @@ def test_a_convex_smooth_body_has_no_shadow_on_it(
         rendered = render(scene)
         with_shadow = rendered.image.astype(int)
         with monkeypatch.context() as patch:
-            patch.setattr(rasteriser_module, "shadow_map", without_casters)
+            patch.setattr(shadow_module, "shadow_map", without_casters)
             without = render(scene).image.astype(int)
         # Dots of shadow would be dozens of levels dark.
         assert np.abs(with_shadow - without).max() <= 3
