@@ -78,6 +78,19 @@ def predict(
     ],
     overlay: Annotated[Path | None, typer.Option(help="write the picture with wireframes")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    verify: Annotated[
+        bool, typer.Option("--verify", help="add how well picture and drawn part agree, 0 to 1")
+    ] = False,
+    parts: Annotated[
+        list[str] | None,
+        typer.Option("--part", help="for --verify: built-in part, mesh file, or NAME=FILE"),
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
+    refine: Annotated[str | None, typer.Option(help="depth: refine with --depth")] = None,
+    depth: Annotated[
+        Path | None, typer.Option(help="16-bit PNG aligned to the picture, 0 where unknown")
+    ] = None,
+    depth_scale: Annotated[float, typer.Option(help="metres per unit of --depth")] = 0.001,
 ) -> None:
     """Print the poses on one picture as JSON, a line per detection."""
     from dopepp.drawing.overlay import YELLOW, Wireframe
@@ -85,12 +98,26 @@ def predict(
     from dopepp.drawing.pictures import read_rgb
     from dopepp.drawing.png import write_png
     from dopepp.geometry.camera import camera_matrix
+    from dopepp.inference.depth_image import read_depth
     from dopepp.inference.estimator import PoseEstimator
+    from dopepp.virtual.agreement import agreement, meshes_of
 
     with _mistakes_told():
-        picture = read_rgb(image)
-        found = PoseEstimator.load(checkpoint, device).predict(picture, camera_matrix(*intrinsics))
-    for one in found:
+        picture, K = read_rgb(image), camera_matrix(*intrinsics)
+        if (refine is None) != (depth is None):
+            raise UserError(
+                "--depth without --refine" if refine is None else "--refine without --depth",
+                "both or none of them",
+                "add --refine depth" if refine is None else "add --depth FILE",
+            )
+        estimator = PoseEstimator.load(checkpoint, device, refine)
+        metres = None if depth is None else read_depth(depth, depth_scale)
+        found = estimator.predict(picture, K, depth=metres)
+        agreements: list[float] = []
+        if verify:
+            meshes = meshes_of(estimator.parts, parts or (), unit)
+            agreements = [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
+    for number, one in enumerate(found):
         record = {
             "object": one.object,
             "score": one.score,
@@ -98,6 +125,8 @@ def predict(
             "keypoints": one.keypoints.tolist(),
             "reprojection_error_px": one.reprojection_error_px,
         }
+        if verify:
+            record["agreement"] = agreements[number]
         typer.echo(json.dumps(record))
     if overlay is not None:
         wireframes = [Wireframe(one.keypoints, YELLOW, one.object) for one in found]
@@ -217,3 +246,18 @@ def compare(
             if names.count(result.name) > 1:
                 result.name = f"{result.name} {run.name}"
         compare_results(results, out)
+
+
+@app.command()
+def symmetries(
+    part: Annotated[str, typer.Argument(help="a mesh file (STL, OBJ, PLY) or a built-in part")],
+    unit: Annotated[str | None, typer.Option(help="of the mesh file: mm, cm, m, inch")] = None,
+    tolerance: Annotated[
+        float, typer.Option(help="largest miss of the surface, share of the diameter")
+    ] = 0.01,
+) -> None:
+    """Find a part's symmetries and print its entry of BOP's models_info.json."""
+    from dopepp.data.part_symmetries import describe_symmetries
+
+    with _mistakes_told():
+        typer.echo(describe_symmetries(part, unit, tolerance))

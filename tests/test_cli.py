@@ -291,3 +291,32 @@ def test_a_full_disk_is_one_line_and_code_1(
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("no space left for ")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_predict_verifies_and_refines(checkpoint: Path, picture: Path, tmp_path: Path) -> None:
+    pytest.importorskip("small_gicp")
+    depth = tmp_path / "depth.png"
+    cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
+    arguments = ["predict", str(checkpoint), str(picture), *K, "--verify"]
+    done = CliRunner().invoke(app, [*arguments, "--refine", "depth", "--depth", str(depth)])
+    assert done.exit_code == 0, done.output
+    for line in done.stdout.splitlines():
+        assert 0 <= json.loads(line)["agreement"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--refine", "depth"], "--refine without --depth"),
+        (["--depth", "d.png"], "--depth without --refine"),
+        (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
+        (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
+    ],
+)
+def test_predict_tells_wrong_options(
+    checkpoint: Path, picture: Path, options: list[str], message: str
+) -> None:
+    done = CliRunner().invoke(app, ["predict", str(checkpoint), str(picture), *K, *options])
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr

@@ -54,6 +54,14 @@ class Batch:
         """Move the tensors like ``Tensor.to(device, non_blocking=…)``; dtypes are kept."""
         return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
+    def rows(self, index: Int[Tensor, " rows"]) -> Batch:
+        """Return some of the images."""
+        part = self._map(lambda tensor: tensor[index.to(tensor.device)])
+        numbers = index.tolist()
+        part.keys = [self.keys[number] for number in numbers]
+        part.sources = [self.sources[number] for number in numbers]
+        return part
+
     def pin_memory(self) -> Batch:
         """Copy the tensors into page-locked memory, for asynchronous transfer to a GPU."""
         return self._map(lambda tensor: tensor.pin_memory())

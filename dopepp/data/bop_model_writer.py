@@ -31,7 +31,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
                 "give the part's mesh file",
             )  # fmt: skip
     folder = root / MODEL_FOLDERS[0]
-    entries = {str(number): _info_record(part) for number, part in enumerate(parts, start=1)}
+    entries = {str(number): model_info(part) for number, part in enumerate(parts, start=1)}
     content = (json.dumps(entries, indent=2, ensure_ascii=False) + "\n").encode()
     path = folder / INFO_FILE
     if path.exists():
@@ -50,7 +50,8 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
     write_whole(path, content)
 
 
-def _info_record(part: Part) -> dict[str, object]:
+def model_info(part: Part) -> dict[str, object]:
+    """Return a part's entry in ``models_info.json``: millimetres, transforms row by row."""
     lower = part.cuboid[:8].min(axis=0) * MM
     size = part.cuboid[:8].max(axis=0) * MM - lower
     record: dict[str, object] = {"name": part.name, "diameter": part.diameter * MM}

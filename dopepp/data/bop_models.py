@@ -114,7 +114,15 @@ def read_models(root: Path) -> dict[int, ModelInfo]:
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return {}
-    records = read_json(path)
+    return parse_models(path, read_json(path))
+
+
+def parse_models(path: Path, records: object) -> dict[int, ModelInfo]:
+    """Return the objects of what a ``models_info.json`` holds, by number.
+
+    Raises:
+        UserError: It holds something else, or two objects share a name.
+    """
     if not isinstance(records, dict) or not all(re.fullmatch(r"[0-9]{1,9}", k) for k in records):
         raise _bad(f"{path}", 'objects by number: {"1": {"diameter": …}, …}')
     infos = {int(key): _info(path, key, record) for key, record in records.items()}

@@ -30,6 +30,7 @@ from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 from dopepp.training.saving import AtomicCheckpointIO
+from dopepp.training.symmetry import SymmetryOptions
 from dopepp.training.system import PoseSystem
 
 _MAX_EPOCHS: Final = 10**9
@@ -74,6 +75,7 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         scheduler_factory(config["scheduler"]),
         description.to_payload(),
         compile_network=config["compile"],
+        symmetry=SymmetryOptions(**config["symmetry"]),
     )
 
 

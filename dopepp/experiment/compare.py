@@ -14,7 +14,8 @@ import numpy as np
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.png import write_whole
 from dopepp.experiment import display
-from dopepp.experiment.report import FULL_SIZE_COST, Cost, Report
+from dopepp.experiment.methods import Cost
+from dopepp.experiment.report import FULL_SIZE_COST, Report
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, PoseRow
 
@@ -119,11 +120,12 @@ def _costs(report: Report) -> dict[str, str]:
 
 
 def _cost(cost: Cost, prefix: str) -> dict[str, str]:
-    ms = NOT_AVAILABLE if cost.ms_per_frame is None else f"{cost.ms_per_frame:.1f}"
+    """Return what is known of a cost."""
+    facts = {"parameters": (cost.parameters, ","), "GMACs": (cost.gmacs, ".3f"),
+             "ms/frame": (cost.ms_per_frame, ".1f")}  # fmt: skip
     return {
-        f"{prefix}parameters": f"{cost.parameters:,}",
-        f"{prefix}GMACs": f"{cost.gmacs:.3f}",
-        f"{prefix}ms/frame": ms,
+        f"{prefix}{heading}": NOT_AVAILABLE if value is None else format(value, form)
+        for heading, (value, form) in facts.items()
     }
 
 

@@ -13,6 +13,7 @@ from rich.tree import Tree
 
 from dopepp.data.datamodule import SourceRow
 from dopepp.experiment.report import Report
+from dopepp.experiment.tuning import Tuning
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
 
@@ -46,8 +47,13 @@ def show_sources(rows: Sequence[SourceRow]) -> None:
     console.print(table)
 
 
-def show_report(report: Report) -> None:
-    """Print a table per object: a line per measure, the reference rows beside the estimate."""
+def show_report(report: Report, all_measures: bool = False) -> None:
+    """Print a table per object: a line per measure, the reference rows beside the estimate.
+
+    Args:
+        report: What was measured.
+        all_measures: Whether to print the symmetric measures of a part without symmetries, too.
+    """
     for name, row in report.rows.items():
         if name == MEAN and len(report.rows) == 2:
             continue
@@ -62,8 +68,11 @@ def show_report(report: Report) -> None:
         for number, one in enumerate(rows):
             style = "bold" if number == 0 else "dim"
             table.add_column(one.method, justify="right", style=style)
-        for column in COLUMNS:
-            table.add_row(column.heading, *(column.text(one) for one in rows))
+        shown = [c for c in COLUMNS if all_measures or row.num_symmetries > 1 or not c.symmetric]
+        for column, following in zip(shown, [*shown[1:], None], strict=True):
+            ends = following is not None and following.group != column.group
+            texts = (column.text(one) for one in rows)
+            table.add_row(column.heading, *texts, end_section=ends)
         console.print(table)
 
 
@@ -77,6 +86,20 @@ def show_comparison(rows: Sequence[Mapping[str, str]]) -> None:
     for row in rows:
         table.add_row(*(row.get(heading, "") for heading in header))
     console.print(table)
+
+
+def show_tuning(tuning: Tuning, path: Path) -> None:
+    """Print what tuning changed, measured on test images, and where the checkpoint is."""
+    shown, empty = tuning.num_images
+    title = f"tuned; measured on {shown} test images and {empty} without objects"
+    table = Table("", "before", "after", title=title)
+    for name in ("calibration_error", "false_positive_rate", "recall"):
+        before, after = getattr(tuning.before, name), getattr(tuning.after, name)
+        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
+    console.print(table)
+    for name, value in tuning.options.items():
+        console.print(f"recovery.{name}: {value:.4g}")
+    console.print(f"tuned checkpoint {path}")
 
 
 def show_files(run_dir: Path) -> None:

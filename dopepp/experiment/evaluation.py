@@ -1,23 +1,35 @@
-"""Measuring checkpoints on a test set, and writing down what came out."""
+"""Measuring methods on a test set, and writing down what came out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from dopepp.data.bop_results import UNKNOWN_TIME, PoseResult, results_name, write_results
+from dopepp.data.rendered import MAX_ITEMS
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.png import write_png
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.errors import UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.compare import compare
+from dopepp.experiment.methods import (
+    EstimatorMethod,
+    FileMethod,
+    MeasuredPose,
+    Method,
+    object_numbers,
+)
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import Report, measure
 from dopepp.experiment.sources import build_test_source
+from dopepp.experiment.tuning import tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.models.gate import check_flag, check_integer
 from dopepp.parts.part import Part
 
 
@@ -28,34 +40,92 @@ def measure_and_record(
     run_dir: Path,
     num_pictures: int,
     details: Mapping[str, Any] | None = None,
+    *,
+    results: Mapping[str, Path] | None = None,
+    bop_csv: bool = False,
+    all_measures: bool = False,
 ) -> list[Report]:
-    """Measure estimators on a test set; show and write tables, curves and pictures."""
-    last = list(estimators.values())[-1]
-    parts = _parts_of(last, data)
+    """Measure methods on a test set; show and write tables, curves and pictures.
+
+    Args:
+        estimators: By name, the baseline first where there is one.
+        data: The data config.
+        seed: Of the test images, where they are renders.
+        run_dir: Folder that everything is written to.
+        num_pictures: How many of the first images are drawn.
+        details: Further plain facts of the last report.
+        results: BOP challenge CSVs of other methods, by name.
+        bop_csv: Whether to write one of each method.
+        all_measures: Whether to print the symmetric measures of every object.
+
+    Returns:
+        A report per estimator, then per file.
+
+    Raises:
+        UserError: The data or a file are wrong.
+    """
+    parts = _parts_of(list(estimators.values()), data)
     source = build_test_source(data, parts, seed)
+    numbers = object_numbers(data, parts)
+    files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
+    methods: dict[str, Method] = {
+        **{name: EstimatorMethod(one, parts) for name, one in estimators.items()},
+        **files,
+    }
     samples = (source.sample(index, 0) for index in range(len(source)))
-    reports, tiles = measure(estimators, samples, num_pictures)
+    measured = measure(methods, samples, num_pictures)
+    for file in files.values():
+        file.check_used()
+    reports = measured.reports
     reports[-1].details.update(details or {})
     for report in reports:
-        display.show_report(report)
+        display.show_report(report, all_measures)
     record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
+    if bop_csv:
+        _write_results(run_dir, measured.poses, data, numbers)
     curves = {
         f"{report.name} {name}" if len(reports) > 1 else name: errors
         for report in reports
         for name, errors in report.errors.items()
     }
     save_accuracy_curves(run_dir / "auc", curves, title=f"{len(source)} test images")
-    if tiles:
-        write_png(run_dir / "overlay.png", contact_sheet(tiles))
+    if measured.tiles:
+        write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
     if len(reports) > 1:
         compare(reports, run_dir, baseline=reports[0].name)
     display.show_files(run_dir)
     return reports
 
 
-def _parts_of(estimator: PoseEstimator, data: Mapping[str, Any]) -> list[Part]:
-    """Return the estimator's parts with the meshes and points that the test data have for them."""
-    names = [part.name for part in estimator.parts]
+def _write_results(
+    run_dir: Path,
+    poses: Mapping[str, Sequence[MeasuredPose]],
+    data: Mapping[str, Any],
+    numbers: Mapping[str, int],
+) -> None:
+    """Write every method's poses as a BOP challenge CSV."""
+    has_folder = data["root"] is not None and data["test"]["renderer"] is None
+    dataset = Path(data["root"]).resolve().name if has_folder else str(data["name"])
+    split = str(data["image_sets"]["test"]) if has_folder else "test"
+    for method, found in poses.items():
+        rows = [
+            PoseResult(
+                *one.image,
+                numbers[one.pose.object],
+                one.pose.score,
+                one.pose.T_cam_obj,
+                UNKNOWN_TIME if one.seconds is None else one.seconds,
+            )
+            for one in found
+        ]
+        write_results(run_dir / results_name(method, dataset, split), rows)
+
+
+def _parts_of(estimators: Sequence[PoseEstimator], data: Mapping[str, Any]) -> list[Part]:
+    """Return the last estimator's parts as the test data have them; without one, all of these."""
+    if not estimators:
+        return build_parts(data)
+    names = [part.name for part in estimators[-1].parts]
     if data["root"] is not None and data["objects"] is None:
         data = {**data, "objects": names}
     available = {part.name: part for part in build_parts(data)}
@@ -70,29 +140,73 @@ def _parts_of(estimator: PoseEstimator, data: Mapping[str, Any]) -> list[Part]:
 
 
 def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
-    """Measure a checkpoint, and a baseline beside it, on its own test set or another one.
+    """Measure a checkpoint, a file of another method's poses, or both, on a test set.
+
+    The test set is the checkpoint's own one or another one.
 
     Args:
         config: The composed and resolved evaluation config, plain values.
         run_dir: Folder that everything is written to.
 
     Raises:
-        UserError: A checkpoint, an option or the data are wrong.
+        UserError: A checkpoint, an option, a file or the data are wrong.
     """
     device = config["device"]
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     paths = [path for path in (config["baseline"], config["ckpt_path"]) if path is not None]
-    loaded = [PoseEstimator.load(path, device) for path in paths]
-    own = loaded[-1].checkpoint
-    stored = own.data
-    data = chosen_data(config, stored.get("config"), str(config["ckpt_path"]))
+    file = config["results"]
+    if config["ckpt_path"] is None and file is None:
+        allowed = "ckpt_path=… or results=… on the command line"
+        raise UserError("no ckpt_path", allowed, "add what is to be measured")
+    loaded = [PoseEstimator.load(path, device, config["refine"]) for path in paths]
+    own = loaded[-1].checkpoint if loaded else None
+    stored = own.data if own is not None else {}
+    data = chosen_data(config, stored.get("config"), str(file if own is None else paths[-1]))
     record.write_config(run_dir, config)
-    environment = record.environment(int(config["seed"]), own.data_fingerprint)
+    fingerprint = "" if own is None else own.data_fingerprint
+    environment = record.environment(int(config["seed"]), fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     seed = int(stored.get("seed", config["seed"]))
-    estimators = dict(zip(_names(loaded), loaded, strict=True))
-    return measure_and_record(estimators, data, seed, run_dir, config["num_pictures"])
+    if check_flag("tune", config["tune"]):
+        _tune(config, loaded, data, seed, run_dir)
+        return []
+    names = _names(loaded, [] if file is None else [_method_name(config)])
+    return measure_and_record(
+        dict(zip(names, loaded, strict=False)),
+        data,
+        seed,
+        run_dir,
+        config["num_pictures"],
+        results={} if file is None else {names[-1]: Path(file)},
+        bop_csv=check_flag("bop_csv", config["bop_csv"]),
+        all_measures=check_flag("all_measures", config["all_measures"]),
+    )
+
+
+def _tune(
+    config: Mapping[str, Any],
+    loaded: Sequence[PoseEstimator],
+    data: Mapping[str, Any],
+    seed: int,
+    run_dir: Path,
+) -> None:
+    """Tune the checkpoint and say what came of it."""
+    if config["ckpt_path"] is None or len(loaded) > 1:
+        allowed = "one ckpt_path, and no baseline"
+        raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+    num_empty = check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS)
+    tuning = tune(loaded[0], data, _parts_of(loaded, data), seed, num_empty)
+    path = write_tuned(loaded[0].checkpoint, Path(config["ckpt_path"]), tuning.options)
+    record.write_json(run_dir / "tuning.json", asdict(tuning))
+    display.show_tuning(tuning, path)
+    display.show_files(run_dir)
+
+
+def _method_name(config: Mapping[str, Any]) -> str:
+    """Return what made the results: as given, else what BOP's file names begin with."""
+    given = config["method"]
+    return str(given) if given is not None else Path(config["results"]).stem.partition("_")[0]
 
 
 def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> dict[str, Any]:
@@ -115,8 +229,16 @@ def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> d
         )
     base = stored if isinstance(stored, dict) else {}
     data = dict(given) if whole else _changed(base, given, "data")
-    data["virtual"] = _chosen_virtual(config.get("virtual") or {}, base.get("virtual"), checkpoint)
-    return {**data, "test": {"renderer": None, "cache": "none", **(data.get("test") or {})}}
+    data["test"] = {"renderer": None, "cache": "none", **(data.get("test") or {})}
+    how_to_render = config.get("virtual") or {}
+    if how_to_render or base.get("virtual") is not None or _are_renders(data):
+        data["virtual"] = _chosen_virtual(how_to_render, base.get("virtual"), checkpoint)
+    return data
+
+
+def _are_renders(data: Mapping[str, Any]) -> bool:
+    """Tell whether the test images are rendered."""
+    return data.get("root") is None or data["test"]["renderer"] is not None
 
 
 def _chosen_virtual(
@@ -145,9 +267,10 @@ def _changed(base: Mapping[str, Any], changes: Mapping[str, Any], where: str) ->
     return merged
 
 
-def _names(loaded: list[PoseEstimator]) -> list[str]:
-    """Return the models' names; of two with one name, the first is called the baseline."""
-    names = [str(one.checkpoint.data.get("name", "estimate")) for one in loaded]
-    if len(set(names)) < len(names):
-        names[0] += " (baseline)"
+def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:
+    """Return the methods' names; of two with one name, the first is called the baseline."""
+    names = [str(one.checkpoint.data.get("name", "estimate")) for one in loaded] + list(others)
+    for number, name in enumerate(names[:-1]):
+        if name in names[number + 1 :]:
+            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
     return names

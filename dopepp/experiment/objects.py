@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.data.bop_models import bop_parts
+from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.rendered import MAX_ITEMS
 from dopepp.data.ycb_layout import read_classes
 from dopepp.errors import UserError
@@ -31,11 +32,18 @@ MAX_WORKERS: Final = 1024
 def build_parts(data: Mapping[str, Any]) -> list[Part]:
     """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
 
+    They have the symmetries that ``data.symmetries`` says.
+
     Raises:
         UserError: The root, an object or a part is wrong, or real frames are asked for without a
             root.
     """
     _check_options(data)
+    # Checkpoints of earlier versions were trained without the option.
+    return choose_symmetries(_read_parts(data), data.get("symmetries"))
+
+
+def _read_parts(data: Mapping[str, Any]) -> list[Part]:
     if data["root"] is None:
         for option in ("objects", "frames"):
             if data[option] is not None:

@@ -1,10 +1,10 @@
-"""Measuring estimators on a test set: one loop, one accumulator, for every kind of comparison."""
+"""Measuring methods on a test set: one loop, one accumulator, for every kind of comparison."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile
-from dopepp.inference.estimator import PoseEstimator
+from dopepp.experiment.methods import Cost, MeasuredPose, Method, image_id
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow
 from dopepp.models.cost import network_cost
@@ -23,24 +23,6 @@ from dopepp.models.spec import build_network
 
 FULL_SIZE_COST: Final = "full_size_cost"
 """Key of the details that holds what a narrowed network costs at full width and size."""
-
-_WARM_UP_FRAMES: Final = 3
-"""The first frames allocate memory and choose kernels; they are not timed."""
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What a network costs.
-
-    Attributes:
-        parameters: Number of trained numbers.
-        gmacs: Multiply-accumulates of one image of the input size, 10⁹.
-        ms_per_frame: Median time from image to poses in this run; None if nothing was timed.
-    """
-
-    parameters: int
-    gmacs: float
-    ms_per_frame: float | None = None
 
 
 @dataclass
@@ -109,59 +91,68 @@ class Report:
         )
 
 
+@dataclass
+class Measured:
+    """What came out of measuring methods on a test set.
+
+    Attributes:
+        reports: One per method.
+        tiles: Pictures of the first images.
+        poses: Every pose of each method.
+    """
+
+    reports: list[Report]
+    tiles: list[Tile]
+    poses: dict[str, list[MeasuredPose]]
+
+
 def measure(
-    estimators: Mapping[str, PoseEstimator], samples: Iterable[Sample], num_pictures: int = 12
-) -> tuple[list[Report], list[Tile]]:
-    """Run estimators over the same images at native resolution.
+    methods: Mapping[str, Method], samples: Iterable[Sample], num_pictures: int = 12
+) -> Measured:
+    """Run methods over the same images at native resolution.
 
     Args:
-        estimators: By name, the baseline first where there is one.
+        methods: By name, the baseline first where there is one.
         samples: The test set.
         num_pictures: How many of the first images are drawn.
 
     Returns:
-        A report per estimator, and pictures with the truth in green and the predictions in yellow;
-        of two estimators, the first in blue (paper Fig. 14).
+        A report per method, and pictures with the truth in green, the last method's predictions in
+        yellow and those of the methods before it in blue (paper Fig. 14).
     """
-    colours = [YELLOW] if len(estimators) == 1 else [BLUE, YELLOW]
     # One process measures alone: after a distributed training the others have ended.
     metrics = {
-        name: PoseMetrics(one.parts, name, sync_on_compute=False)
-        for name, one in estimators.items()
+        name: PoseMetrics(method.parts, name, sync_on_compute=False)
+        for name, method in methods.items()
     }
-    times: dict[str, list[float]] = {name: [] for name in estimators}
-    tiles: list[Tile] = []
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    measured = Measured([], [], {name: [] for name in methods})
     num_images = 0
-    for sample in samples:
+    for index, sample in enumerate(samples):
         num_images += 1
+        image = image_id(sample, index)
         wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
-        for (name, estimator), colour in zip(estimators.items(), colours, strict=True):
-            start = time.perf_counter()
-            detections = estimator.predict(sample.image, sample.K)
-            times[name].append(1000 * (time.perf_counter() - start))
-            metrics[name].update(detections, sample.instances)
-            wireframes += [Wireframe(one.keypoints, colour, name) for one in detections]
-        if len(tiles) < num_pictures:
-            tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
-    reports = [
+        for number, (name, method) in enumerate(methods.items()):
+            poses, taken = method.detect(sample, image)
+            seconds[name] += [] if taken is None else [taken]
+            metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
+            colour = BLUE if number < len(methods) - 1 else YELLOW
+            wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
+        if len(measured.tiles) < num_pictures:
+            measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
+    measured.reports = [
         Report(
             name,
             metrics[name].compute(),
             metrics[name].references(),
-            {part.name: metrics[name].errors(part.name) for part in estimator.parts},
-            cost_of(estimator, times[name]),
+            {part.name: metrics[name].errors(part.name) for part in method.parts},
+            method.cost(seconds[name]),
             num_images,
         )
-        for name, estimator in estimators.items()
+        for name, method in methods.items()
     ]
-    return reports, tiles
-
-
-def cost_of(estimator: PoseEstimator, times_ms: Sequence[float] = ()) -> Cost:
-    """Count a network's parameters and operations, and take the median of its timed frames."""
-    parameters, gmacs = network_cost(estimator.network, estimator.checkpoint.input_size)
-    timed = times_ms[_WARM_UP_FRAMES:] or times_ms
-    return Cost(parameters, gmacs, statistics.median(timed) if timed else None)
+    return measured
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:

@@ -63,6 +63,25 @@ def build_test_source(data: Mapping[str, Any], parts: Sequence[Part], seed: int)
     return _held_out_source(data, parts, seed, "test")
 
 
+def build_validation_source(
+    data: Mapping[str, Any], parts: Sequence[Part], seed: int
+) -> DescribedSource:
+    """Build the validation images alone, at their native resolution."""
+    return _held_out_source(data, parts, seed, "val")
+
+
+def build_source_without_objects(
+    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split, num_images: int
+) -> DescribedSource:
+    """Render what the network must be silent on: backgrounds, distractors and look-alike parts.
+
+    They are the scenes of the validation or the test range, without the objects.
+    """
+    scene = {**(data["virtual"]["scene"] or {}), "targets_per_image": [0, 0]}
+    empty = {**data, "virtual": {**data["virtual"], "scene": scene}, f"num_{split}": num_images}
+    return held_out_renders(empty, parts, seed, split)
+
+
 def _train_source(
     data: Mapping[str, Any],
     parts: Sequence[Part],

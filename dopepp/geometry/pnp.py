@@ -7,6 +7,7 @@ and checks that no returned pose is NaN, behind the camera or at a wild distance
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,9 +18,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from dopepp.compiled import Array, compiled
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.refine import GATE, NO_GATE, Correspondences, Poses, refine
-from dopepp.geometry.rotation import is_rotation, rotation_vector_to_matrix
 
 MIN_POINTS: Final = 4
 
@@ -38,6 +39,12 @@ LARGEST: Final = 1e9
 
 MAX_TANGENT: Final = 1000.0
 """Distance from the principal point in focal lengths: 89.9° off the axis, where no pixel is."""
+
+ROTATION_TOLERANCE: Final = 1e-6
+"""Error of a rotation matrix's entries that refinement may leave."""
+
+SAME_PIXEL: Final = 1e-3
+"""Pixels by which two positions must differ to be two."""
 
 PLATE: Final = 0.3
 """Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
@@ -130,8 +137,8 @@ def _inverse_root(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "
 
 def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     K = np.asarray(K, np.float64)
-    proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and bool((K[2] == (0, 0, 1)).all())
-    if not proper or np.linalg.det(K) == 0:
+    proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and K[2].tolist() == [0, 0, 1]
+    if not proper or K[0, 0] * K[1, 1] == K[0, 1] * K[1, 0]:
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
     return K
 
@@ -149,12 +156,13 @@ def _solve(
     reason = _degenerate(object_points, rays @ to_px.T, sigma)
     if reason:
         return replace(nothing, reason=reason)
-    centre, size = object_points.mean(0), float(np.linalg.norm(np.ptp(object_points, axis=0)))
+    centre = object_points.mean(0)
+    size = math.hypot(*(object_points.max(0) - object_points.min(0)).tolist())
     points = Correspondences((object_points - centre) / size, rays, whitening @ to_px)
     poses = _best_first(points)
     if not len(poses):
         return replace(nothing, reason="no start led to a pose in front of the camera")
-    agree = np.linalg.norm(points.residuals(poses[:1])[0], axis=-1) <= GATE
+    agree = _agreeing(points, poses)
     if agree.sum() < MIN_POINTS:
         reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
         return replace(nothing, reason=reason)
@@ -162,8 +170,9 @@ def _solve(
     best = refine(points[agree], poses[:1], NO_GATE)
     rotation, translation = best.rotations[0], best.translations[0]
     T = make_transform(rotation, size * translation - rotation @ centre)
-    off = np.linalg.solve(whitening[agree], points[agree].residuals(best)[0, :, :, None])
-    error = float(np.sqrt(np.mean((off**2).sum((1, 2)))))
+    moved = points.object_points[agree] @ rotation.T + translation
+    off = (moved[:, :2] / moved[:, 2:] - rays[agree]) @ to_px.T
+    error = math.sqrt(float((off**2).sum()) / len(off))
     return PnPResult(
         T, error, agree, covariance=_covariance(points[agree], best, size, rotation @ centre)
     )
@@ -182,11 +191,20 @@ def _covariance(
         size: Metres per unit of the points.
         centre: Origin to centre in camera axes, metres.
     """
+    return np.asarray(_carried(points.information(pose), size, centre))
+
+
+@compiled()
+def _carried(information: Array, size: float, centre: Array) -> Array:
+    """See :func:`_covariance`."""
     carry = np.zeros((6, 6))
-    carry[:3, :3], carry[3:, 3:] = np.eye(3), size * np.eye(3)
-    carry[3:, :3] = np.cross(np.eye(3), centre)
+    for k in range(3):
+        carry[k, k], carry[3 + k, k + 3] = 1.0, size
+    carry[3, 1], carry[3, 2] = -centre[2], centre[1]
+    carry[4, 0], carry[4, 2] = centre[2], -centre[0]
+    carry[5, 0], carry[5, 1] = -centre[1], centre[0]
     # Four points that agree but lie on a line leave a direction open: its variance is huge.
-    return np.asarray(carry @ np.linalg.pinv(points.information(pose), rcond=1e-15) @ carry.T)
+    return carry @ np.linalg.pinv(information, 1e-15) @ carry.T
 
 
 def _degenerate(
@@ -197,21 +215,52 @@ def _degenerate(
     """Say why these points cannot fix a pose, or return an empty string."""
     if len(object_points) < MIN_POINTS:
         return f"only {len(object_points)} usable points, {MIN_POINTS} are needed"
-    extent = float(np.ptp(object_points, axis=0).max())
+    extent, length, breadth, distinct, image_length, image_breadth, noise = _spreads(
+        object_points, image_points, sigma
+    )
     if not SMALLEST < extent < LARGEST:
         return f"the object points extend over {extent:.3g} m"
-    spread = np.linalg.svd((object_points - object_points.mean(0)) / extent, compute_uv=False)
-    if spread[1] < 1e-6 * spread[0]:
+    if breadth < 1e-6 * length:
         return "the object points lie on one line"
-    distinct = len({(x, y) for x, y in np.round(image_points, 3).tolist()})
     if distinct < MIN_POINTS:
-        return f"only {distinct} distinct pixels, {MIN_POINTS} are needed"
-    spread = np.linalg.svd(image_points - image_points.mean(0), compute_uv=False)
-    if spread[1] < 1e-3 * spread[0]:
+        return f"only {int(distinct)} distinct pixels, {MIN_POINTS} are needed"
+    if image_breadth < 1e-3 * image_length:
         return "the pixels lie on one line"
-    if np.hypot(*spread) < np.median(sigma) * np.sqrt(len(image_points)):
+    if math.hypot(image_length, image_breadth) < noise * math.sqrt(len(image_points)):
         return "the pixels spread no wider than their own noise"
     return ""
+
+
+@compiled()
+def _spreads(
+    object_points: Array, image_points: Array, sigma: Array
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return how far points spread, for :func:`_degenerate`.
+
+    Returns:
+        The object's largest extent, metres, and its two largest singular values over that; the
+        number of pixels more than a thousandth apart, and the pixels' two singular values;
+        their median deviation.
+    """
+    n = len(object_points)
+    extent = 0.0
+    for axis in range(3):
+        extent = max(extent, np.ptp(object_points[:, axis]))
+    centred, spread = np.empty((n, 3)), np.empty((n, 2))
+    for axis in range(3):
+        values = object_points[:, axis]
+        centred[:, axis] = (values - values.mean()) / extent  # NaN for a single place
+    for axis in range(2):
+        spread[:, axis] = image_points[:, axis] - image_points[:, axis].mean()
+    distinct = 0.0
+    for i in range(n):
+        new = True
+        for j in range(i):
+            new &= np.abs(image_points[i] - image_points[j]).max() > SAME_PIXEL
+        distinct += new
+    solid = np.linalg.svd(centred, False)[1] if np.isfinite(centred).all() else np.zeros(3)
+    flat = np.linalg.svd(spread, False)[1] if np.isfinite(spread).all() else np.zeros(2)
+    return extent, solid[0], solid[1], distinct, flat[0], flat[1], np.median(sigma)
 
 
 def _best_first(points: Correspondences) -> Poses:
@@ -224,16 +273,23 @@ def _best_first(points: Correspondences) -> Poses:
     poses = Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
     for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
         starts = _sqpnp(points, list(combinations(range(count), left_out)))
-        starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]
+        if len(starts) > NUM_STARTS:
+            starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]
         if normal is not None:
             starts += _mirrored(starts, normal)
-        poses += refine(points, starts)
-        poses = poses[_plausible(points, poses)]
-        poses = poses[_truncated_cost(points, poses).argsort()]
-        distance = np.linalg.norm(points.residuals(poses[:1]), axis=-1)
-        if (distance <= GATE).sum() >= count - left_out:
+        refined = refine(points, starts)
+        poses += refined[_plausible(points, refined)]
+        if len(poses) > 1:
+            poses = poses[_truncated_cost(points, poses).argsort()]
+        if len(poses) and _agreeing(points, poses).sum() >= count - left_out:
             break
     return poses
+
+
+def _agreeing(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "n"]:
+    """Tell which points lie within the gate of the first pose."""
+    squared = points.residuals(poses[:1])[0] ** 2
+    return np.asarray(squared[:, 0] + squared[:, 1] <= GATE**2)
 
 
 def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, "s"]:
@@ -244,19 +300,42 @@ def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, 
 
 def _plausible(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "s"]:
     """Tell sound poses: rotations, all points in front of the camera, at a believable distance."""
-    depth = points.object_points @ poses.rotations[:, 2, :, None] + poses.translations[:, None, 2:]
-    near = np.linalg.norm(poses.translations, axis=-1) <= MAX_DISTANCE
-    proper = [is_rotation(rotation, tolerance=1e-6) for rotation in poses.rotations]
-    return np.asarray((depth > 0).all((1, 2)) & near & np.array(proper, bool))
+    sound = np.empty(len(poses), np.bool_)
+    for number in range(len(poses)):
+        sound[number] = _is_plausible(
+            points.object_points, poses.rotations[number], poses.translations[number]
+        )
+    return sound
+
+
+@compiled()
+def _is_plausible(object_points: Array, R: Array, t: Array) -> bool:
+    for i in range(len(object_points)):
+        x, y, z = object_points[i, 0], object_points[i, 1], object_points[i, 2]
+        if not R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] > 0.0:
+            return False
+    if not math.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2) <= MAX_DISTANCE:
+        return False
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        for k in range(3):
+            # A right-handed frame: each row is the cross product of the next two.
+            m, n = (k + 1) % 3, (k + 2) % 3
+            if not abs(R[b, m] * R[c, n] - R[b, n] * R[c, m] - R[a, k]) <= ROTATION_TOLERANCE:
+                return False
+    return True
 
 
 def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Poses:
     """Solve all points but some with OpenCV's SQPnP; NaN where it raises or finds no pose."""
-    solved = np.full((len(left_out), 2, 3), np.nan)
-    for pose, missing in zip(solved, left_out, strict=True):
+    rotations, translations = (
+        np.full((len(left_out), 3, 3), np.nan),
+        np.full((len(left_out), 3), np.nan),
+    )
+    for R, t, missing in zip(rotations, translations, left_out, strict=True):
         kept = [k for k in range(len(points.rays)) if k not in missing]
         with suppress(cv2.error):  # OpenCV 5 raises on coincident points
-            found, *vectors = cv2.solvePnP(
+            found, turn, move = cv2.solvePnP(
                 points.object_points[kept],
                 points.rays[kept],
                 _NO_CAMERA,
@@ -264,14 +343,26 @@ def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Pose
                 flags=cv2.SOLVEPNP_SQPNP,
             )
             if found:
-                pose[:] = np.hstack(vectors).T
-    return Poses(rotation_vector_to_matrix(solved[:, 0]), solved[:, 1])
+                R[:], t[:] = cv2.Rodrigues(turn)[0], move[:, 0]
+    return Poses(rotations, translations)
 
 
 def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """Return the unit normal of a plate; None for a thicker part, which has no second tilt."""
-    _, extents, axes = np.linalg.svd(object_points - object_points.mean(0))
+    extents, axes = _principal_axes(object_points)
     return np.asarray(axes[2]) if extents[2] < PLATE * extents[0] else None
+
+
+@compiled()
+def _principal_axes(points: Array) -> tuple[Array, Array]:
+    """Return the singular values of centred points and their axes, longest first."""
+    n = len(points)
+    # At least three rows give three axes.
+    centred = np.zeros((n, 3))
+    for axis in range(3):
+        centred[:, axis] = points[:, axis] - points[:, axis].mean()
+    _, extents, axes = np.linalg.svd(centred, False)
+    return extents, axes
 
 
 def _mirrored(poses: Poses, normal: Float[np.ndarray, "3"]) -> Poses:

@@ -135,7 +135,7 @@ def _refine(
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
     _normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
-        _solve(hessian, gradient, damping, step)
+        solve_damped(hessian, gradient, damping, step)
         _turn(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
@@ -235,7 +235,7 @@ def _normal_equations(
 
 
 @compiled()
-def _solve(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
+def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
     """Solve (H + damping) step = −gradient by Cholesky's factors.
 
     Scaled to a unit diagonal, rotations and translations of any size are damped alike.

@@ -4,12 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+
+MAX_FINITE: Final = 60
+"""Rotations of the icosahedron: the largest finite group that is no n-fold axis with its flips."""
+
+_SAME: Final = math.radians(10.0)
+"""Rotations closer than this are one: those of a 12-fold axis are 30° apart, measured ones err."""
+
+_AVERAGINGS: Final = 5
+"""The error is squared by each: 10° become less than 1e-15."""
+
+BALL_STEP: Final = 0.2
+"""Radians between neighbouring rotations of a ball, at least."""
+
+_PARALLEL: Final = 0.01
+"""Sine of the angle under which two axes are one, written down twice."""
 
 MAX_STEP = 0.01
 """How far a point may move between two steps of a continuous symmetry, in diameters (BOP)."""
@@ -29,6 +45,10 @@ def symmetry_group(
     diameter from the axis moves by at most ``max_step`` diameters, and every step is combined with
     every discrete symmetry.
 
+    Two axes that are not parallel make a ball of the part, which any rotation about their common
+    point maps onto itself. Steps of 0.01 would be ten million; so the steps are at least 0.2 rad,
+    about 10,000 rotations.
+
     Args:
         discrete: BOP-style rigid transforms without the identity, metres; None for none.
         continuous: BOP-style (axis, offset) pairs, metres.
@@ -42,21 +62,80 @@ def symmetry_group(
     group = np.eye(4)[None]
     if discrete is not None and len(discrete):
         group = np.concatenate([group, np.asarray(discrete, np.float64)])
-    for axis, offset in continuous:
-        steps = _turns(np.array(axis, np.float64), np.array(offset, np.float64), max_step)
-        group = (steps[None] @ group[:, None]).reshape(-1, 4, 4)
-    return group
-
-
-def _turns(
-    axis: Float[np.ndarray, "3"], offset: Float[np.ndarray, "3"], max_step: float
-) -> Float[np.ndarray, "steps 4 4"]:
-    """Return the turns about an axis, the identity first."""
-    length = float(np.linalg.norm(axis))
-    if not 0 < length < math.inf:
-        raise ValueError(f"an axis of symmetry must have a length, got {axis.tolist()}")
+    if not continuous:
+        return group
+    axes = np.array([_unit(axis) for axis, _ in continuous])
+    offset = np.array(continuous[0][1], np.float64)
+    if np.linalg.norm(np.cross(axes[0], axes), axis=1).max() > _PARALLEL:
+        return _with_centre(_rotations(max(2 * max_step, BALL_STEP)), offset)
     count = math.ceil(math.pi / max_step)
     angles = np.arange(count) * (2 * math.pi / count)
-    turns = rotation_vector_to_matrix(angles[:, None] * (axis / length))
-    turns[0] = np.eye(3)
-    return np.stack([make_transform(turn, offset - turn @ offset) for turn in turns])
+    turns = _with_centre(rotation_vector_to_matrix(angles[:, None] * axes[0]), offset)
+    return np.asarray((turns[None] @ group[:, None]).reshape(-1, 4, 4))
+
+
+def _unit(axis: Sequence[float]) -> Float[np.ndarray, "3"]:
+    length = float(np.linalg.norm(axis))
+    if not 0 < length < math.inf:
+        raise ValueError(f"an axis of symmetry must have a length, got {list(axis)}")
+    return np.array(axis, np.float64) / length
+
+
+def _with_centre(
+    rotations: Float[np.ndarray, "rotations 3 3"], centre: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "rotations 4 4"]:
+    """Return rotations about a point as transforms, the first exactly the identity."""
+    shifts = centre - rotations @ centre
+    transforms = [make_transform(*pair) for pair in zip(rotations, shifts, strict=True)]
+    transforms[0] = np.eye(4)
+    return np.stack(transforms)
+
+
+def _rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
+    """Return rotations about a step (radians) apart, the identity first.
+
+    Each takes z to one of a spiral of directions, after one of a circle of turns about z.
+    """
+    number = np.arange(math.ceil(4 * math.pi / step**2))
+    z = 1 - 2 * number / number[-1]  # the first is z itself
+    polar, around = np.arccos(z), np.pi * (3 - math.sqrt(5)) * number
+    tilt = np.stack([-np.sin(around), np.cos(around), np.zeros_like(z)], axis=1)
+    angles = np.arange(0, 2 * math.pi, 2 * math.pi / math.ceil(2 * math.pi / step))
+    turns = rotation_vector_to_matrix(angles[:, None] * np.array([0.0, 0.0, 1.0]))
+    tilts = rotation_vector_to_matrix(polar[:, None] * tilt)
+    return np.asarray((tilts[:, None] @ turns[None]).reshape(-1, 3, 3))
+
+
+def exact_group(
+    rotations: Float[np.ndarray, "generators 3 3"],
+) -> Float[np.ndarray, "group 3 3"] | None:
+    """Return the finite group that measured rotations generate, closed to rounding.
+
+    Products are added until there is none that is not within 10° of an element. Then each element
+    g is replaced by the mean of ρ(gh)·ρ(h)⁻¹ over all h, made a rotation again, which turns an
+    approximate homomorphism ρ into an exact one (Grove, Karcher, Ruh 1974).
+
+    Args:
+        rotations: Generators, each a few degrees off at most.
+
+    Returns:
+        The group, the identity first; None where it has more than 60 elements.
+    """
+    group = [np.eye(3)]
+    generators = [np.asarray(rotation, np.float64) for rotation in rotations]
+    for element in group:  # grows while it is gone through
+        for generator in generators:
+            product = generator @ element
+            if rotation_angle(product @ np.swapaxes(group, 1, 2)).min() > _SAME:
+                group.append(product)
+        if len(group) > MAX_FINITE:
+            return None
+    elements = np.array(group)
+    products = elements[:, None] @ elements[None]
+    away = rotation_angle(products[:, :, None] @ np.swapaxes(elements, 1, 2))
+    table = away.argmin(axis=2)
+    for _ in range(_AVERAGINGS):
+        left, _, right = np.linalg.svd((elements[table] @ np.swapaxes(elements, 1, 2)).mean(axis=1))
+        elements = left @ right
+    elements[0] = np.eye(3)
+    return np.asarray(elements)

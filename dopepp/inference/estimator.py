@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,11 +14,15 @@ from jaxtyping import Float, UInt8
 
 from dopepp.errors import UserError
 from dopepp.geometry.camera import Letterbox, check_camera, project_keypoints
+from dopepp.inference.depth_image import checked_depth, undistorted_depth
+from dopepp.inference.refine import DepthRefiner
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover
+
+_log = logging.getLogger(__name__)
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -31,11 +36,20 @@ class PoseEstimator:
         network: The trained network.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
+        refine: ``depth`` refines poses with the depth that :meth:`predict` is given; None does not.
+
+    Raises:
+        UserError: There is no such refinement, or its extra is not installed.
     """
 
     def __init__(
-        self, network: PoseNetwork, checkpoint: Checkpoint, device: str | torch.device = "cpu"
+        self,
+        network: PoseNetwork,
+        checkpoint: Checkpoint,
+        device: str | torch.device = "cpu",
+        refine: str | None = None,
     ) -> None:
+        self.refiner = _refiner(refine, checkpoint.parts)
         self.device = torch.device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.checkpoint = checkpoint
@@ -43,13 +57,16 @@ class PoseEstimator:
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     @classmethod
-    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> PoseEstimator:
-        """Load a checkpoint written by training.
+    def load(
+        cls, path: str | Path, device: str | torch.device = "cpu", refine: str | None = None
+    ) -> PoseEstimator:
+        """Load a checkpoint written by training; see the class for the options.
 
         Raises:
-            UserError: The file is missing, not a checkpoint, or not safe to load.
+            UserError: The file is missing, not a checkpoint, or not safe to load, or a refinement
+                is unknown or not installed.
         """
-        return cls(*load_network(Path(path)), device)
+        return cls(*load_network(Path(path)), device, refine)
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -61,6 +78,7 @@ class PoseEstimator:
         image: UInt8[np.ndarray, "height width 3"],
         K: Float[np.ndarray, "3 3"],
         distortion: Float[np.ndarray, "coefficients"] | None = None,
+        depth: Float[np.ndarray, "height width"] | None = None,
     ) -> list[Detection]:
         """Find all known objects on one image.
 
@@ -69,17 +87,25 @@ class PoseEstimator:
             K: Camera matrix in pixels of this image.
             distortion: OpenCV distortion coefficients; the image is undistorted first, with the
                 same K, and pixels of the result refer to the undistorted image.
+            depth: Metres along z, aligned to the image (and distorted as it is), 0 or NaN where
+                unknown; used where the estimator refines with depth. A refined detection has the
+                refined pose, its keypoints and, where there was one, its covariance; score, peaks
+                and reprojection error stay those of the image.
 
         Returns:
             Detections, best score first, in pixels of the given size and metres.
 
         Raises:
-            UserError: The image is no RGB picture, K cannot belong to it, or there is no lens model
-                with so many coefficients.
+            UserError: The image is no RGB picture, K cannot belong to it, there is no lens model
+                with so many coefficients, or the depth is not aligned or not in metres.
         """
         image, K = _checked(image, K)
+        if depth is not None:
+            depth = checked_depth(depth, (image.shape[1], image.shape[0]))
         if distortion is not None:
-            image = cv2.undistort(image, K, _checked_distortion(distortion))
+            coefficients = _checked_distortion(distortion)
+            image = cv2.undistort(image, K, coefficients)
+            depth = None if depth is None else undistorted_depth(depth, K, coefficients)
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
         belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
         found = recover(
@@ -92,7 +118,10 @@ class PoseEstimator:
             **vars(self.recovery),
         )
         cuboids = {part.name: part.cuboid for part in self.parts}
-        return [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
+        detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
+        if self.refiner is None or depth is None:
+            return detections
+        return [_refined(self.refiner, one, cuboids[one.object], depth, K) for one in detections]
 
     def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""
@@ -160,6 +189,35 @@ def _checked_distortion(
             "pass the camera's calibration, or None for an undistorted image",
         )
     return coefficients
+
+
+def _refiner(refine: str | None, parts: Sequence[Part]) -> DepthRefiner | None:
+    """Make what refines poses, by its name."""
+    if refine is None:
+        return None
+    if refine != "depth":
+        raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
+    return DepthRefiner(parts)
+
+
+def _refined(
+    refiner: DepthRefiner,
+    detection: Detection,
+    cuboid: Float[np.ndarray, "9 3"],
+    depth: Float[np.ndarray, "height width"],
+    K: Float[np.ndarray, "3 3"],
+) -> Detection:
+    """Refine a detection with depth, or keep it where depth is in doubt."""
+    refined = refiner.refine(detection.object, detection.T_cam_obj, depth, K, detection.covariance)
+    if refined.covariance is None:
+        _log.debug("%s keeps the image's pose: %s", detection.object, refined.reason)
+        return detection
+    return replace(
+        detection,
+        T_cam_obj=refined.T_cam_obj,
+        keypoints=project_keypoints(cuboid, refined.T_cam_obj, K),
+        covariance=refined.covariance,
+    )
 
 
 def _in_original(

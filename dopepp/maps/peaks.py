@@ -1,53 +1,60 @@
-"""Maps to peaks: batched local maxima with sub-cell positions."""
+"""Maps to peaks: batched local maxima with sub-cell positions, their covariances and vectors.
+
+Maxima are found where the maps are. Only they and the cells around them come to the host, in one
+transfer, to be fitted there (:mod:`dopepp.maps.gaussian`).
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.maps.encode import MapGeometry
+from dopepp.maps.gaussian import fit_peaks
 
-WINDOW: Final = 2
-"""Half-width of the neighbourhood a peak is fitted to, cells."""
+REACH: Final = 2.5
+"""Half-width of the neighbourhood a peak is fitted to, in standard deviations of a perfect peak:
+it shows the flanks of a clamped top; what lies beyond adds more noise than knowledge."""
 
-FLOOR: Final = 1e-6
-"""Belief below which a cell says nothing; a peak of σ = 0.5 on the border needs its third column,
-which is as low as e⁻¹²·⁵ = 4e-6."""
+HALF_WIDTHS: Final = (2, 4)
+"""Least and greatest half-width, cells: a fit needs 5×5 cells, and 9×9 determine any."""
 
 TIE_BREAK: Final = 1e-11
 """Weight of the neighbourhood's sum (at most 25) among equal cells: less than the 2e-9 by which
 float32 beliefs of the lowest useful threshold, 0.02, can differ."""
 
-MARGIN: Final = 3.0
-"""Squared cells by which a cell must be nearer to its peak than to another: both lie anywhere
-within their own cells. Of 1 to 4, 3 gave the smallest errors on pairs of peaks 3σ to 4σ apart."""
-
-_SPAN: Final = range(2 * WINDOW + 1)
-
-PLATEAU: Final = 3
-"""Cells as high as the peak's from which on its top is cut off; an exact tie of two is none."""
+_SPAN: Final = range(-2, 3)
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """The strongest local maxima of every channel, strongest first.
+    """The strongest local maxima of every channel, strongest first, on the host.
 
     Attributes:
-        position: (x, y) in input pixels.
-        score: Belief at the peak's cell.
-        spread_px: Standard deviation of the fitted Gaussian in x and y, input pixels.
+        position: (x, y) in input pixels; NaN where there is none.
+        score: Belief at the peak's cell; 0 where there is none.
+        covariance_px: Of the position, pixels²: the variance by which the peak is wider than a
+            perfect one, and that of the fit. A network trained with a proper loss returns the
+            target Gaussian blurred by its own uncertainty, so variances subtract.
+        toward: Mean of the field's vectors around a corner's peak; zeros for a centroid. A field
+            trained with squared error is the mean of unit vectors, so the more they spread, the
+            shorter it is.
         found: False where a channel has fewer peaks than slots.
     """
 
-    position: Float[Tensor, "batch channels peaks 2"]
-    score: Float[Tensor, "batch channels peaks"]
-    spread_px: Float[Tensor, "batch channels peaks 2"]
-    found: Bool[Tensor, "batch channels peaks"]
+    position: Float[np.ndarray, "batch channels peaks 2"]
+    score: Float[np.ndarray, "batch channels peaks"]
+    covariance_px: Float[np.ndarray, "batch channels peaks 2 2"]
+    toward: Float[np.ndarray, "batch channels peaks 2"]
+    found: Bool[np.ndarray, "batch channels peaks"]
 
 
 def find_peaks(
@@ -55,29 +62,34 @@ def find_peaks(
     geometry: MapGeometry,
     threshold: float = 0.05,
     max_peaks: int = 16,
+    field: Float[Tensor, "batch fields height width"] | None = None,
 ) -> Peaks:
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
     A peak is a cell not below its eight neighbours. Of equal cells, as on the flat top of a clamped
     belief, it is the one with the highest neighbourhood, which is the middle one; if these are
-    equal too, the first in raster order. Its position is that of the Gaussian fitted to its 5×5
-    neighbourhood. There are as many slots as the fullest channel needs.
+    equal too, the first in raster order. Its position is that of a Gaussian fitted around it.
+
+    Args:
+        belief: Belief maps; with a field, nine of each object.
+        geometry: Stride, peak width and disc radius.
+        threshold: Belief below which a maximum is no peak; above 0.
+        max_peaks: Slots of a channel.
+        field: 16 channels of each object; without it, peaks have no vectors.
     """
-    belief = belief.float()
+    belief = belief.detach().float()
     height, width = belief.shape[-2:]
     is_peak = _local_maxima(belief) & (belief > threshold) & torch.isfinite(belief)
-    count = min(max_peaks, height * width, int(is_peak.sum((-2, -1)).max()))
+    count = min(max_peaks, height * width)
     score, index = torch.where(is_peak, belief, -torch.inf).flatten(2).topk(count, dim=-1)
-    row, column = index // width, index % width
-    found = score > -torch.inf
-    offset, spread = _fit_gaussian(belief, row, column, found, geometry.sigma)
-    position = geometry.to_pixels(torch.stack([column, row], dim=-1) + offset)
-    return Peaks(
-        torch.where(found[..., None], position, torch.nan),
-        torch.where(found, score, 0.0),
-        spread * geometry.stride,
-        found,
-    )
+    half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
+    parts = [index[..., None].float(), score[..., None], _windows(belief, index, half)]
+    if field is not None:
+        disc = math.ceil(geometry.field_radius)
+        parts.append(_field_windows(field.detach().float(), index, disc))
+    # Indices are whole numbers below 2²⁴, which float32 holds.
+    table = torch.cat(parts, -1).cpu().numpy()
+    return _fit(table, width, half, geometry)
 
 
 def _local_maxima(
@@ -86,9 +98,11 @@ def _local_maxima(
     """Mark cells that are the highest of their 3×3 neighbourhood, one of every set of equals."""
     height, width = belief.shape[-2:]
     # A sum along one axis, then along the other: a fifth of `avg_pool2d`'s time.
-    around = functional.pad(belief, (WINDOW,) * 4)
-    around = sum((around[..., k : k + height, :] for k in _SPAN[1:]), around[..., :height, :])
-    around = sum((around[..., k : k + width] for k in _SPAN[1:]), around[..., :width])
+    around = functional.pad(belief, (2,) * 4)
+    around = sum(
+        (around[..., 2 + k : 2 + k + height, :] for k in _SPAN[1:]), around[..., :height, :]
+    )
+    around = sum((around[..., 2 + k : 2 + k + width] for k in _SPAN[1:]), around[..., :width])
     # Both numbers fit into one float64 key, so that one comparison orders them lexicographically.
     key = belief.double() + TIE_BREAK * around.double()
     padded = functional.pad(key, (1, 1, 1, 1), value=-torch.inf)
@@ -100,74 +114,54 @@ def _local_maxima(
     return highest
 
 
-def _fit_gaussian(
-    belief: Float[Tensor, "batch channels height width"],
-    row: Int[Tensor, "batch channels peaks"],
-    column: Int[Tensor, "batch channels peaks"],
-    found: Bool[Tensor, "batch channels peaks"],
-    sigma: float,
-) -> tuple[Float[Tensor, "batch channels peaks 2"], Float[Tensor, "batch channels peaks 2"]]:
-    """Fit log b = c + p·x + q·y − r·x² − s·y² around each peak, weighted by b².
-
-    The logarithm makes the fit linear and exact for a clean Gaussian, at the border too, where the
-    neighbourhood is cut; the weight b² undoes the noise amplification of the logarithm (Guo, IEEE
-    SPM 2011). Cells of a cut-off top say only "at least", and cells where another peak's Gaussian
-    is higher say nothing about this one: both are left out. A fit that is not a peak within its own
-    neighbourhood falls back to the middle of the highest cells.
-
-    Returns:
-        Offset from the peak's cell and standard deviation, (x, y) in cells.
-    """
-    height, width = belief.shape[-2:]
-    span = torch.arange(-WINDOW, WINDOW + 1, device=belief.device)
-    dy, dx = (grid.flatten() for grid in torch.meshgrid(span, span, indexing="ij"))
-    y, x = row[..., None] + dy, column[..., None] + dx
-    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    cells = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(2)
-    value = torch.where(inside, belief.flatten(2).gather(2, cells).view_as(inside), 0.0)
-    top = value[..., len(span) * WINDOW + WINDOW, None]
-
-    highest = inside & (value == top)
-    cut_off = highest & (highest.sum(-1, keepdim=True) >= PLATEAU)
-    own = _dominated(x, y, row, column, torch.where(found, top[..., 0], 0.0), sigma)
-    value = torch.where(own & ~cut_off & (value > FLOOR), value / top, 0.0)
-
-    design = torch.stack([torch.ones_like(dx), dx, dy, -(dx**2), -(dy**2)], -1).double()
-    weight = value.double() ** 2
-    logarithm = torch.where(value > 0, value.double(), 1.0).log()
-    weighted = weight[..., None] * design
-    normal = weighted.transpose(-1, -2) @ design
-    # The ridge only decides directions in which no neighbour is above the floor; `solve_ex` leaves
-    # a system that is singular in spite of it to the check below.
-    normal = normal + 1e-14 * torch.eye(5, dtype=torch.float64, device=belief.device)
-    right = (weighted * logarithm[..., None]).sum(-2)
-    solution = torch.linalg.solve_ex(normal, right[..., None])[0][..., 0]
-    slope, curvature = solution[..., 1:3], solution[..., 3:5]
-    offset = slope / (2 * curvature)
-    middle = (highest[..., None] * design[:, 1:3]).sum(-2) / highest.sum(-1, keepdim=True)
-    good = (curvature > 1e-3) & ((offset - middle).abs() <= 1.0)
-    offset = torch.where(good, offset, middle)
-    spread = torch.where(good, (2 * curvature.clamp(min=1e-3)).rsqrt(), float(WINDOW))
-    return offset.float(), spread.float()
+def _windows(
+    maps: Float[Tensor, "*channels height width"], index: Int[Tensor, "*channels peaks"], half: int
+) -> Float[Tensor, "*channels peaks cells"]:
+    """Read the cells around each index, row by row; NaN outside of the map."""
+    width = maps.shape[-1]
+    wide = width + 2 * half
+    padded = functional.pad(maps, (half,) * 4, value=torch.nan).flatten(-2)
+    span = torch.arange(2 * half + 1, device=maps.device)
+    around = (span[:, None] * wide + span).flatten()
+    first = index.div(width, rounding_mode="floor") * wide + index % width
+    cells = first[..., None] + around
+    return padded.gather(-1, cells.flatten(-2)).view(cells.shape)
 
 
-def _dominated(
-    x: Int[Tensor, "batch channels peaks cells"],
-    y: Int[Tensor, "batch channels peaks cells"],
-    row: Int[Tensor, "batch channels peaks"],
-    column: Int[Tensor, "batch channels peaks"],
-    score: Float[Tensor, "batch channels peaks"],
-    sigma: float,
-) -> Bool[Tensor, "batch channels peaks cells"]:
-    """Mark the cells of each peak's neighbourhood that no other peak of its channel reaches more.
+def _field_windows(
+    field: Float[Tensor, "batch fields height width"],
+    index: Int[Tensor, "batch channels peaks"],
+    half: int,
+) -> Float[Tensor, "batch channels peaks cells"]:
+    """Read the vectors around each peak, all x before all y; zeros for a centroid."""
+    batch, channels, count = index.shape
+    corners = index.view(batch, -1, NUM_KEYPOINTS, 1, count)[:, :, :NUM_CORNERS]
+    vectors = field.reshape(batch, -1, NUM_CORNERS, 2, *field.shape[-2:])
+    read = _windows(vectors, corners.expand(-1, -1, -1, 2, -1), half)
+    read = functional.pad(read.transpose(3, 4).flatten(-2), (0, 0, 0, 0, 0, 1))
+    return read.reshape(batch, channels, count, -1)
 
-    Of Gaussians s·exp(−d²/2σ²), of which a belief map is the maximum, the highest in a cell is the
-    one with the smallest d² − 2σ² log s.
-    """
-    squared = (x[..., None] - column[:, :, None, None]) ** 2
-    squared = squared + (y[..., None] - row[:, :, None, None]) ** 2
-    power = squared - 2 * sigma**2 * score.log()[:, :, None, None]
-    own = power.diagonal(dim1=2, dim2=4).transpose(-1, -2)
-    myself = torch.eye(row.shape[-1], dtype=torch.bool, device=row.device)[:, None]
-    others = power.masked_fill(myself, torch.inf)
-    return (own[..., None] + MARGIN < others).all(-1)
+
+def _fit(
+    table: Float[np.ndarray, "batch channels peaks columns"],
+    width: int,
+    half: int,
+    geometry: MapGeometry,
+) -> Peaks:
+    """Fit the peaks of every channel; see :func:`find_peaks` for the table's columns."""
+    slots = table.shape[:3]
+    found = table[..., 1] > -np.inf
+    position, covariance = np.full((*slots, 2), np.nan), np.full((*slots, 2, 2), np.nan)
+    toward = np.zeros((*slots, 2))
+    fit_peaks(
+        table.reshape(-1, *table.shape[2:]), width, half, geometry.sigma, geometry.field_radius,
+        position.reshape(-1, slots[2], 2), covariance.reshape(-1, slots[2], 2, 2),
+        toward.reshape(-1, slots[2], 2),
+    )  # fmt: skip
+    return Peaks(
+        position * geometry.stride + (geometry.stride - 1) / 2,
+        np.where(found, table[..., 1], 0.0).astype(np.float64),
+        covariance * geometry.stride**2,
+        toward,
+        found,
+    )

@@ -7,7 +7,7 @@ a new measure needs no new state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -20,57 +20,25 @@ from torchmetrics.utilities import dim_zero_cat
 
 from dopepp.drawing.curves import accuracy_figure
 from dopepp.errors import UserError
-from dopepp.geometry.camera import transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.functional import (
-    add,
-    add_s,
-    match,
-    rotation_error_deg,
-    translation_error,
-)
+from dopepp.metrics.assignment import Assignment, PredictedPose, TruePose, assign
+from dopepp.metrics.errors import PoseErrors, symmetries
+from dopepp.metrics.functional import BOP_MSPD_THRESHOLDS, average_precision, average_recall
 from dopepp.metrics.references import REFERENCES, reference_rows
 from dopepp.metrics.row import PoseRow, finite_median, mean_row, summarise
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
+
 MIN_VISIBLE_FRACTION: Final = 0.1
 """An instance counts when at least this share of its silhouette is visible."""
 
-_WIDTH: Final = 1 + 16 + 16
-"""One instance in the state: object index, T_est (NaN for a miss), T_gt."""
+CurveMeasure = Literal["add", "add_s", "mssd"]
+"""An error in metres, of which a curve can be drawn."""
 
-
-class PredictedPose(Protocol):
-    """What the accumulator reads of a detection."""
-
-    @property
-    def object(self) -> str:
-        """Name of the part."""
-
-    @property
-    def score(self) -> float:
-        """Confidence; a better one is matched first."""
-
-    @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
-        """Estimated pose, metres."""
-
-
-class TruePose(Protocol):
-    """What the accumulator reads of a ground-truth instance."""
-
-    @property
-    def label(self) -> str:
-        """Name of the part."""
-
-    @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
-        """True pose, metres."""
-
-    @property
-    def visible_fraction(self) -> float:
-        """Visible share of the full silhouette, in [0, 1]."""
+_WIDTH: Final = 1 + 16 + 16 + 9 + 1 + 1
+"""One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
+where unknown), score (NaN for a miss)."""
 
 
 class PoseMetrics(Metric):
@@ -91,7 +59,7 @@ class PoseMetrics(Metric):
     full_state_update = False
 
     poses: list[Tensor]
-    false_positives: Tensor
+    strays: list[Tensor]
 
     def __init__(self, parts: Sequence[Part], method: str = "estimate", **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -105,15 +73,28 @@ class PoseMetrics(Metric):
         self.set_dtype(torch.float64)
         # Flat, because torchmetrics lets a rank without images send an empty vector.
         self.add_state("poses", default=[], dist_reduce_fx="cat")
-        counts = torch.zeros(len(parts), dtype=torch.float64)
-        self.add_state("false_positives", default=counts, dist_reduce_fx="sum")
-        self._gathered: dict[str, _Errors] = {}
+        # Object index and score of every false positive.
+        self.add_state("strays", default=[], dist_reduce_fx="cat")
+        self._gathered: dict[str, _Gathered] = {}
 
-    def update(self, detections: Sequence[PredictedPose], instances: Sequence[TruePose]) -> None:
+    def update(
+        self,
+        detections: Sequence[PredictedPose],
+        instances: Sequence[TruePose],
+        K: Float[np.ndarray, "3 3"] | None = None,
+        width: float | None = None,
+    ) -> None:
         """Add one image.
+
+        Args:
+            detections: Of the scored parts.
+            instances: Ground truth.
+            K: The image's camera matrix, pixels; MSPD needs it of every image, and the width.
+            width: Width of the image, pixels.
 
         Raises:
             UserError: A detection's object is none of the parts.
+            ValueError: Only one of K and width is given, or one is impossible.
         """
         for detection in detections:
             if detection.object not in self.parts:
@@ -122,40 +103,56 @@ class PoseMetrics(Metric):
                     f"the scored parts {', '.join(self.parts)}",
                     "score it with a PoseMetrics that knows this part",
                 )
+        camera = _camera(K, width)
         for index, part in enumerate(self.parts.values()):
-            rows, num_false = _match_image(
+            assignment = assign(
                 part.cuboid[CENTROID],
                 [d for d in detections if d.object == part.name],
                 [i for i in instances if i.label == part.name],
+                MIN_VISIBLE_FRACTION,
             )
-            self.false_positives[index] += num_false
-            if len(rows):
-                state = np.insert(rows, 0, index, axis=1).ravel()
-                self.poses.append(torch.from_numpy(state).to(self.device))
+            self._keep(index, assignment, camera)
+
+    def _keep(self, index: int, found: Assignment, camera: Float[np.ndarray, "10"]) -> None:
+        """Add one object on one image to the state."""
+        n = len(found.T_gt)
+        if n:
+            columns = (
+                np.full((n, 1), index),
+                found.T_est.reshape(n, 16),
+                found.T_gt.reshape(n, 16),
+                np.tile(camera, (n, 1)),
+                found.scores[:, None],
+            )
+            self.poses.append(torch.from_numpy(np.hstack(columns).ravel()).to(self.device))
+        if len(found.stray_scores):
+            pairs = np.insert(found.stray_scores[:, None], 0, index, axis=1)
+            self.strays.append(torch.from_numpy(pairs.ravel()).to(self.device))
 
     def compute(self) -> dict[str, PoseRow]:
         """Return a row per object, then their :data:`MEAN`; see :mod:`dopepp.metrics.row`.
 
         An object without an instance that counts has None for everything but its counts.
         """
-        state = dim_zero_cat(self.poses) if len(self.poses) else torch.empty(0)
-        table = state.detach().cpu().double().reshape(-1, _WIDTH)
+        poses, strays = _table(self.poses, _WIDTH), _table(self.strays, 2)
         rows = {}
         for index, (name, part) in enumerate(self.parts.items()):
-            errors = _Errors.of(part, table[table[:, 0] == index, 1:])
-            self._gathered[name] = errors
-            rows[name] = errors.row(part, self.method, int(self.false_positives[index]))
+            gathered = _Gathered(
+                part, poses[poses[:, 0] == index, 1:], strays[strays[:, 0] == index, 1]
+            )
+            self._gathered[name] = gathered
+            rows[name] = gathered.row(part, self.method)
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
 
-    def errors(self, name: str) -> Float[np.ndarray, "instances"]:
-        """Return ADD of every instance of a part, metres, infinite where it was missed.
+    def errors(self, name: str, measure: CurveMeasure = "add") -> Float[np.ndarray, "instances"]:
+        """Return an error of every instance of a part, metres, infinite where it was missed.
 
         Like ``compute``, all ranks must call it, unless they have called ``compute`` since the
         last update.
         """
         self.compute()
-        return np.asarray(self._gathered[name].add.numpy())
+        return np.asarray(getattr(self._gathered[name].errors, measure).numpy())
 
     def references(self, seed: int = 0) -> dict[str, dict[str, PoseRow]]:
         """Return the reference rows on the instances seen: reference, then object or mean.
@@ -174,79 +171,70 @@ class PoseMetrics(Metric):
             table[reference][MEAN] = mean_row(rows, reference)
         return table
 
-    def plot(self) -> tuple[Figure, Axes]:
-        """Draw each object's ADD accuracy-threshold curve up to 0.1 m."""
-        curves = {name: self.errors(name) for name in self.parts}
+    def plot(self, measure: CurveMeasure = "add") -> tuple[Figure, Axes]:
+        """Draw each object's accuracy-threshold curve up to 0.1 m, of ADD or another error."""
+        curves = {name: self.errors(name, measure) for name in self.parts}
         figure = accuracy_figure(curves, title=self.method)
         return figure, figure.axes[0]
 
 
-class _Errors:
-    """Errors of all instances of one object, infinite where missed."""
+class _Gathered:
+    """All instances of one object, and the scores of its false positives."""
 
-    def __init__(self, part: Part, T_est: Tensor, T_gt: Tensor) -> None:
-        poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
-        points = torch.from_numpy(np.asarray(part.points, np.float64))
-        self.T_gt = T_gt
-        self.add = add(*poses, points)
-        self.add_s = add_s(*poses, points)
-        self.rotation_deg = rotation_error_deg(poses[0], poses[2])
-        self.translation = translation_error(poses[1], poses[3])
+    def __init__(
+        self, part: Part, table: Float[Tensor, "n 43"], strays: Float[Tensor, "strays"]
+    ) -> None:
+        T_est, T_gt, K, width, self.scores = torch.split(table, [16, 16, 9, 1, 1], dim=1)
+        self.T_gt, self.strays = T_gt.reshape(-1, 4, 4), strays
+        self.errors = PoseErrors.of(
+            part, T_est.reshape(-1, 4, 4), self.T_gt, K.reshape(-1, 3, 3), width[:, 0]
+        )
 
-    @classmethod
-    def of(cls, part: Part, table: Float[Tensor, "instances 32"]) -> _Errors:
-        return cls(part, *table.reshape(-1, 2, 4, 4).unbind(dim=1))
-
-    def row(self, part: Part, method: str, false_positives: int) -> PoseRow:
+    def row(self, part: Part, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""
-        if len(self.add) == 0:
-            return PoseRow(part.name, method, num_instances=0, false_positives=false_positives)
-        row = summarise(part.name, method, part.diameter, self.add, self.add_s, self.rotation_deg)
-        matched = int(self.add.isfinite().sum())
-        row.median_translation = finite_median(self.translation)
-        row.miss_rate = 1 - matched / len(self.add)
-        row.precision = matched / max(matched + false_positives, 1)
-        row.false_positives = false_positives
+        errors, num_false = self.errors, len(self.strays)
+        num_symmetries = len(symmetries(part))
+        if len(errors.add) == 0:
+            return PoseRow(
+                part.name, method, 0, false_positives=num_false, num_symmetries=num_symmetries
+            )
+        row = summarise(
+            part.name, method, part.diameter, errors.add, errors.add_s, errors.mssd,
+            errors.rotation_deg, errors.rotation_s_deg, num_symmetries,
+        )  # fmt: skip
+        matched = int(errors.add.isfinite().sum())
+        row.median_translation = finite_median(errors.translation)
+        row.miss_rate = 1 - matched / len(errors.add)
+        row.precision = matched / max(matched + num_false, 1)
+        row.false_positives = num_false
+        row.average_precision = self._average_precision(0.1 * part.diameter)
+        if errors.mspd is not None:
+            row.ar_mspd = average_recall(errors.mspd, BOP_MSPD_THRESHOLDS)
         return row
 
+    def _average_precision(self, threshold: float) -> float:
+        """Return AP with ADD below a threshold; of equal scores the wrong ones come first.
 
-def _match_image(
-    centre: Float[np.ndarray, "3"],
-    detections: Sequence[PredictedPose],
-    instances: Sequence[TruePose],
-) -> tuple[Float[np.ndarray, "counted 32"], int]:
-    """Match one object on one image.
-
-    Instances that count are matched first; predictions left over may then explain themselves by
-    instances that do not, and are ignored; the rest are false positives.
-
-    Returns:
-        T_est (NaN where missed) and T_gt of each instance that counts, and the false positives.
-    """
-    counted = [i for i in instances if i.visible_fraction >= MIN_VISIBLE_FRACTION]
-    hidden = [i for i in instances if not i.visible_fraction >= MIN_VISIBLE_FRACTION]
-    matches = _match(centre, detections, counted)
-    left = [d for d, instance in zip(detections, matches, strict=True) if instance < 0]
-    num_false = int((_match(centre, left, hidden) < 0).sum())
-    rows = np.full((len(counted), 2, 4, 4), np.nan)
-    for row, instance in zip(rows, counted, strict=True):
-        row[1] = instance.T_cam_obj
-    for detection, index in zip(detections, matches, strict=True):
-        if index >= 0:
-            rows[index, 0] = detection.T_cam_obj
-    return rows.reshape(-1, 32), num_false
+        So it depends neither on the order of images nor on which rank saw them.
+        """
+        right = self.errors.add < threshold
+        scores = self.scores[:, 0]
+        wrong = ~right & self.errors.add.isfinite()
+        ordered = torch.cat([self.strays, scores[wrong], scores[right]])
+        correct = torch.arange(len(ordered)) >= len(ordered) - int(right.sum())
+        return average_precision(ordered, correct, len(right))
 
 
-def _match(
-    centre: Float[np.ndarray, "3"],
-    detections: Sequence[PredictedPose],
-    instances: Sequence[TruePose],
-) -> Tensor:
-    """Match by the distance between the centres of the objects' cuboids."""
-    # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
-    estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
-    predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
-    true = [transform(np.asarray(i.T_cam_obj, np.float64), centre) for i in instances]
-    offsets = np.reshape(predicted, (-1, 1, 3)) - np.reshape(true, (1, -1, 3))
-    scores = torch.tensor([float(d.score) for d in detections], dtype=torch.float64)
-    return match(scores, torch.from_numpy(np.linalg.norm(offsets, axis=2)))
+def _table(state: list[Tensor], width: int) -> Float[Tensor, "rows columns"]:
+    flat = dim_zero_cat(state) if len(state) else torch.empty(0)
+    return flat.detach().cpu().double().reshape(-1, width)
+
+
+def _camera(K: Float[np.ndarray, "3 3"] | None, width: float | None) -> Float[np.ndarray, "10"]:
+    """Return K and the width in a row, NaN where they are not given."""
+    if K is None and width is None:
+        return np.full(10, np.nan)
+    K = np.asarray(np.nan if K is None else K, np.float64)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or width is None or not 0 < width < np.inf:
+        raise ValueError(f"K must be (3, 3), width positive, and both given, got {K} and {width}")
+    return np.append(K.ravel(), float(width))

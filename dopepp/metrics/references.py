@@ -5,7 +5,9 @@ range, and the one rotation that suits the test set best. Where a task's range o
 its pass rates are high for anybody; these rows say how high.
 
 Every measure here depends only on the rotation Q between the true and the guessed orientation,
-because the part is turned about its own centre (the cuboid's), so each row is a list of Qs.
+because the part is turned about its own centre (the cuboid's), so each row is a list of Qs. MSPD
+depends on the place in the image as well, and a guess has no score, so there is neither AR_MSPD nor
+average precision.
 
 To add a reference, write a function that returns its Qs and name it in :func:`reference_rows`.
 """
@@ -21,7 +23,8 @@ from torch import Tensor
 
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import random_rotation
-from dopepp.metrics.functional import add, add_s, pass_rate, rotation_error_deg
+from dopepp.metrics.errors import extreme_points, symmetries
+from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.row import PoseRow, summarise
 from dopepp.parts.part import Part
 
@@ -37,7 +40,7 @@ _NUM_DRAWS: Final = 2000
 _NUM_POINTS: Final = 500
 """ADD points of a guess: the mean of 500 of 2,000 distances is right to about 1 %."""
 _NUM_SURFACE_DRAWS: Final = 300
-"""Guesses whose ADD-S is taken, which needs all points and so costs far more than ADD."""
+"""Guesses whose ADD-S and symmetric errors are taken, which cost far more than ADD."""
 
 
 def reference_rows(
@@ -75,27 +78,31 @@ def reference_rows(
         if len(guess):
             rows[name] = _row(part, name, torch.from_numpy(guess), few_points, points)
         rows[name].num_instances = num_instances
+        rows[name].num_symmetries = len(symmetries(part))
     return rows
 
 
 def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -> PoseRow:
     """Measure guesses that are off by the rotations Q, (n, 3, 3), at the true position."""
     identity = torch.eye(3, dtype=torch.float64).expand_as(Q)
+    nowhere = Q.new_zeros(len(Q), 3)
     # Chance guesses are in random order (the first are a fair sample), constant ones all fit.
-    some = Q[:_NUM_SURFACE_DRAWS]
+    some = slice(_NUM_SURFACE_DRAWS)
+    about_centre = Q[some], nowhere[some], identity[some], nowhere[some]
+    # Symmetries are transforms of the object frame, whose origin may lie anywhere.
+    centre = torch.from_numpy(np.asarray(part.cuboid[CENTROID], np.float64))
+    turned = Q[some], centre - Q[some] @ centre, identity[some], nowhere[some]
+    group = symmetries(part)
     return summarise(
         part.name,
         name,
         part.diameter,
-        add=add(Q, Q.new_zeros(len(Q), 3), identity, Q.new_zeros(len(Q), 3), few_points),
-        add_s=add_s(
-            some,
-            some.new_zeros(len(some), 3),
-            identity[: len(some)],
-            some.new_zeros(len(some), 3),
-            points,
-        ),
+        add=add(Q, nowhere, identity, nowhere, few_points),
+        add_s=add_s(*about_centre, points),
+        mssd=mssd(*turned, extreme_points(part), group),
         rotation_deg=rotation_error_deg(Q, identity),
+        rotation_s_deg=rotation_error_deg(Q[some], identity[some], group),
+        num_symmetries=len(group),
     )
 
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.metrics.functional import auc, pass_rate
+from dopepp.metrics.functional import BOP_THRESHOLDS, auc, average_recall, pass_rate
 
 NOT_AVAILABLE: Final = "n/a"
 
@@ -40,6 +40,12 @@ class PoseRow:
         miss_rate: Share of instances without a matched prediction.
         precision: TP / (TP + FP); 0 without predictions.
         false_positives: Predictions matched with no instance.
+        average_precision: AP over the scores, with ADD below a tenth of the diameter right.
+        mssd_01d: Share with MSSD below a tenth of the diameter.
+        ar_mssd: BOP's average recall of MSSD.
+        ar_mspd: BOP's average recall of MSPD; None where an image's camera is not known.
+        median_rotation_s_deg: Over matched instances, the nearest symmetry's angle, degrees.
+        num_symmetries: Transforms that map the part onto itself, the identity among them.
     """
 
     object: str
@@ -56,6 +62,12 @@ class PoseRow:
     miss_rate: float | None = None
     precision: float | None = None
     false_positives: int | None = None
+    average_precision: float | None = None
+    mssd_01d: float | None = None
+    ar_mssd: float | None = None
+    ar_mspd: float | None = None
+    median_rotation_s_deg: float | None = None
+    num_symmetries: int = 1
 
     def to_record(self) -> dict[str, str | int | float | None]:
         """Return a plain dict that JSON can hold; ``PoseRow(**record)`` reads it back."""
@@ -75,12 +87,16 @@ class Column:
         heading: What stands above it, with the unit.
         scale: Factor from the stored unit to the shown one.
         decimals: Digits after the point.
+        group: Measures of one group stand together in a printed table.
+        symmetric: Whether it says something of its own only about a part with symmetries.
     """
 
     field: str
     heading: str
     scale: float = 1.0
     decimals: int = 0
+    group: str = ""
+    symmetric: bool = False
 
     def text(self, row: PoseRow) -> str:
         """Return the cell, ``n/a`` where the measure does not exist."""
@@ -92,17 +108,22 @@ class Column:
 
 COLUMNS: Final[tuple[Column, ...]] = (
     Column("num_instances", "instances"),
-    Column("add_01d", "ADD-0.1d %", 100, 1),
-    Column("pass_5cm", "ADD<5cm %", 100, 1),
-    Column("pass_10cm", "ADD<10cm %", 100, 1),
-    Column("auc_10cm", "AUC[0,10cm] %", 100, 1),
-    Column("add_s_01d", "ADD-S-0.1d %", 100, 1),
-    Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1),
-    Column("median_rotation_deg", "rotation °", 1, 1),
-    Column("median_translation", "translation mm", 1000, 1),
-    Column("miss_rate", "missed %", 100, 1),
-    Column("precision", "precision %", 100, 1),
-    Column("false_positives", "false pos."),
+    Column("add_01d", "ADD-0.1d %", 100, 1, "ADD"),
+    Column("pass_5cm", "ADD<5cm %", 100, 1, "ADD"),
+    Column("pass_10cm", "ADD<10cm %", 100, 1, "ADD"),
+    Column("auc_10cm", "AUC[0,10cm] %", 100, 1, "ADD"),
+    Column("add_s_01d", "ADD-S-0.1d %", 100, 1, "symmetry", symmetric=True),
+    Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1, "symmetry", symmetric=True),
+    Column("mssd_01d", "MSSD-0.1d %", 100, 1, "symmetry", symmetric=True),
+    Column("median_rotation_s_deg", "rotation-S °", 1, 1, "symmetry", symmetric=True),
+    Column("ar_mssd", "AR_MSSD %", 100, 1, "BOP"),
+    Column("ar_mspd", "AR_MSPD %", 100, 1, "BOP"),
+    Column("median_rotation_deg", "rotation °", 1, 1, "median"),
+    Column("median_translation", "translation mm", 1000, 1, "median"),
+    Column("miss_rate", "missed %", 100, 1, "detection"),
+    Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
+    Column("precision", "precision %", 100, 1, "detection"),
+    Column("false_positives", "false pos.", group="detection"),
 )
 """The measures of a table, in order; ``object`` and ``method`` name its rows."""
 
@@ -115,7 +136,10 @@ def summarise(
     diameter: float,
     add: Float[Tensor, "n"],
     add_s: Float[Tensor, "n"],
+    mssd: Float[Tensor, "n"],
     rotation_deg: Float[Tensor, "n"],
+    rotation_s_deg: Float[Tensor, "n"],
+    num_symmetries: int,
 ) -> PoseRow:
     """Fill the measures that follow from the errors of N >= 1 poses alone.
 
@@ -124,8 +148,11 @@ def summarise(
         method: What produced the poses.
         diameter: The part's diameter, metres.
         add: ADD of each pose, metres, infinite for a miss.
-        add_s: ADD-S of each pose, metres, infinite for a miss.
+        add_s: ADD-S, likewise.
+        mssd: MSSD, likewise.
         rotation_deg: Rotation error of each pose, degrees, infinite for a miss.
+        rotation_s_deg: That to the nearest symmetry, likewise.
+        num_symmetries: Transforms that map the part onto itself, the identity among them.
     """
     return PoseRow(
         object=name,
@@ -138,6 +165,10 @@ def summarise(
         add_s_01d=pass_rate(add_s, 0.1 * diameter),
         auc_s_10cm=auc(add_s, 0.1),
         median_rotation_deg=finite_median(rotation_deg),
+        mssd_01d=pass_rate(mssd, 0.1 * diameter),
+        ar_mssd=average_recall(mssd, [share * diameter for share in BOP_THRESHOLDS]),
+        median_rotation_s_deg=finite_median(rotation_s_deg),
+        num_symmetries=num_symmetries,
     )
 
 
@@ -153,14 +184,15 @@ def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:
     """Average each measure over the objects that have it and at least one instance.
 
     Counts are totals over all objects. An object without ground truth takes no part in the means.
+    The mean has symmetries where an object has.
     """
     mean = PoseRow(object="mean", method=method, num_instances=0)
+    mean.num_symmetries = max((row.num_symmetries for row in rows), default=1)
     for column in COLUMNS:
         counted = column.field in _TOTALS
         values = [getattr(row, column.field) for row in rows if counted or row.num_instances]
         known = torch.tensor([v for v in values if v is not None], dtype=torch.float64)
-        if counted:
-            setattr(mean, column.field, int(known.sum()))
-        elif len(known):
-            setattr(mean, column.field, float(known.mean()))
+        if len(known):
+            value = int(known.sum()) if counted else float(known.mean())
+            setattr(mean, column.field, value)
     return mean

@@ -35,8 +35,8 @@ class MapLoss(nn.Module, ABC):
         field: Float[Tensor, "batch 16*objects height width"],
         belief_target: Float[Tensor, "batch 9*objects height width"],
         field_target: Float[Tensor, "batch 16*objects height width"],
-    ) -> dict[str, Tensor]:
-        """Return one stage's weighted terms by name; the stage's loss is their sum."""
+    ) -> dict[str, Float[Tensor, "batch"]]:
+        """Return one stage's weighted terms of each image; the loss is the mean of their sums."""
 
     def forward(
         self,
@@ -49,6 +49,31 @@ class MapLoss(nn.Module, ABC):
         The terms are computed in float32 also under autocast: sums over exponentials lose their
         digits in 16 bits.
         """
+        terms = {
+            name: value.mean()
+            for name, value in self._summed(stages, belief_target, field_target).items()
+        }
+        total = torch.stack(list(terms.values())).sum()
+        return total, {name: value.detach() for name, value in terms.items()}
+
+    @torch.no_grad()
+    def per_image(
+        self,
+        stages: Sequence[Stage],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> Float[Tensor, "batch"]:
+        """Return each image's loss, to choose among targets that are equally right."""
+        terms = self._summed(stages, belief_target, field_target)
+        return torch.stack(list(terms.values())).sum(dim=0)
+
+    def _summed(
+        self,
+        stages: Sequence[Stage],
+        belief_target: Float[Tensor, "batch 9*objects height width"],
+        field_target: Float[Tensor, "batch 16*objects height width"],
+    ) -> dict[str, Float[Tensor, "batch"]]:
+        """Return the terms of each image, summed over the stages."""
         terms: dict[str, Tensor] = {}
         with torch.autocast(belief_target.device.type, enabled=False):
             for logits, field in stages:
@@ -57,8 +82,7 @@ class MapLoss(nn.Module, ABC):
                 )
                 for name, value in parts.items():
                     terms[name] = terms[name] + value if name in terms else value
-        total = torch.stack(list(terms.values())).sum()
-        return total, {name: value.detach() for name, value in terms.items()}
+        return terms
 
 
 class MapMSE(MapLoss):
@@ -72,11 +96,11 @@ class MapMSE(MapLoss):
         field: Float[Tensor, "batch 16*objects height width"],
         belief_target: Float[Tensor, "batch 9*objects height width"],
         field_target: Float[Tensor, "batch 16*objects height width"],
-    ) -> dict[str, Tensor]:
-        """Return one stage's ``belief`` and ``field`` terms."""
+    ) -> dict[str, Float[Tensor, "batch"]]:
+        """Return one stage's ``belief`` and ``field`` terms of each image."""
         return {
-            "belief": functional.mse_loss(logits, belief_target),
-            "field": functional.mse_loss(field, field_target),
+            "belief": (logits - belief_target).square().mean(dim=(1, 2, 3)),
+            "field": (field - field_target).square().mean(dim=(1, 2, 3)),
         }
 
 
@@ -124,8 +148,8 @@ class SpatialCrossEntropy(MapLoss):
         field: Float[Tensor, "batch 16*objects height width"],
         belief_target: Float[Tensor, "batch 9*objects height width"],
         field_target: Float[Tensor, "batch 16*objects height width"],
-    ) -> dict[str, Tensor]:
-        """Return one stage's ``where``, ``count`` and ``field`` terms."""
+    ) -> dict[str, Float[Tensor, "batch"]]:
+        """Return one stage's ``where``, ``count`` and ``field`` terms of each image."""
         z, g = logits.flatten(2), belief_target.flatten(2)
         # Unit of both terms: one Gaussian's mass; `count` is N and `log_total` log Λ in that unit.
         share = g / self.mass
@@ -138,8 +162,8 @@ class SpatialCrossEntropy(MapLoss):
         how_much = _capped_exp(log_total, count) - count + torch.xlogy(count, count)
         how_much = how_much - count * log_total
         return {
-            "where": where.mean(),
-            "count": self.count_weight * how_much.mean(),
+            "where": where.mean(dim=1),
+            "count": self.count_weight * how_much.mean(dim=1),
             "field": self.field_weight * _field_error(field, field_target),
         }
 
@@ -152,9 +176,13 @@ def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
 
 
 def _field_error(field: Tensor, target: Tensor) -> Tensor:
-    """Return the mean smooth-L1 distance of the vectors over the cells of all discs."""
+    """Return each image's smooth-L1 distance of the vectors inside the discs.
+
+    It is divided by the mean number of the discs' cells in an image, so that the mean over images
+    is the mean over all cells.
+    """
     corners = (field.shape[0], field.shape[1] // 2, 2, *field.shape[2:])
     field, target = field.view(corners), target.view(corners)
     inside = (target != 0).any(dim=2, keepdim=True)
     error = functional.smooth_l1_loss(field, target, reduction="none") * inside
-    return error.sum() / inside.sum().clamp(min=1)
+    return error.flatten(1).sum(dim=1) * len(field) / inside.sum().clamp(min=1)

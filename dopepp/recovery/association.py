@@ -2,30 +2,55 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
+from dopepp.compiled import Array, compiled
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.recovery.consensus import foretell
+
+LEAST_DEVIATION: Final = 0.05
+"""Radians by which even a clear vector may be off its centroid's direction."""
+
+POSITION_PX: Final = 1.0
+"""Error of a peak's and a centroid's positions, as far as it turns the direction between them."""
+
+LEAST_LENGTH: Final = 1e-3
+"""Of a mean vector; a shorter one has no direction."""
+
+PREDICTION_PX: Final = 4.0
+"""Deviation of a measured keypoint from where the other ones put it: half a cell of stride 8."""
 
 
 @dataclass(frozen=True)
-class ChannelPeaks:
-    """The peaks of one keypoint's channel.
+class ObjectPeaks:
+    """The peaks of one object's corners and its centroids.
 
     Attributes:
-        position: (x, y), input pixels.
-        score: Belief at the peak.
-        spread_px: Standard deviation of the fitted Gaussian, x and y, pixels.
-        toward: The field's vector at the peak, pointing to the centroid; zeros for a centroid.
+        position: (x, y) of corners 0–7, input pixels; NaN in slots without a peak.
+        score: Belief at the peak; 0 in slots without one.
+        covariance_px: Of the position, pixels².
+        toward: The field's mean vector at the peak, pointing to the centroid; the shorter, the
+            less certain its direction.
+        centroid: (x, y) of centroids.
+        centroid_score: Their beliefs.
+        centroid_covariance_px: Of their positions.
+        area_px: Of the maps, pixels².
     """
 
-    position: Float[np.ndarray, "peaks 2"]
-    score: Float[np.ndarray, "peaks"]
-    spread_px: Float[np.ndarray, "peaks 2"]
-    toward: Float[np.ndarray, "peaks 2"]
+    position: Float[np.ndarray, "8 peaks 2"]
+    score: Float[np.ndarray, "8 peaks"]
+    covariance_px: Float[np.ndarray, "8 peaks 2 2"]
+    toward: Float[np.ndarray, "8 peaks 2"]
+    centroid: Float[np.ndarray, "instances 2"]
+    centroid_score: Float[np.ndarray, "instances"]
+    centroid_covariance_px: Float[np.ndarray, "instances 2 2"]
+    area_px: float
 
 
 @dataclass(frozen=True)
@@ -34,57 +59,130 @@ class KeypointGroup:
 
     position: Float[np.ndarray, "9 2"]
     score: Float[np.ndarray, "9"]
-    spread_px: Float[np.ndarray, "9 2"]
+    covariance_px: Float[np.ndarray, "9 2 2"]
+
+
+def direction_evidence(
+    peaks: ObjectPeaks, max_angle: float, coincident_px: float
+) -> Float[np.ndarray, "instances 8 peaks"]:
+    """Say how much belief and direction speak for each corner peak to belong to each centroid.
+
+    The angle's likelihood is taken over that of any angle, so that a vector without a direction
+    speaks for nobody. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
+
+    Args:
+        peaks: Of one object.
+        max_angle: Largest angle at which a corner may belong to a centroid, radians.
+        coincident_px: A corner this close to the centroid has no direction; any angle will do.
+
+    Returns:
+        Log-likelihood ratios; −∞ where a pair is not allowed.
+    """
+    evidence = np.empty((len(peaks.centroid), *peaks.score.shape))
+    _direction_evidence(
+        peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score, max_angle,
+        coincident_px, evidence,
+    )  # fmt: skip
+    return evidence
+
+
+@compiled()
+def _direction_evidence(
+    position: Array,
+    score: Array,
+    toward: Array,
+    centroid: Array,
+    centroid_score: Array,
+    max_angle: float,
+    coincident_px: float,
+    evidence: Array,
+) -> None:
+    """Fill the evidence of every instance, corner and peak."""
+    evidence[:] = -math.inf
+    for i, k, m in np.ndindex(evidence.shape):
+        if not score[k, m] > 0.0:
+            continue
+        x, y = centroid[i, 0] - position[k, m, 0], centroid[i, 1] - position[k, m, 1]
+        u, v = toward[k, m, 0], toward[k, m, 1]
+        distance = math.hypot(x, y)
+        angle, length = abs(math.atan2(x * v - y * u, x * u + y * v)), math.hypot(u, v)
+        # A vector that is no number, as of a network that diverged, points nowhere.
+        if not (math.isfinite(angle) and length >= LEAST_LENGTH):
+            angle, length = math.pi, LEAST_LENGTH
+        variance = LEAST_DEVIATION**2 - 2 * math.log(min(length, 1.0))
+        variance += (POSITION_PX / max(distance, POSITION_PX)) ** 2
+        ratio = -(angle**2) / (2 * variance) - min(0.5 * math.log(variance / (2 * math.pi)), 0.0)
+        if distance < coincident_px:
+            ratio = max(ratio, 0.0)
+        elif angle > max_angle:
+            continue
+        evidence[i, k, m] = ratio + math.log(score[k, m]) + math.log(centroid_score[i])
+
+
+@compiled()
+def _gain(
+    evidence: Array,
+    position: Array,
+    covariance_px: Array,
+    expected: Array,
+    deviation: Array,
+    area_px: float,
+) -> Array:
+    """Add what the distance from the expected place says; 0 where all speaks against a pair.
+
+    It is the ratio of a Gaussian's density there to that of a peak anywhere on the maps. Without
+    an expectation the pair may be anywhere, which is what a ratio of 1 says.
+    """
+    gain = np.zeros(evidence.shape)
+    for i, k, m in np.ndindex(evidence.shape):
+        if not evidence[i, k, m] > -math.inf:
+            continue
+        value = evidence[i, k, m]
+        if math.isfinite(expected[i, k, 0]):
+            variance = deviation[i] ** 2
+            variance += 0.5 * (covariance_px[k, m, 0, 0] + covariance_px[k, m, 1, 1])
+            x, y = position[k, m, 0] - expected[i, k, 0], position[k, m, 1] - expected[i, k, 1]
+            value += math.log(area_px / (2 * math.pi * variance)) - (x * x + y * y) / (2 * variance)
+        if value > 0.0:
+            gain[i, k, m] = value
+    return gain
 
 
 def associate(
-    channels: list[ChannelPeaks], max_angle: float, coincident_px: float
+    peaks: ObjectPeaks,
+    evidence: Float[np.ndarray, "instances 8 peaks"],
+    expected: Float[np.ndarray, "instances 8 2"] | None = None,
 ) -> list[KeypointGroup]:
-    """Group the peaks of one object's nine channels into instances, one per centroid peak.
+    """Group peaks into instances, one per centroid.
 
-    Per corner, peaks are assigned to centroids one-to-one by the smallest total of squared angle
-    between the field's vector and the direction to the centroid, in units of ``max_angle``, minus
-    the logarithm of the belief: the negative log-likelihood of peak and direction together.
+    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: that of
+    belief and direction, and that of the distance from where the instance's other corners put it.
+    The latter binds the corners together. A peak that nothing speaks for stays alone.
 
     Args:
-        channels: Peaks of corners 0–7 and the centroid, in this order.
-        max_angle: Largest angle at which a corner may belong to a centroid, radians.
-        coincident_px: A corner this close to the centroid has no direction; any angle will do.
+        peaks: Of one object.
+        evidence: From :func:`direction_evidence`.
+        expected: Where poses found before put the corners, pixels; NaN for an instance without
+            a pose. Before there are any, triples of corners foretell the others.
     """
-    centroids = channels[CENTROID]
-    count = len(centroids.score)
+    deviation = np.full(len(evidence), PREDICTION_PX)
+    if expected is None:
+        expected, deviation = foretell(
+            peaks.position, evidence, peaks.centroid, PREDICTION_PX, peaks.area_px
+        )
+    gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)
+    count = len(evidence)
     position = np.full((count, NUM_KEYPOINTS, 2), np.nan)
-    spread = np.full((count, NUM_KEYPOINTS, 2), np.nan)
+    covariance = np.full((count, NUM_KEYPOINTS, 2, 2), np.nan)
     score = np.zeros((count, NUM_KEYPOINTS))
-    position[:, CENTROID] = centroids.position
-    spread[:, CENTROID] = centroids.spread_px
-    score[:, CENTROID] = centroids.score
+    position[:, CENTROID] = peaks.centroid
+    covariance[:, CENTROID] = peaks.centroid_covariance_px
+    score[:, CENTROID] = peaks.centroid_score
     for k in range(NUM_CORNERS):
-        for peak, instance in _assign(channels[k], centroids, max_angle, coincident_px):
-            position[instance, k] = channels[k].position[peak]
-            spread[instance, k] = channels[k].spread_px[peak]
-            score[instance, k] = channels[k].score[peak]
-    return [KeypointGroup(*group) for group in zip(position, score, spread, strict=True)]
-
-
-def _assign(
-    corners: ChannelPeaks, centroids: ChannelPeaks, max_angle: float, coincident_px: float
-) -> list[tuple[int, int]]:
-    """Pair one corner's peaks with centroids; (peak, centroid) indices."""
-    if not len(corners.score) or not len(centroids.score):
-        return []
-    offset = centroids.position[None] - corners.position[:, None]
-    distance = np.linalg.norm(offset, axis=-1)
-    cross = (
-        offset[..., 0] * corners.toward[:, None, 1] - offset[..., 1] * corners.toward[:, None, 0]
-    )
-    along = (offset * corners.toward[:, None]).sum(-1)
-    angle = np.abs(np.arctan2(cross, along))
-    # A vector that is no number, as of a network that diverged, points nowhere.
-    angle = np.where(distance < coincident_px, 0.0, np.where(np.isfinite(angle), angle, np.pi))
-    allowed = angle <= max_angle
-    cost = (angle / max_angle) ** 2 - np.log(corners.score)[:, None]
-    # A forbidden pair costs more than any set of allowed ones, so it never displaces one.
-    forbidden = 1.0 + 2 * np.abs(cost).sum()
-    pairs = zip(*linear_sum_assignment(np.where(allowed, cost, forbidden)), strict=True)
-    return [(int(i), int(j)) for i, j in pairs if allowed[i, j]]
+        instance, peak = linear_sum_assignment(gain[:, k], maximize=True)
+        wanted = gain[instance, k, peak] > 0
+        instance, peak = instance[wanted], peak[wanted]
+        position[instance, k] = peaks.position[k, peak]
+        covariance[instance, k] = peaks.covariance_px[k, peak]
+        score[instance, k] = peaks.score[k, peak]
+    return [KeypointGroup(*group) for group in zip(position, score, covariance, strict=True)]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
+from dopepp.compiled import Array, compiled
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.recovery.association import KeypointGroup
 
@@ -18,32 +20,44 @@ WIDENINGS: Final = (1.0, 2.0, 4.0)
 
 
 def solve_group(
-    group: KeypointGroup,
-    cuboid: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
-    target_sigma_px: float,
+    group: KeypointGroup, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
 ) -> PnPResult:
-    """Solve PnP with each keypoint's uncertainty read from the width of its peak.
+    """Solve PnP with each keypoint weighted by its own covariance.
 
-    A network trained with a proper loss returns the target Gaussian blurred by its own uncertainty,
-    so variances subtract. A network's maps are narrower than its errors; where fewer than two
-    thirds of the keypoints agree on a pose, the deviations are widened and the pose solved again.
+    A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
+    agree on a pose, the deviations are widened and the pose solved again.
 
     Args:
         group: The instance's keypoints.
         cuboid: The object's nine keypoints, metres.
         K: Camera matrix of the network's input, pixels.
-        target_sigma_px: Width of a perfect peak, pixels.
     """
-    excess = np.mean(group.spread_px**2, axis=1) - target_sigma_px**2
-    sigma = np.sqrt(np.maximum(excess, 0.0) + SIGMA_FLOOR_PX**2)
-    found = int(np.isfinite(sigma).sum())
+    covariance = _floored(group.covariance_px, SIGMA_FLOOR_PX**2)
+    found = int(np.isfinite(group.position[:, 0]).sum())
     best = None
     for widening in WIDENINGS:
-        result = solve_pnp(cuboid, group.position, K, sigma * widening)
+        result = solve_pnp(cuboid, group.position, K, covariance_px=covariance * widening**2)
         if best is None or result.inliers.sum() > best.inliers.sum():
             best = result
         if 3 * best.inliers.sum() >= 2 * found:
             break
     assert best is not None
     return best
+
+
+@compiled()
+def _floored(covariance: Array, floor: float) -> Array:
+    """Raise the variance along either principal axis to the floor; NaN stays NaN.
+
+    Of a symmetric Σ with eigenvalues λ, f(Σ) = αΣ + βI where αλ + β = f(λ) for both of them.
+    """
+    raised = covariance.copy()
+    for k in range(len(covariance)):
+        a, b, c = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 1, 1]
+        middle, radius = (a + c) / 2, math.hypot((a - c) / 2, b)
+        low, high = max(middle - radius, floor), max(middle + radius, floor)
+        alpha = (high - low) / (2 * radius) if radius > 0.0 else 0.0
+        raised[k] *= alpha
+        for axis in range(2):
+            raised[k, axis, axis] += (high + low) / 2 - alpha * middle
+    return raised

@@ -23,15 +23,21 @@ from torch.optim.lr_scheduler import LRScheduler
 from dopepp.data.batch import PADDING, Batch
 from dopepp.maps.encode import MapGeometry, encode
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
 from dopepp.training.loggers import MetricsTable
+from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
 
 OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
+Targets = tuple[
+    Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
+]
+"""Belief maps and vector fields as the network should give them."""
 
 _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
 """What torch's schedulers call how far they are; the rest of their state is the run's length."""
@@ -66,6 +72,7 @@ class PoseSystem(LightningModule):
             a constant learning rate.
         payload: The self-description stored in every checkpoint under ``dopepp``.
         compile_network: Whether to run the network through ``torch.compile``.
+        symmetry: How symmetric parts are learnt.
     """
 
     def __init__(
@@ -79,6 +86,7 @@ class PoseSystem(LightningModule):
         make_scheduler: SchedulerFactory | None = None,
         payload: Mapping[str, Any] | None = None,
         compile_network: bool = False,
+        symmetry: SymmetryOptions | None = None,
     ) -> None:
         super().__init__()
         # Convolutions on channels-last memory are faster on CPUs and tensor cores alike.
@@ -87,6 +95,7 @@ class PoseSystem(LightningModule):
         self.parts = tuple(parts)
         self.cuboids = np.stack([part.cuboid for part in parts])
         self.geometry, self.recovery = geometry, recovery
+        self.symmetry = SymmetryHandling(parts, symmetry or SymmetryOptions())
         self.make_optimizer, self.make_scheduler = make_optimizer, make_scheduler
         self.payload = dict(payload or {})
         # In place, so that parameter names stay those of the plain network.
@@ -100,24 +109,47 @@ class PoseSystem(LightningModule):
         )
         return stages
 
-    def targets(
-        self, batch: Batch
-    ) -> tuple[
-        Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
-    ]:
+    def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
         """Draw the batch's target maps on its own device.
 
         What no metric counts, because it is hardly visible, is not asked of the network either.
+        Of poses of a symmetric part that look alike, one is drawn; where several are as good, the
+        one that the given maps are nearest to, instance by instance.
+
+        Args:
+            batch: Images and poses.
+            stages: What the network says; None takes the first of equally good poses.
         """
+        if not self.symmetry.active:
+            return self._draw(batch, batch.keypoints)
+        found = self.symmetry.equivalents(batch)
+        keypoints = found.keypoints[:, :, 0].clone()
+        for slot, choice in found.allowed[:, :, 1:].any(dim=0).nonzero().tolist():
+            if stages is None:
+                break
+            rows = found.allowed[:, slot, 1 + choice].nonzero()[:, 0]
+            some, maps = (
+                batch.rows(rows),
+                [(z[rows].detach(), field[rows].detach()) for z, field in stages],
+            )
+            other = keypoints[rows]
+            other[:, slot] = found.keypoints[rows, slot, 1 + choice]
+            present = self.loss.per_image(maps, *self._draw(some, keypoints[rows]))
+            better = self.loss.per_image(maps, *self._draw(some, other)) < present
+            keypoints[rows] = torch.where(better[:, None, None, None], other, keypoints[rows])
+        return self._draw(batch, keypoints)
+
+    def _draw(self, batch: Batch, keypoints: Float[Tensor, "batch instances 9 2"]) -> Targets:
         height, width = batch.images.shape[-2:]
         map_size = height // self.geometry.stride, width // self.geometry.stride
         seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
         index = torch.where(seen, batch.object_index, PADDING)
-        return encode(batch.keypoints, index, len(self.parts), map_size, self.geometry)
+        return encode(keypoints, index, len(self.parts), map_size, self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss and log it with its terms."""
-        loss, terms = self.loss(self(batch.images), *self.targets(batch))
+        stages = self(batch.images)
+        loss, terms = self.loss(stages, *self.targets(batch, stages))
         size = len(batch)
         self.log("train/loss", loss.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
@@ -128,7 +160,7 @@ class PoseSystem(LightningModule):
     ) -> ValidationOutput:
         """Log the loss and hand the maps to the callbacks."""
         stages = self(batch.images)
-        loss, _ = self.loss(stages, *self.targets(batch))
+        loss, _ = self.loss(stages, *self.targets(batch, stages))
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch), sync_dist=True)
         logits, field = stages[-1]
         return ValidationOutput(loss, self.network.activate(logits.float()), field.float())

@@ -281,3 +281,46 @@ def test_an_unknown_name_of_the_package() -> None:
 
     with pytest.raises(AttributeError, match="PoseEstimater"):
         _ = dopepp.PoseEstimater
+
+
+def test_refines_with_depth_where_it_is_given(tmp_path: Path) -> None:
+    pytest.importorskip("small_gicp")
+    from dopepp.parts.builtin import pivconnector, servoholder
+    from dopepp.virtual import Scene, SceneObject, make_surface, render
+
+    checkpoint = Checkpoint(
+        SPEC, build_network(SPEC).state_dict(), [servoholder(), pivconnector()], (416, 416), 8, 1.5
+    )
+    path = tmp_path / "parts.ckpt"
+    write_atomic(checkpoint.to_file(), path)
+    T = make_transform(random_rotation(np.random.default_rng(3)), np.array([0.01, 0.0, 0.4]))
+    off = T.copy()
+    off[2, 3] += 0.012
+    mesh = servoholder().mesh
+    assert mesh is not None
+    picture = image(640, 480)
+    scene = Scene(K_VGA, picture, (SceneObject(make_surface(mesh), T),))
+    depth = render(scene).depth
+    errors = []
+    for refine in (None, "depth"):
+        estimator = Oracle.load(path, refine=refine)
+        estimator.show((640, 480), K_VGA, [(0, off)])  # type: ignore[attr-defined]
+        found = estimator.predict(picture, K_VGA, depth=depth)[0]
+        assert_array_equal(
+            found.keypoints, project_keypoints(estimator.cuboids[0], found.T_cam_obj, K_VGA)
+        )
+        errors.append(np.linalg.norm(found.T_cam_obj[:3, 3] - T[:3, 3]))
+        alone = estimator.predict(picture, K_VGA)[0]
+        assert abs(np.linalg.norm(alone.T_cam_obj[:3, 3] - off[:3, 3])) < 0.004
+    assert errors[1] < 0.002 < 0.009 < errors[0]
+
+
+def test_says_what_is_wrong_with_refinement_and_depth(
+    estimator: PoseEstimator, checkpoint_path: Path
+) -> None:
+    with pytest.raises(UserError, match=r"refine='icp'.*depth, or None"):
+        PoseEstimator.load(checkpoint_path, refine="icp")
+    with pytest.raises(UserError, match="depth of type uint16"):
+        estimator.predict(
+            image(64, 48), camera_matrix(60, 60, 31, 23), depth=np.ones((48, 64), np.uint16)
+        )

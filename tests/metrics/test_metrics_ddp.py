@@ -36,7 +36,9 @@ class Detection:
 def metric() -> PoseMetrics:
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (100, 3)) * [1, 0.6, 0.2]
     cuboid = cuboid_keypoints(points.min(0), points.max(0))
-    return PoseMetrics([Part("box", cuboid, 0.12, points), Part("none", cuboid, 0.12, points)])
+    turning = (((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),)
+    box = Part("box", cuboid, 0.12, points, symmetries_continuous=turning)
+    return PoseMetrics([box, Part("none", cuboid, 0.12, points)])
 
 
 def feed(target: PoseMetrics, images: range) -> None:
@@ -48,8 +50,11 @@ def feed(target: PoseMetrics, images: range) -> None:
         T[:3, 3] = rng.normal([0, 0, 1], 0.1)
         E = T.copy()
         E[:3, 3] += rng.normal(0, 0.01, 3)
-        detections = [] if i % 3 == 0 else [Detection("box", 0.5, E)] * (1 + i % 2)
-        target.update(detections, [Instance("box", T, np.zeros((9, 2)))])
+        # Two scores only, so that ties run across the ranks.
+        found = Detection("box", 0.5 + 0.1 * (i % 2), E)
+        detections = [] if i % 3 == 0 else [found] * (1 + i % 2)
+        K = np.array([[500.0 + i, 0, 320], [0, 500, 240], [0, 0, 1]])
+        target.update(detections, [Instance("box", T, np.zeros((9, 2)))], K, 640 + 10 * i)
 
 
 def summary(source: PoseMetrics) -> dict[str, object]:
@@ -98,7 +103,11 @@ def test_two_processes_give_the_numbers_of_one(split: str, tmp_path: Path) -> No
     alone = metric()
     feed(alone, range(NUM_IMAGES))
     expected = json.loads(json.dumps(summary(alone)))
-    assert expected["rows"]["box"]["num_instances"] == NUM_IMAGES
+    box = expected["rows"]["box"]
+    assert box["num_instances"] == NUM_IMAGES
+    assert box["false_positives"] == 4  # images 1, 5, 7 and 11
+    for measure in ("ar_mssd", "ar_mspd", "average_precision", "mssd_01d"):
+        assert 0 < box[measure] < 1
     for rank in range(2):
         result = json.loads((tmp_path / f"{rank}.json").read_text())
         assert result["errors"] == expected["errors"]

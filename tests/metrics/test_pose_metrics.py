@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -17,10 +17,18 @@ from scipy.spatial.transform import Rotation
 from dopepp.data.sample import Instance
 from dopepp.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.metrics.functional import add, add_s, auc, pass_rate
+from dopepp.metrics.functional import (
+    add,
+    add_s,
+    auc,
+    mspd,
+    mssd,
+    pass_rate,
+    rotation_error_deg,
+)
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 
 Array = NDArray[np.float64]
 
@@ -169,6 +177,11 @@ def test_all_missed_gives_zero_and_no_nan() -> None:
         miss_rate=1.0,
         precision=0.0,
         false_positives=0,
+        average_precision=0.0,
+        mssd_01d=0.0,
+        ar_mssd=0.0,
+        ar_mspd=None,
+        median_rotation_s_deg=None,
     )
 
 
@@ -234,6 +247,99 @@ def test_references_use_the_instances_that_count() -> None:
         assert rows[MEAN].add_01d == rows["a"].add_01d
 
 
+K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+
+
+def test_bops_recalls_agree_with_the_functions() -> None:
+    rng = np.random.default_rng(3)
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned[:3, 3] = [0.002, 0.0, 0.0]
+    box = replace(part("box"), symmetries_discrete=turned[None])
+    metric = PoseMetrics([box])
+    errors: list[tuple[float, float, float]] = []
+    points = torch.from_numpy(box.points)
+    group = torch.from_numpy(np.stack([np.eye(4), turned]))
+    for number in range(30):
+        width = 640 if number % 2 else 1280
+        camera = np.diag([width / 640, width / 640, 1.0]) @ K
+        T = pose(rng.normal(0, 0.05), tuple(rng.normal(size=3)))
+        E = (T @ turned if number % 3 else T).copy()
+        E[:3, 3] += rng.normal(0, 0.01, 3)
+        metric.update([Detection("box", 0.9, E)], [truth("box", T)], camera, width)
+        est, gt = torch.from_numpy(E)[None], torch.from_numpy(T)[None]
+        split = est[:, :3, :3], est[:, :3, 3], gt[:, :3, :3], gt[:, :3, 3]
+        pixels = mspd(*split, points, torch.from_numpy(camera), group) / (width / 640)
+        angle = rotation_error_deg(split[0], split[2], group)
+        errors.append((float(mssd(*split, points, group)), float(pixels), float(angle)))
+    surface, image, angles = np.array(errors).T
+    shares, steps = np.arange(1, 11) * 0.05, np.arange(1, 11) * 5.0
+    row = metric.compute()["box"]
+    assert row.mssd_01d == (surface < 0.012).mean()
+    assert row.ar_mssd == pytest.approx(np.mean([(surface < s * 0.12).mean() for s in shares]))
+    assert row.ar_mspd == pytest.approx(np.mean([(image < s).mean() for s in steps]))
+    assert row.median_rotation_s_deg == pytest.approx(np.median(angles), abs=1e-6)
+    assert 0 < row.ar_mspd < 1  # type: ignore[operator]
+    assert row.median_rotation_s_deg < 1e-5 < 100 < row.median_rotation_deg  # type: ignore[operator]
+    assert row.num_symmetries == metric.compute()[MEAN].num_symmetries == 2
+    assert metric.errors("box", "mssd") == pytest.approx(surface)
+
+
+def test_the_corners_of_the_mesh_count_where_there_is_one() -> None:
+    vertices = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0]])
+    box = replace(part("box"), mesh=Mesh(vertices, np.array([[0, 1, 2]], np.int32)))
+    metric = PoseMetrics([box])
+    metric.update([Detection("box", 1, pose(0, (0, 0, 0.2)))], [truth("box", pose())])
+    assert metric.errors("box", "mssd") == pytest.approx([2 * np.sin(0.1) * 0.1])
+
+
+def test_mspd_needs_every_camera() -> None:
+    metric = PoseMetrics([part("box")])
+    metric.update([Detection("box", 1, pose())], [truth("box", pose())], K, 640)
+    assert metric.compute()["box"].ar_mspd == 1
+    metric.update([Detection("box", 1, pose())], [truth("box", pose())])
+    assert metric.compute()["box"].ar_mspd is None
+    for camera, width in ((K, None), (None, 640), (K[:2], 640), (K * np.nan, 640), (K, 0)):
+        with pytest.raises(ValueError, match="K must be"):
+            metric.update([], [], camera, width)
+
+
+def test_average_precision_by_hand() -> None:
+    def run(found: list[tuple[float, float | None]], missed: int = 0) -> float | None:
+        """Give (score, error in metres, or None for a stray), a picture each."""
+        metric = PoseMetrics([part("box")])
+        for score, error in found:
+            instances = [] if error is None else [truth("box", pose())]
+            metric.update([Detection("box", score, pose(error or 0.0))], instances)
+        for _ in range(missed):
+            metric.update([], [truth("box", pose())])
+        return metric.compute()["box"].average_precision
+
+    assert run([(0.9, 0.0), (0.8, 0.0)]) == 1
+    # Half of the recall at precision 1; 51 of the 101 recalls are at most 0.5.
+    assert run([(0.9, 0.0)], missed=1) == pytest.approx(51 / 101)
+    # A pose off by more than 12 mm is wrong though matched, and so is a stray one before it.
+    assert run([(0.9, 0.013), (0.8, 0.0)]) == pytest.approx(51 / 101 * 0.5)
+    assert run([(0.9, None), (0.8, 0.0)]) == pytest.approx(0.5)
+    assert run([(0.8, 0.0), (0.7, None)]) == 1
+    assert run([(0.9, 0.0119)]) == 1
+    # Of equal scores the wrong one comes first, whatever the order of the images.
+    assert run([(0.5, 0.0), (0.5, None)]) == run([(0.5, None), (0.5, 0.0)]) == 0.5
+    assert run([(math.nan, 0.0), (0.1, None)]) == 0.5
+    assert run([], missed=2) == 0
+
+
+def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not() -> None:
+    metric = PoseMetrics([part("box")])
+    twice = [Detection("box", s, pose()) for s in (0.9, 0.8)]
+    metric.update(twice, [truth("box", pose())])
+    metric.update([Detection("box", 0.7, pose())], [truth("box", pose())])
+    # Right, wrong, right: precision 1 up to recall 0.5, then 2/3.
+    expected = (51 + 50 * 2 / 3) / 101
+    assert metric.compute()["box"].average_precision == pytest.approx(expected)
+    metric.update([Detection("box", 0.99, pose(0.3))], [truth("box", pose(0.3), 0.01)])
+    assert metric.compute()["box"].average_precision == pytest.approx(expected)
+
+
 def test_plot_shows_one_curve_per_object() -> None:
     metric = PoseMetrics([part("a"), part("b")], method="DOPE++")
     metric.update([Detection("a", 1, pose(0.05))], [truth("a", pose()), truth("b", pose())])
@@ -241,3 +347,5 @@ def test_plot_shows_one_curve_per_object() -> None:
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["a (AUC 50.0 %)", "b (AUC 0.0 %)"]
     assert figure.axes == [axes]
+    labels = [text.get_text() for text in metric.plot("mssd")[1].get_legend().get_texts()]
+    assert labels == ["a (AUC 50.0 %)", "b (AUC 0.0 %)"]

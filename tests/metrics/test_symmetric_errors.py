@@ -15,6 +15,7 @@ from torch import Tensor
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg
 from dopepp.metrics.functional.distances import compare_all_pairs
+from dopepp.metrics.functional.symmetric import _try_everything
 
 Array = NDArray[np.float64]
 K = np.array([[520.0, 0, 311], [0, 530, 252], [0, 0, 1]])
@@ -68,17 +69,43 @@ def test_mssd_and_mspd_are_their_formulas(seed: int, turns: int) -> None:
     np.testing.assert_allclose(mspd(*arguments, torch.from_numpy(K), symmetries), image, rtol=1e-9)
 
 
-def test_the_convex_hull_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = tensors(*poses(50, 0), cloud(2000))
-    group = torch.from_numpy(symmetry_group(half_turn()[None]))
-    whole = mssd(*arguments, group)
-    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 1)
-    np.testing.assert_allclose(mssd(*arguments, group), whole, rtol=1e-12)
-    flat = arguments[4] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 10**9)
-    expected = mssd(*arguments[:4], flat)
-    monkeypatch.setattr("dopepp.metrics.functional.distances._WORTH_A_HULL", 1)
-    np.testing.assert_array_equal(mssd(*arguments[:4], flat), expected)
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.sampled_from([1, 2, 8, 9, 200]),
+    axis=st.sampled_from([(0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]),
+    is_near=st.booleans(),
+)
+def test_leaving_symmetries_out_early_changes_nothing(
+    seed: int, count: int, axis: tuple[float, float, float], is_near: bool
+) -> None:
+    group = torch.from_numpy(symmetry_group(half_turn()[None], [(axis, (0.01, 0.0, 0.0))], 0.05))
+    R_est, t_est, R_gt, t_gt = tensors(*poses(6, seed))
+    if is_near:  # true up to a symmetry and a little: many symmetries come close to the best
+        some = group[torch.randint(len(group), (6,), generator=torch.Generator().manual_seed(seed))]
+        R_est, t_est = R_gt @ some[:, :3, :3], t_gt + (R_gt @ some[:, :3, 3:])[..., 0] + 1e-4
+    t_gt[5, 2] = 0.0  # some of its points are behind the camera
+    t_est[4] = torch.nan
+    points = torch.from_numpy(cloud(count, seed))
+    parts = group[:, :3, :3], group[:, :3, 3]
+    everything = _try_everything((R_est, t_est), (R_gt, t_gt), points, parts, False)
+    found = mssd(R_est, t_est, R_gt, t_gt, points, group)
+    np.testing.assert_allclose(found, everything, rtol=1e-9, atol=1e-15)
+    camera = torch.from_numpy(K)
+    images = [
+        (camera @ R, (camera @ t[..., None])[..., 0]) for R, t in ((R_est, t_est), (R_gt, t_gt))
+    ]
+    everything = _try_everything(images[0], images[1], points, parts, True)
+    found = mspd(R_est, t_est, R_gt, t_gt, points, camera, group)
+    np.testing.assert_allclose(found, everything, rtol=1e-9, atol=1e-9)
+    assert found[4] == torch.inf
+
+
+def test_mspd_ignores_the_last_row_of_k() -> None:
+    arguments = tensors(*poses(5, 0), cloud(20))
+    odd = torch.from_numpy(K).clone()
+    odd[2] = torch.tensor([0.1, 0.2, 2.0])
+    np.testing.assert_array_equal(mspd(*arguments, odd), mspd(*arguments, torch.from_numpy(K)))
 
 
 def test_a_symmetric_pose_has_no_error() -> None:

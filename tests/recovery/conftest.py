@@ -42,16 +42,20 @@ class Scene:
         )
         return belief[0], field[0]
 
-    def error(self, index: int, T_cam_obj: np.ndarray) -> float:
-        """ADD of the cuboid to the nearest instance of an object, in diameters."""
+    def errors(self, index: int, T_cam_obj: np.ndarray) -> list[float]:
+        """ADD of the cuboid to each instance of an object, in diameters."""
         cuboid = self.cuboids[index]
         moved = transform(T_cam_obj, cuboid)
-        errors = [
-            np.linalg.norm(moved - transform(T, cuboid), axis=1).mean()
+        diameter = np.linalg.norm(cuboid[0] - cuboid[6])
+        return [
+            float(np.linalg.norm(moved - transform(T, cuboid), axis=1).mean() / diameter)
             for c, T in zip(self.objects, self.poses, strict=True)
             if c == index
         ]
-        return float(min(errors) / np.linalg.norm(cuboid[0] - cuboid[6]))
+
+    def error(self, index: int, T_cam_obj: np.ndarray) -> float:
+        """ADD to the nearest instance."""
+        return min(self.errors(index, T_cam_obj))
 
 
 @pytest.fixture(name="K")

@@ -1,77 +1,116 @@
 from __future__ import annotations
 
 import math
-from itertools import permutations
 
 import numpy as np
-from numpy.testing import assert_array_equal
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from dopepp.recovery.association import ChannelPeaks, associate
+from dopepp.geometry.cuboid import CORNER_SIGNS
+from dopepp.recovery.association import ObjectPeaks, associate, direction_evidence
+from dopepp.recovery.consensus import foretell
 
-NONE = ChannelPeaks(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)))
+WIDE = math.radians(45)
 
 
-def peaks(position: object, toward: object = None, score: object = None) -> ChannelPeaks:
-    where = np.array(position, float).reshape(-1, 2)
-    vectors = np.zeros_like(where) if toward is None else np.array(toward, float).reshape(-1, 2)
-    scores = np.ones(len(where)) if score is None else np.array(score, float)
-    return ChannelPeaks(where, scores, np.full_like(where, 8.0), vectors)
+def peaks(
+    corners: np.ndarray, toward: np.ndarray, centroids: object, score: object = 1.0
+) -> ObjectPeaks:
+    """Peaks of known place, (8, n, 2); NaN where there is none."""
+    centroid = np.array(centroids, float).reshape(-1, 2)
+    there = np.isfinite(corners[..., 0])
+    return ObjectPeaks(
+        corners,
+        np.where(there, score, 0.0),
+        np.tile(np.eye(2), (*corners.shape[:2], 1, 1)),
+        toward,
+        centroid,
+        np.ones(len(centroid)),
+        np.tile(np.eye(2), (len(centroid), 1, 1)),
+        160_000.0,
+    )
+
+
+def one_corner(position: object, toward: object, centroids: object, score: object = 1.0):
+    corners, vectors = np.full((2, 8, len(np.array(position)), 2), np.nan)
+    corners[0], vectors[0] = position, toward
+    return peaks(corners, vectors, centroids, score)
+
+
+def group(found: ObjectPeaks, max_angle: float = WIDE, coincident_px: float = 8.0):
+    return associate(found, direction_evidence(found, max_angle, coincident_px))
+
+
+def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Affine images of cuboids, their corners shuffled per channel; (8, n, 2) and centroids."""
+    centroids = rng.uniform(0, 400, (count, 2))
+    affine = rng.normal(scale=25, size=(count, 2, 3))
+    return centroids[None] + np.einsum("nij,kj->kni", affine, CORNER_SIGNS), centroids
 
 
 def test_a_corner_goes_where_its_vector_points() -> None:
-    centroids = peaks([[0, 0], [100, 0]])
-    corner = peaks([[40, 0], [60, 0]], [[1, 0], [-1, 0]])
-    left, right = associate([corner, *[NONE] * 7, centroids], math.radians(45), 8)
+    left, right = group(one_corner([[40, 0], [60, 0]], [[1, 0], [-1, 0]], [[0, 0], [100, 0]]))
     assert_array_equal(left.position[0], [60, 0])
     assert_array_equal(right.position[0], [40, 0])
     assert np.isnan(left.position[1:8]).all()
     assert_array_equal(left.score, [1, 0, 0, 0, 0, 0, 0, 0, 1])
 
 
-def test_the_assignment_is_the_best_of_all() -> None:
-    """Against trying every one-to-one pairing, angles and scores at random."""
-    rng = np.random.default_rng(0)
-    limit = math.radians(170)
-    for _ in range(50):
-        centroids = peaks(rng.uniform(0, 400, (3, 2)))
-        turn = rng.uniform(0, 2 * np.pi, 3)
-        vectors = np.stack([np.cos(turn), np.sin(turn)], 1)
-        corner = peaks(rng.uniform(0, 400, (3, 2)), vectors, rng.uniform(0.05, 1, 3))
-        offset = centroids.position[None] - corner.position[:, None]
-        cosine = (offset * vectors[:, None]).sum(-1) / np.linalg.norm(offset, axis=-1)
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        if (angle > limit).any():
-            continue
-        best = min(permutations(range(3)), key=lambda p: sum(angle[p[j], j] ** 2 for j in range(3)))
-        groups = associate([corner, *[NONE] * 7, centroids], limit, 1e-6)
-        for j, group in enumerate(groups):
-            assert_array_equal(group.position[0], corner.position[best[j]])
-
-
-def test_a_vector_that_points_elsewhere_joins_nobody() -> None:
-    corner = peaks([[40, 0]], [[0, 1]])
-    (group,) = associate([corner, *[NONE] * 7, peaks([[0, 0]])], math.radians(45), 8)
-    assert np.isnan(group.position[0]).all()
+@pytest.mark.parametrize("vector", [[0, 1], [1, 0], [np.nan, 0], [np.inf, 0]])
+def test_a_vector_that_points_elsewhere_joins_nobody(vector: list[float]) -> None:
+    (alone,) = group(one_corner([[40, 0]], [vector], [[0, 0]]))
+    assert np.isnan(alone.position[0]).all()
 
 
 def test_the_stronger_of_two_peaks_wins() -> None:
-    corner = peaks([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [0.1, 0.9])
-    (group,) = associate([corner, *[NONE] * 7, peaks([[0, 0]])], math.radians(45), 8)
-    assert_array_equal(group.position[0], [0, 50])
+    score = np.array([0.5, 0.9])
+    (one,) = group(one_corner([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [[0, 0]], score))
+    assert_array_equal(one.position[0], [0, 50])
 
 
 def test_a_corner_on_the_centroid_needs_no_direction() -> None:
-    corner = peaks([[3, 0]], [[1, 0]])
-    (group,) = associate([corner, *[NONE] * 7, peaks([[0, 0]])], math.radians(45), 8)
-    assert_array_equal(group.position[0], [3, 0])
+    found = one_corner([[3, 0]], [[1, 0]], [[0, 0]])
+    assert direction_evidence(found, WIDE, 8.0)[0, 0, 0] == 0
+    assert direction_evidence(found, WIDE, 2.0)[0, 0, 0] == -np.inf
 
 
-def test_a_vector_that_is_no_number_joins_nobody() -> None:
-    corner = peaks([[40, 0], [-40, 0]], [[np.nan, 0], [1, 0]])
-    groups = associate([corner, *[NONE] * 7, peaks([[0, 0], [9, 9]])], math.radians(45), 2)
-    assert_array_equal(groups[0].position[0], [-40, 0])
-    assert np.isnan(groups[1].position[0]).all()
+def test_corners_in_one_direction_are_told_apart_by_the_others() -> None:
+    """Vectors say only which way; the affine camera says how far."""
+    rng = np.random.default_rng(0)
+    right = total = 0
+    for _ in range(30):
+        corners, centroids = crowd(rng, 6)
+        toward = centroids[None] - corners
+        toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+        toward += 0.05 * rng.normal(size=toward.shape)
+        order = rng.permuted(np.tile(np.arange(6), (8, 1)), axis=1)[..., None]
+        found = peaks(
+            np.take_along_axis(corners, order, 1), np.take_along_axis(toward, order, 1), centroids
+        )
+        for n, one in enumerate(group(found)):
+            right += (one.position[:8] == corners[:, n]).all(1).sum()
+            total += 8
+    assert right >= 0.97 * total
+
+
+def test_three_corners_foretell_the_others() -> None:
+    corners, centroids = crowd(np.random.default_rng(1), 1)
+    evidence = np.full((1, 8, 1), -np.inf)
+    evidence[0, [0, 1, 2]] = 0.0
+    expected, deviation = foretell(corners, evidence, centroids, 4.0, 160_000.0)
+    assert_allclose(expected[0], corners[:, 0], atol=1e-9)
+    assert deviation[0] > 4
+    evidence[0, 2] = -np.inf
+    assert np.isnan(foretell(corners, evidence, centroids, 4.0, 160_000.0)[0]).all()
+
+
+def test_a_pose_found_before_decides() -> None:
+    found = one_corner([[40, 0], [60, 0]], [[-1, 0], [-1, 0]], [[0, 0]])
+    expected = np.full((1, 8, 2), np.nan)
+    expected[0, 0] = 61, 1
+    evidence = direction_evidence(found, WIDE, 8.0)
+    assert_array_equal(associate(found, evidence, expected)[0].position[0], [60, 0])
 
 
 def test_no_centroid_no_instance() -> None:
-    assert associate([peaks([[1, 1]], [[1, 0]])] * 8 + [NONE], 1.0, 8) == []
+    assert group(one_corner([[1, 1]], [[1, 0]], np.zeros((0, 2)))) == []

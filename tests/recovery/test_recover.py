@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dopepp.errors import UserError
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.recovery import Detection, RecoveryOptions, recover, recover_batch
+from dopepp.recovery import Detection, RecoveryOptions, explain, recover, recover_batch
 
 Make = Callable[..., Any]
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
@@ -244,3 +244,50 @@ def test_cameras_and_names_must_fit(box: np.ndarray, K: np.ndarray) -> None:
 def test_bad_option(option: str, value: float) -> None:
     with pytest.raises(UserError, match=f"recovery option {option}={value}"):
         RecoveryOptions(**{option: value})
+
+
+def test_the_reason_for_no_detection(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+    scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
+    belief, field = scene.maps()
+    assert explain(belief, field, scene.cuboids, scene.K) == []
+    (reason,) = explain(belief, field, scene.cuboids, scene.K, names=["bracket"], min_score=1.0)
+    assert "bracket at pixel" in reason
+    assert "below 1" in reason
+    belief[:6] = 0
+    assert recover(belief, field, scene.cuboids, scene.K) == []
+    (reason,) = explain(belief, field, scene.cuboids, scene.K)
+    assert "only 3 usable points, 4 are needed" in reason
+    (reason,) = explain(0 * belief, field, scene.cuboids, scene.K)
+    assert reason == "0: no centroid's belief reaches 0.05"
+
+
+@pytest.mark.parametrize(("name", "sigma"), [("box", 2.0), ("plate", 2.0), ("box", 0.5)])
+def test_crowds_with_noise_on_their_maps(
+    name: str, sigma: float, request: pytest.FixtureRequest, make_scene: Make, pose: Make
+) -> None:
+    cuboid, rng = request.getfixturevalue(name), np.random.default_rng(11)
+    generator = torch.Generator().manual_seed(11)
+    places = [(x, y) for x in (-0.13, -0.04, 0.04, 0.13) for y in (-0.1, 0.0, 0.1)]
+    right = 0
+    for _ in range(4):
+        scene = make_scene(cuboid)
+        for x, y in places[:10]:
+            scene.place(0, pose(rng, x, y, 0.55))
+        belief, field = scene.maps(sigma)
+        belief = belief + 0.02 * torch.randn(belief.shape, generator=generator)
+        field = field + 0.05 * torch.randn(field.shape, generator=generator)
+        found = recover(belief, field, scene.cuboids, scene.K, sigma=sigma)
+        errors = np.array([scene.errors(0, one.T_cam_obj) for one in found])
+        right += int((errors.min(0) < 0.1).sum())
+    assert right >= 36
+
+
+def test_the_covariance_is_that_of_the_peaks(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+    """Wider peaks, a wider pose; symmetric and positive."""
+    scene = make_scene(box).place(0, pose(np.random.default_rng(12)))
+    (sharp,) = recover(*scene.maps(), scene.cuboids, scene.K)
+    (wide,) = recover(*scene.maps(1.5), scene.cuboids, scene.K)
+    for one in (sharp, wide):
+        assert_allclose(one.covariance, one.covariance.T, rtol=1e-6)
+        assert np.linalg.eigvalsh(one.covariance).min() > 0
+    assert np.trace(wide.covariance) > 4 * np.trace(sharp.covariance)

@@ -25,13 +25,13 @@ def test_wide_peaks_count_less(box: np.ndarray, K: np.ndarray, pose: Pose) -> No
         truth = pose(rng)
         noise = np.array([0.3] * 5 + [6.0] * 4)
         pixels = project_keypoints(box, truth, K) + rng.normal(size=(9, 2)) * noise[:, None]
-        honest = np.sqrt(8.0**2 + noise**2)[:, None].repeat(2, 1)
+        honest = noise[:, None, None] ** 2 * np.eye(2)
         errors.append(
             [
-                error(solve_group(group, box, K, 8.0).T_cam_obj, truth, box)
+                error(solve_group(group, box, K).T_cam_obj, truth, box)
                 for group in (
                     KeypointGroup(pixels, np.ones(9), honest),
-                    KeypointGroup(pixels, np.ones(9), np.full((9, 2), honest.mean())),
+                    KeypointGroup(pixels, np.ones(9), np.tile(9.0 * np.eye(2), (9, 1, 1))),
                 )
             ]
         )
@@ -47,8 +47,8 @@ def test_maps_narrower_than_their_errors_still_give_poses(
     for _ in range(40):
         truth = pose(rng)
         pixels = project_keypoints(box, truth, K) + 2.0 * rng.normal(size=(9, 2))
-        group = KeypointGroup(pixels, np.ones(9), np.full((9, 2), 8.0))
-        result = solve_group(group, box, K, 8.0)
+        group = KeypointGroup(pixels, np.ones(9), np.zeros((9, 2, 2)))
+        result = solve_group(group, box, K)
         good += error(result.T_cam_obj, truth, box) < 0.0141  # a tenth of the diameter
         assert result.T_cam_obj is None or result.inliers.sum() >= 4
     assert good >= 38
@@ -57,7 +57,7 @@ def test_maps_narrower_than_their_errors_still_give_poses(
 def test_too_few_keypoints_have_a_reason(box: np.ndarray, K: np.ndarray) -> None:
     pixels = np.full((9, 2), np.nan)
     pixels[:3] = [[0, 0], [50, 0], [0, 50]]
-    spread = np.where(np.isnan(pixels), np.nan, 8.0)
-    result = solve_group(KeypointGroup(pixels, np.zeros(9), spread), box, K, 8.0)
+    covariance = np.tile(np.eye(2), (9, 1, 1))
+    result = solve_group(KeypointGroup(pixels, np.zeros(9), covariance), box, K)
     assert result.T_cam_obj is None
     assert "only 3 usable points" in result.reason

@@ -8,6 +8,7 @@ To add an error, write one function of this form, its formula in ``docs/metrics.
 against an independent implementation.
 """
 
+from dopepp.metrics.functional.calibration import expected_calibration_error
 from dopepp.metrics.functional.distances import add, add_s, mssd
 from dopepp.metrics.functional.matching import MATCH_DISTANCE, average_precision, match
 from dopepp.metrics.functional.offsets import rotation_error_deg, translation_error
@@ -30,6 +31,7 @@ __all__ = [
     "auc",
     "average_precision",
     "average_recall",
+    "expected_calibration_error",
     "match",
     "mspd",
     "mssd",

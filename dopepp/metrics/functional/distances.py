@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from dopepp.metrics.functional.inputs import check_poses, check_symmetries, chunks, nan_is_miss
 from dopepp.metrics.functional.nearest import NearestPoints
-
-_WORTH_A_HULL: Final = 1 << 22
-"""Transformed points from which a convex hull (10 ms for 10,000 points) pays."""
+from dopepp.metrics.functional.symmetric import least_farthest
 
 _CHUNK_PAIRS: Final = 1 << 26
 """Pairs of points held at once on a GPU: 0.5 GB in float64."""
@@ -123,17 +119,8 @@ def mssd(
         ValueError: A shape is wrong or there are no points.
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
-    turns, shifts = check_symmetries(symmetries, t_est)
-    if len(t_est) * len(turns) * len(points) >= _WORTH_A_HULL:
-        points = _extreme_points(points)
-    errors = torch.full_like(t_est[:, 0], torch.inf)
-    for turn, shift in zip(turns, shifts, strict=True):
-        rotation = R_est - R_gt @ turn
-        translation = t_est - t_gt - R_gt @ shift
-        for chunk in chunks(len(t_est), len(points)):
-            farthest = _lengths(rotation[chunk], translation[chunk], points).amax(dim=1)
-            errors[chunk] = torch.fmin(errors[chunk], farthest)
-    return errors
+    group = check_symmetries(symmetries, t_est)
+    return least_farthest((R_est, t_est), (R_gt, t_gt), points, group, perspective=False)
 
 
 def _lengths(
@@ -144,15 +131,3 @@ def _lengths(
         translation[..., None], rotation, points.T.expand(len(rotation), *points.T.shape)
     )
     return offsets.square_().sum(dim=1).sqrt_()
-
-
-def _extreme_points(points: Float[Tensor, "v 3"]) -> Float[Tensor, "h 3"]:
-    """Return the corners of the convex hull: ‖A x + b‖ is convex in x and largest at one of them.
-
-    A flat object has no hull in space; all its points are returned.
-    """
-    try:
-        corners = ConvexHull(points.cpu().numpy()).vertices
-    except QhullError:
-        return points
-    return points[torch.from_numpy(np.sort(corners)).long().to(points.device)]

@@ -13,6 +13,7 @@ from dopepp.metrics.functional.inputs import (
     chunks,
     nan_is_miss,
 )
+from dopepp.metrics.functional.symmetric import least_farthest
 
 
 def reprojection_error(
@@ -69,15 +70,15 @@ def mspd(
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     K = check_cameras(K, len(R_est))
-    turns, shifts = check_symmetries(symmetries, t_est)
-    errors = torch.full_like(t_est[:, 0], torch.inf)
-    for chunk in chunks(len(t_est), len(points)):
-        estimated = _project(R_est[chunk], t_est[chunk], points, K[chunk])
-        for turn, shift in zip(turns, shifts, strict=True):
-            R, t = R_gt[chunk] @ turn, R_gt[chunk] @ shift + t_gt[chunk]
-            squared = (estimated - _project(R, t, points, K[chunk])).square_().sum(dim=2)
-            errors[chunk] = torch.fmin(errors[chunk], nan_is_miss(squared.amax(dim=1)).sqrt())
-    return errors
+    group = check_symmetries(symmetries, t_est)
+    # Pixels are the first two of K·x over x's depth, whatever the last row of K holds.
+    to_pixels = K.clone()
+    to_pixels[:, 2] = K.new_tensor([0.0, 0.0, 1.0])
+    estimated, true = (
+        (to_pixels @ R, (to_pixels @ t[..., None])[..., 0])
+        for R, t in ((R_est, t_est), (R_gt, t_gt))
+    )
+    return least_farthest(estimated, true, points, group, perspective=True)
 
 
 def _project(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dopepp.errors import UserError
@@ -61,33 +61,44 @@ def vsd(
         shapes = [tuple(depth.shape) for depth in depths]
         raise ValueError(f"depths must be (N, height, width) of one shape, got {shapes}")
     K = check_cameras(K, len(depths[0]))
-    est, gt, test = (_distances(depth, K) for depth in depths)
+    # Pixels without the object at either pose are visible at neither.
+    pixels = ((depths[0] > 0) | (depths[1] > 0)).nonzero(as_tuple=True)
+    image, y, x = pixels
+    lengths = _ray_lengths(image, y, x, K)
+    est, gt, test = (depth[pixels] * lengths for depth in depths)
     visible_gt = _visible(gt, test, delta)
     visible_est = _visible(est, test, delta) | (visible_gt & (est > 0))
-    both, either = visible_gt & visible_est, (visible_gt | visible_est).sum(dim=(1, 2))
+    both, either = visible_gt & visible_est, visible_gt | visible_est
     difference = torch.where(both, (gt - est).abs() / scale, torch.inf)
-    right = [(difference < tau).sum(dim=(1, 2)) for tau in taus]
-    errors = 1 - torch.stack(right, dim=1) / either[:, None].clamp(min=1)
-    return errors.double()
+
+    def count(chosen: Bool[Tensor, "pixels"]) -> Float[Tensor, "n"]:
+        return torch.bincount(image[chosen], minlength=len(K)).double()
+
+    right = torch.stack([count(difference < tau) for tau in taus], dim=1)
+    return 1 - right / count(either)[:, None].clamp(min=1)
 
 
-def _distances(
-    depth: Float[Tensor, "n height width"], K: Float[Tensor, "n 3 3"]
-) -> Float[Tensor, "n height width"]:
-    """Turn depths along z into distances from the camera's centre."""
-    height, width = depth.shape[1:]
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=depth.dtype, device=depth.device),
-        torch.arange(width, dtype=depth.dtype, device=depth.device),
-        indexing="ij",
-    )
-    pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(1, -1, 3)
-    rays = (pixels @ torch.linalg.inv(K).mT).reshape(len(K), height, width, 3)
-    distance: Tensor = depth * torch.linalg.vector_norm(rays, dim=-1)
-    return distance
+def _ray_lengths(
+    image: Int[Tensor, "pixels"],
+    y: Int[Tensor, "pixels"],
+    x: Int[Tensor, "pixels"],
+    K: Float[Tensor, "n 3 3"],
+) -> Float[Tensor, "pixels"]:
+    """Return the distance from the camera's centre of a point at depth 1 behind each pixel.
+
+    Args:
+        image: Image of each pixel.
+        y: Its row.
+        x: Its column.
+        K: Camera matrix of every image.
+    """
+    columns = torch.linalg.inv(K)[image].unbind(dim=2)
+    rays = columns[0] * x[:, None] + columns[1] * y[:, None] + columns[2]
+    lengths: Tensor = torch.linalg.vector_norm(rays, dim=1)
+    return lengths
 
 
 def _visible(
-    model: Float[Tensor, "n height width"], test: Float[Tensor, "n height width"], delta: float
-) -> Bool[Tensor, "n height width"]:
+    model: Float[Tensor, "pixels"], test: Float[Tensor, "pixels"], delta: float
+) -> Bool[Tensor, "pixels"]:
     return (model > 0) & ((model - test <= delta) | (test == 0))

@@ -1,0 +1,144 @@
+"""CPU time of the pose errors for 1,000 pairs of poses, beside one prebuilt KD-tree.
+
+    python benchmarks/metrics.py [--pairs 1000] [--seed 0]
+
+One thread; process time, the second of two calls. ADD-S by scipy's ``cKDTree`` needs one tree: the
+true points are carried into the object frame of the estimate, where distances are the same. It runs
+in the same process on the same poses. MSSD and MSPD take a solid of revolution of 2,000 points.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg, vsd
+
+K = torch.tensor([[1066.8, 0.0, 313.0], [0.0, 1067.5, 241.3], [0.0, 0.0, 1.0]])
+Poses = tuple[Tensor, Tensor, Tensor, Tensor]
+
+LIMITS = {"ADD 10,000": 0.15, "ADD-S 2,000": 0.9, "ADD-S 10,000": 7.0}
+"""Seconds for 1,000 pairs."""
+
+TURNS = (64, 315)
+VSD_IMAGES = 50
+"""Of 640×480: 1,000 would take 7 GB."""
+
+
+def draw_poses(pairs: int, rng: np.random.Generator) -> Poses:
+    """Draw true poses and estimates about 15° and 1.5 cm off."""
+    true = Rotation.random(pairs, random_state=rng)
+    estimated = true * Rotation.from_rotvec(rng.normal(0, np.radians(9), (pairs, 3)))
+    t = rng.normal([0, 0, 0.8], 0.1, (pairs, 3))
+    t_est = t + rng.normal(0, 0.009, (pairs, 3))
+    arrays = estimated.as_matrix(), t_est, true.as_matrix(), t
+    return tuple(torch.from_numpy(array) for array in arrays)  # type: ignore[return-value]
+
+
+def box_surface(count: int, rng: np.random.Generator) -> Float[np.ndarray, "count 3"]:
+    """Draw points on a cracker box."""
+    points = rng.uniform(-1, 1, (count, 3))
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count)
+    return points * [0.036, 0.082, 0.107]
+
+
+def can_surface(count: int, rng: np.random.Generator) -> Float[np.ndarray, "count 3"]:
+    """Draw points on the side of a soup can."""
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.051, 0.051, count)
+    return np.stack([0.034 * np.cos(angle), 0.034 * np.sin(angle), z], axis=1)
+
+
+def kd_tree_add_s(poses: Poses, points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "n"]:
+    """Return ADD-S of every pair by one KD-tree."""
+    R_est, t_est, R_gt, t_gt = (tensor.numpy() for tensor in poses)
+    tree = cKDTree(points)
+    errors = np.empty(len(t_est))
+    for n in range(len(errors)):
+        true = points @ R_gt[n].T + t_gt[n]
+        errors[n] = np.mean(tree.query((true - t_est[n]) @ R_est[n])[0])
+    return errors
+
+
+def timed(function: Callable[[], object]) -> tuple[float, object]:
+    """Return the process time of the second call, and its result."""
+    function()
+    start = time.process_time()
+    result = function()
+    return time.process_time() - start, result
+
+
+def report(name: str, seconds: float, note: str = "") -> None:
+    """Print a line."""
+    limit = LIMITS.get(name)
+    verdict = "" if limit is None else f"limit {limit:g}: {'ok' if seconds <= limit else 'OVER'}"
+    print(f"{name:<36} {seconds:8.3f} s  {verdict:<18} {note}")
+
+
+def measure_distances(poses: Poses, rng: np.random.Generator) -> None:
+    """Time ADD and ADD-S, the latter beside a KD-tree."""
+    points = torch.from_numpy(box_surface(10_000, rng))
+    report("ADD 10,000", timed(lambda: add(*poses, points))[0])
+    for count in (2000, 10_000):
+        surface = box_surface(count, rng)
+        seconds, errors = timed(lambda s=surface: add_s(*poses, torch.from_numpy(s)))  # type: ignore[misc]
+        start = time.process_time()
+        expected = kd_tree_add_s(poses, surface)
+        tree = time.process_time() - start
+        worst = float(np.abs(np.asarray(errors) / expected - 1).max())
+        note = f"KD-tree {tree:.2f} s, ratio {tree / seconds:.1f}, differ by {worst:.0e} at most"
+        report(f"ADD-S {count:,}", seconds, note)
+
+
+def measure_symmetric(poses: Poses, rng: np.random.Generator) -> None:
+    """Time what takes the least over symmetries."""
+    can = torch.from_numpy(can_surface(2000, rng))
+    for turns in TURNS:
+        axis = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+        group = torch.from_numpy(symmetry_group(None, [axis], np.pi / turns))
+        assert len(group) == turns
+        size = f"2,000, {turns} symmetries"
+        report(f"MSSD {size}", timed(lambda g=group: mssd(*poses, can, g))[0])  # type: ignore[misc]
+        report(f"MSPD {size}", timed(lambda g=group: mspd(*poses, can, K, g))[0])  # type: ignore[misc]
+        seconds, _ = timed(lambda g=group: rotation_error_deg(poses[0], poses[2], g))  # type: ignore[misc]
+        report(f"rotation, {turns} symmetries", seconds)
+
+
+def measure_vsd(pairs: int, rng: np.random.Generator) -> None:
+    """Time VSD at BOP's ten tolerances on a slanted square, per ``pairs`` images."""
+    x, y = np.meshgrid(np.arange(640), np.arange(480))
+    inside = (abs(x - 320) < 100) & (abs(y - 240) < 100)
+    slants = rng.uniform(-2e-4, 2e-4, (2, VSD_IMAGES, 1, 1))
+    estimated, true = (torch.from_numpy(inside * (0.8 + slant * x)) for slant in slants)
+    test = torch.full_like(true, 1.0).where(true == 0, true)
+    taus = [0.05 * k for k in range(1, 11)]
+    seconds, _ = timed(lambda: vsd(estimated, true, test, K, taus, diameter=0.2))
+    report("VSD 640×480, 10 tolerances", seconds * pairs / VSD_IMAGES, f"of {VSD_IMAGES} images")
+
+
+def main() -> None:
+    """Print a line per error."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pairs", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(options.seed)
+    poses = draw_poses(options.pairs, rng)
+    print(f"{options.pairs:,} pairs of poses, one thread, process time")
+    measure_distances(poses, rng)
+    measure_symmetric(poses, rng)
+    measure_vsd(options.pairs, rng)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""The symmetries of the objects to learn: found, read from a file, or left out.
+
+A file is BOP's ``models_info.json``, or one entry of it, as ``dopepp symmetries`` prints.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from dopepp.data.bop_model_writer import model_info
+from dopepp.data.bop_models import ModelInfo, parse_models
+from dopepp.data.json_file import read_json
+from dopepp.errors import UserError
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Part
+from dopepp.parts.symmetry import TOLERANCE, find_symmetries
+
+_log = logging.getLogger(__name__)
+
+AUTO: Final = "auto"
+NONE: Final = "none"
+
+_SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
+
+
+def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
+    """Give parts the symmetries that a user has chosen.
+
+    Args:
+        parts: The objects, with what their data set states.
+        choice: None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
+            them on the mesh; anything else is a file that has them for every part, by name.
+
+    Raises:
+        UserError: A part has no mesh to look at, or the file is damaged or lacks a part.
+    """
+    if choice is None:
+        return list(parts)
+    if choice == NONE:
+        return [replace(part, symmetries_discrete=None, symmetries_continuous=()) for part in parts]
+    if choice == AUTO:
+        return [with_found_symmetries(part) for part in parts]
+    infos = _read_infos(choice)
+    return [_with_info(part, infos, choice) for part in parts]
+
+
+def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
+    """Return a part with the symmetries of its mesh, and say in the log what they are.
+
+    Args:
+        part: A part with a mesh.
+        tolerance: Largest distance of a moved surface point from the surface, in diameters.
+
+    Raises:
+        UserError: The part has no mesh, or the tolerance is out of range.
+    """
+    if part.mesh is None:
+        raise UserError(
+            f"part {part.name} without a mesh to find symmetries on", "parts with a mesh",
+            "state its symmetries in a file, or leave them out",
+        )  # fmt: skip
+    discrete, continuous = find_symmetries(part.mesh, tolerance)
+    _log.info(
+        "%s: %d discrete symmetries and %d axes of continuous symmetry within %.3g mm",
+        part.name, len(discrete), len(continuous), 1000 * tolerance * part.diameter,
+    )  # fmt: skip
+    if part.mesh.texture is not None and (len(discrete) or continuous):
+        _log.warning(
+            "%s has a texture, which is not looked at: a print that tells the sides apart "
+            "leaves no symmetry", part.name,
+        )  # fmt: skip
+    found = discrete if len(discrete) else None
+    return replace(part, symmetries_discrete=found, symmetries_continuous=continuous)
+
+
+def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
+    """Return the ``models_info.json`` entry of a mesh file or built-in part, as JSON.
+
+    Raises:
+        UserError: The file cannot be used, or the tolerance is out of range.
+    """
+    entry = model_info(with_found_symmetries(load_part(path, unit), tolerance))
+    entry |= {field: entry.get(field, []) for field in _SYMMETRY_FIELDS}
+    return json.dumps(entry, indent=2, ensure_ascii=False)
+
+
+def _read_infos(choice: str) -> dict[str, ModelInfo]:
+    """Return a file's entries by the part's name."""
+    path = Path(choice)
+    if not path.is_file():
+        raise UserError(
+            f"data.symmetries={choice}, no such file",
+            f"null, {NONE}, {AUTO} or a models_info.json",
+            "check the path",
+        )
+    records = read_json(path)
+    if isinstance(records, dict) and "diameter" in records:
+        records = {"1": records}  # one entry alone
+    return {info.name: info for info in parse_models(path, records).values()}
+
+
+def _with_info(part: Part, infos: dict[str, ModelInfo], path: str) -> Part:
+    if part.name not in infos:
+        raise UserError(
+            f"data.symmetries={path}, which has no {part.name}", ", ".join(infos),
+            f'add an entry with "name": "{part.name}"',
+        )  # fmt: skip
+    info = infos[part.name]
+    return replace(
+        part,
+        symmetries_discrete=info.symmetries_discrete,
+        symmetries_continuous=info.symmetries_continuous,
+    )

@@ -1,0 +1,250 @@
+"""Score and threshold of a checkpoint, chosen on validation images and checked on others.
+
+The score's weights are fitted to "ADD below a tenth of the diameter"; the threshold is the lowest
+at which the network keeps silent on images without its objects. Both go into a new checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.errors import UserError
+from dopepp.experiment.sources import (
+    build_source_without_objects,
+    build_test_source,
+    build_validation_source,
+)
+from dopepp.geometry.camera import transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.functional import (
+    MATCH_DISTANCE,
+    add,
+    expected_calibration_error,
+    match,
+)
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.storage import write_atomic
+from dopepp.parts.part import Part
+from dopepp.recovery.calibration import FEATURES, detection_features, fit_weights, score
+from dopepp.recovery.detection import Detection
+
+LOUD: Final = 0.01
+"""Share of validation images without objects on which the threshold may let a detection pass."""
+
+_PASSING: Final = 0.1
+"""ADD over the diameter below which a pose is right."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The detections on a set of images.
+
+    Attributes:
+        features: Of every detection.
+        scores: What the estimator said.
+        correct: Whether it is right.
+        image: Number of its image.
+        num_images: Images in all.
+        num_instances: Instances that were to be found.
+    """
+
+    features: Float[np.ndarray, "n features"]
+    scores: Float[np.ndarray, "n"]
+    correct: Bool[np.ndarray, "n"]
+    image: np.ndarray
+    num_images: int
+    num_instances: int
+
+    def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
+        """Return the best score on every image; 0 where nothing was found."""
+        best = np.zeros(self.num_images)
+        np.maximum.at(best, self.image, scores)
+        return best
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How good scores and a threshold are.
+
+    Attributes:
+        calibration_error: Expected calibration error of the scores.
+        false_positive_rate: Share of images without objects on which something is found.
+        recall: Share of instances with a right pose above the threshold.
+    """
+
+    calibration_error: float
+    false_positive_rate: float
+    recall: float
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What tuning chose, and how good it is on images it was not chosen on.
+
+    Attributes:
+        options: The recovery options to change.
+        before: Figures of the checkpoint as it was.
+        after: Figures with the new options.
+        num_images: Test images with objects, and without.
+    """
+
+    options: dict[str, float]
+    before: Figures
+    after: Figures
+    num_images: tuple[int, int]
+
+
+def tune(
+    estimator: PoseEstimator,
+    data: Mapping[str, Any],
+    parts: Sequence[Part],
+    seed: int,
+    num_empty: int,
+) -> Tuning:
+    """Choose score weights and threshold on validation images, and measure them on test images.
+
+    Args:
+        estimator: The trained network.
+        data: The data config.
+        parts: The objects as the data have them.
+        seed: Of renders.
+        num_empty: Images without objects, for choosing and again for measuring.
+
+    Raises:
+        UserError: The network finds nothing, or everything it finds is right or wrong.
+    """
+    old = estimator.recovery
+    estimator.recovery = replace(old, min_score=0.0)
+    try:
+        chosen_on = [
+            score_images(estimator, parts, source)
+            for source in (
+                build_validation_source(data, parts, seed),
+                build_source_without_objects(data, parts, seed, "val", num_empty),
+            )
+        ]
+        options = choose(*chosen_on)
+        test = score_images(estimator, parts, build_test_source(data, parts, seed))
+        empty = score_images(
+            estimator, parts, build_source_without_objects(data, parts, seed, "test", num_empty)
+        )
+    finally:
+        estimator.recovery = old
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    before = _figures(test, empty, test.scores, empty.scores, old.min_score)
+    after = _figures(
+        test, empty, score(test.features, weights), score(empty.features, weights),
+        options["min_score"],
+    )  # fmt: skip
+    return Tuning(options, before, after, (test.num_images, empty.num_images))
+
+
+def choose(shown: Scored, empty: Scored) -> dict[str, float]:
+    """Choose the weights and the threshold.
+
+    Args:
+        shown: Detections on images with objects.
+        empty: Detections on images without; each is wrong.
+
+    Raises:
+        UserError: There is nothing to learn from.
+    """
+    features = np.concatenate([shown.features, empty.features])
+    correct = np.concatenate([shown.correct, empty.correct])
+    if not correct.any() or correct.all():
+        what = "right" if correct.any() else "wrong"
+        raise UserError(
+            f"{len(correct)} validation detections, all of them {what}"
+            if len(correct)
+            else "no detection on any validation image",
+            "right and wrong ones to learn from",
+            "train longer, or raise data.num_val and num_empty",
+        )
+    weights = fit_weights(features, correct)
+    loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
+    allowed = int(LOUD * empty.num_images)
+    # A detection passes from the threshold on, so it lies just above the first that must not.
+    threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
+    named = zip(FEATURES, weights, strict=True)
+    return {"min_score": threshold} | {f"score_{name}": float(value) for name, value in named}
+
+
+def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Any) -> Scored:
+    """Run an estimator over a source and judge every detection."""
+    rows: list[tuple[np.ndarray, float, bool, int]] = []
+    num_instances = 0
+    samples: Iterable[Sample] = (source.sample(index, 0) for index in range(len(source)))
+    for number, sample in enumerate(samples):
+        found = estimator.predict(sample.image, sample.K)
+        for part in parts:
+            own = [one for one in found if one.object == part.name]
+            true = [one for one in sample.instances if one.label == part.name]
+            counted = [one for one in true if one.visible_fraction >= MIN_VISIBLE_FRACTION]
+            num_instances += len(counted)
+            right = _right(part, own, counted)
+            for one, is_right in zip(own, right, strict=True):
+                features = detection_features(one, part.cuboid, sample.K)
+                rows.append((features, one.score, bool(is_right), number))
+    return Scored(
+        np.array([row[0] for row in rows]).reshape(-1, len(FEATURES)),
+        np.array([row[1] for row in rows], np.float64),
+        np.array([row[2] for row in rows], bool),
+        np.array([row[3] for row in rows], np.int64),
+        len(source),
+        num_instances,
+    )
+
+
+def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
+    """Write a checkpoint with other recovery options beside the old one; returns its path."""
+    tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
+    target = path.with_name(f"{path.stem}_tuned{path.suffix}")
+    write_atomic(tuned.to_file(), target)
+    return target
+
+
+def _right(part: Part, found: Sequence[Detection], true: Sequence[Instance]) -> list[bool]:
+    """Tell which detections of one object on one image are right: matched, and within 0.1 d."""
+    if not found or not true:
+        return [False] * len(found)
+    centre = part.cuboid[CENTROID]
+    at = [np.array([transform(one.T_cam_obj, centre) for one in many]) for many in (found, true)]
+    distances = np.linalg.norm(at[0][:, None] - at[1][None], axis=2)
+    scores = torch.tensor([one.score for one in found], dtype=torch.float64)
+    indices = match(scores, torch.from_numpy(distances), MATCH_DISTANCE).tolist()
+    points = torch.from_numpy(np.asarray(part.points, np.float64))
+    right = []
+    for one, index in zip(found, indices, strict=True):
+        if index < 0:
+            right.append(False)
+            continue
+        poses = [torch.from_numpy(np.asarray(T)) for T in (one.T_cam_obj, true[index].T_cam_obj)]
+        error = add(
+            poses[0][None, :3, :3], poses[0][None, :3, 3],
+            poses[1][None, :3, :3], poses[1][None, :3, 3], points,
+        )  # fmt: skip
+        right.append(bool(error[0] < _PASSING * part.diameter))
+    return right
+
+
+def _figures(
+    test: Scored,
+    empty: Scored,
+    scores: Float[np.ndarray, "n"],
+    empty_scores: Float[np.ndarray, "m"],
+    threshold: float,
+) -> Figures:
+    error = expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(test.correct))
+    loud = empty.loudest(np.where(empty_scores >= threshold, 1.0, 0.0))
+    recall = float((test.correct & (scores >= threshold)).sum()) / max(test.num_instances, 1)
+    return Figures(error, float(loud.mean()), recall)

@@ -1,0 +1,401 @@
+"""Gaussians fitted to the neighbourhoods of peaks, compiled.
+
+A belief map is the maximum over instances of b = exp(c + p·x + q·y − r·x² − t·xy − s·y²), with x
+and y counted from the peak's cell. All peaks of a channel are fitted together: each to the cells
+that no other of them reaches, which are told anew once positions are known.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from dopepp.compiled import Array, compiled
+from dopepp.geometry.refine import solve_damped
+
+FLOOR: Final = 1e-6
+"""Belief over its peak below which a cell's logarithm says nothing; a peak of σ = 0.5 on the border
+needs its third column, which is as low as e⁻¹²·⁵ = 4e-6."""
+
+FIRST_MARGIN: Final = 3.0
+"""Squared cells by which a cell must be nearer to its peak than to another: both lie anywhere
+within their own cells. Of 1 to 4, 3 gave the smallest errors on pairs of peaks 3σ to 4σ apart."""
+
+MARGIN: Final = 1.0
+"""The same once both positions are fitted."""
+
+PLATEAU: Final = 3
+"""Cells as high as the peak's from which on its top is cut off; an exact tie of two is none."""
+
+STEPS: Final = 3
+"""Gauss–Newton steps; the start is the exact answer where there is no noise."""
+
+STEEPEST: Final = 10.0
+"""Logarithm of the highest top under which a clamped belief's flanks are believed."""
+
+ARRIVED: Final = 1e-4
+"""Change of the parameters below which a fit has arrived: 1e-3 px of stride 8."""
+
+SHAPE_PRIOR: Final = 0.5
+"""How far a peak's curvature departs from the target's, relative to it, before the map is seen."""
+
+RIDGE: Final = 1e-14
+"""Decides directions in which no cell is above the floor."""
+
+FLATTEST: Final = 1e-3
+"""Smallest curvature of a peak, 1/cells²: a standard deviation of 22 cells."""
+
+UNCERTAIN: Final = 4.0
+"""Variance of a position that is only the middle of its highest cells, cells²."""
+
+
+@compiled()
+def fit_peaks(
+    table: Array,
+    width: int,
+    half: int,
+    sigma: float,
+    radius: float,
+    position: Array,
+    covariance: Array,
+    toward: Array,
+) -> None:
+    """Fit the peaks of every channel and average the field around them.
+
+    Args:
+        table: Of each peak its cell's index, its belief (−∞: no peak; the channel's peaks come
+            first), the (2·half + 1)² cells around it, NaN outside of the map, and where there is
+            a field the x, then the y of the vectors around it; (channels, peaks, columns).
+        width: Of the map, cells.
+        half: Half-width of a window, cells.
+        sigma: Standard deviation of a perfect peak, cells.
+        radius: Of the disc around a corner that carries its vector, cells.
+        position: Filled with (x, y) of each peak, cells.
+        covariance: Filled with the covariance of each position, cells²: the fitted Gaussian's less
+            the target's, as far as the map's noise does not explain it, and that of the fit.
+        toward: Filled with the mean vectors, unless there is no field.
+    """
+    side = 2 * half + 1
+    columns = table.shape[2]
+    for channel in range(len(table)):
+        count = 0
+        while count < table.shape[1] and table[channel, count, 1] > -math.inf:
+            count += 1
+        if not count:
+            continue
+        rows = table[channel, :count]
+        cells = np.empty((count, 2))
+        windows = np.empty((count, side, side))
+        for i in range(count):
+            cells[i] = rows[i, 0] % width, rows[i, 0] // width
+            windows[i] = rows[i, 2 : 2 + side * side].copy().reshape(side, side)
+        _fit_channel(windows, cells, sigma, position[channel, :count], covariance[channel, :count])
+        if columns > 2 + side * side:
+            vectors = rows[:, 2 + side * side :]
+            _mean_vectors(vectors, cells, position[channel, :count], radius, toward[channel])
+
+
+@compiled()
+def _mean_vectors(
+    vectors: Array, cells: Array, position: Array, radius: float, toward: Array
+) -> None:
+    """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
+
+    Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
+    fall to 0 at the edges of discs, which no position is exact enough to tell.
+    """
+    area = vectors.shape[1] // 2
+    side = 1
+    while side * side < area:
+        side += 1
+    half = side // 2
+    for i in range(len(cells)):
+        total = 0.0
+        for y in range(side):
+            for x in range(side):
+                column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
+                squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+                weight = 1 - squared / radius**2
+                u, v = vectors[i, y * side + x], vectors[i, area + y * side + x]
+                if not (weight > 0.0 and math.isfinite(u) and math.isfinite(v)):
+                    continue
+                nearest = True
+                for j in range(len(cells)):
+                    if (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2 < squared:
+                        nearest = False
+                        break
+                if nearest:
+                    total += weight
+                    toward[i, 0] += weight * u
+                    toward[i, 1] += weight * v
+        if total > 0.0:
+            toward[i] /= total
+
+
+@compiled()
+def _fit_channel(
+    windows: Array, cells: Array, sigma: float, position: Array, covariance: Array
+) -> None:
+    """Fit all peaks of one channel, first their logarithms, then the beliefs themselves.
+
+    The logarithm makes the first fit linear and exact for a clean Gaussian, at the border too,
+    where the neighbourhood is cut; weights b² undo the logarithm's amplification of noise (Guo,
+    IEEE SPM 2011). Gauss–Newton on b itself then removes the bias that noise leaves in logarithms.
+    """
+    count = len(cells)
+    theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    noise, freedom = 0.0, 0.0
+    scores, work = np.empty(count), np.empty((5, 10))
+    half = windows.shape[1] // 2
+    for i in range(count):
+        scores[i] = windows[i, half, half]
+        position[i] = cells[i]
+    own = np.empty((count, windows.shape[1], windows.shape[1]), np.bool_)
+    for i in range(count):
+        _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
+    for i in range(count):
+        _fit_logarithm(windows[i], own[i], sigma, 0.0, work, theta[i])
+        position[i] = cells[i] + _mode(windows[i], theta[i])[0]
+    for i in range(count):
+        _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
+        squared, used, _ = _step(windows[i], own[i], theta[i], 0.0, sigma, work, hessian[i], False)
+        noise += squared * scores[i] ** 2
+        freedom += max(used - 6.0, 0.0)
+    noise /= max(freedom, 1.0)
+    for i in range(count):
+        relative = noise / scores[i] ** 2
+        _fit_logarithm(windows[i], own[i], sigma, relative, work, theta[i])
+        for _ in range(STEPS if theta[i].any() else 0):
+            move = _step(windows[i], own[i], theta[i], relative, sigma, work, hessian[i], True)[2]
+            if move < ARRIVED:
+                break
+        offset, sound = _mode(windows[i], theta[i])
+        position[i] = cells[i] + offset
+        _covariance(theta[i], offset, sound, hessian[i], relative, sigma, covariance[i])
+
+
+@compiled()
+def _own_cells(
+    i: int,
+    windows: Array,
+    cells: Array,
+    position: Array,
+    scores: Array,
+    sigma: float,
+    margin: float,
+    own: Array,
+) -> None:
+    """Mark the finite cells of a window that no other peak reaches and no plateau has cut off.
+
+    Of Gaussians s·exp(−d²/2σ²) the highest in a cell is that with the smallest d² − 2σ² log s.
+    """
+    side = windows.shape[1]
+    half = side // 2
+    highest = 0
+    for y in range(side):
+        for x in range(side):
+            own[y, x] = math.isfinite(windows[i, y, x])
+            highest += windows[i, y, x] == scores[i]
+    for j in range(len(cells)):
+        far = max(abs(position[j, 0] - position[i, 0]), abs(position[j, 1] - position[i, 1]))
+        if j == i or far > 4 * half + 2:
+            continue
+        handicap = 2 * sigma**2 * math.log(scores[i] / scores[j]) - margin
+        for y in range(side):
+            for x in range(side):
+                column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
+                mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+                other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
+                if mine - handicap >= other:
+                    own[y, x] = False
+    if highest >= PLATEAU:
+        for y in range(side):
+            for x in range(side):
+                own[y, x] &= windows[i, y, x] != scores[i]
+
+
+@compiled()
+def _fit_logarithm(
+    window: Array, own: Array, sigma: float, noise: float, work: Array, theta: Array
+) -> None:
+    """Write the weighted linear least-squares fit of log b over its peak, with the prior's pull."""
+    side = len(window)
+    half = side // 2
+    curvature = 0.5 / sigma**2
+    theta[:] = 0.0
+    theta[3] = theta[5] = curvature
+    work[:] = 0.0
+    for y in range(side):
+        for x in range(side):
+            value = window[y, x] / window[half, half]
+            if own[y, x] and value > FLOOR:
+                expected = -curvature * ((x - half) ** 2 + (y - half) ** 2)
+                weight = value * value
+                _add(work, x - half, weight, weight * (expected - math.log(value)))
+        _end_row(work, y - half)
+    hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    _system(work, theta, noise, sigma, hessian, gradient)
+    solve_damped(hessian, gradient, 0.0, step)
+    theta += step
+    if work[0, 0] == 0.0:  # nothing but a cut-off top: no slope, no peak
+        theta[:] = 0.0
+
+
+@compiled()
+def _step(
+    window: Array,
+    own: Array,
+    theta: Array,
+    noise: float,
+    sigma: float,
+    work: Array,
+    hessian: Array,
+    move: bool,
+) -> tuple[float, float, float]:
+    """Take a Gauss–Newton step on b with a prior on the shape.
+
+    Returns:
+        Σ residual² before it, the number of cells, and the largest move of a parameter.
+    """
+    side = len(window)
+    half = side // 2
+    squared, used = 0.0, 0.0
+    work[:] = 0.0
+    for y in range(side):
+        v = float(y - half)
+        level = theta[0] + v * (theta[2] - theta[5] * v)
+        slope = theta[1] - theta[4] * v
+        for x in range(side):
+            if own[y, x]:
+                u = float(x - half)
+                # Beyond it the fit is far off already, and its square must stay a number.
+                model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
+                residual = model - window[y, x] / window[half, half]
+                squared += residual * residual
+                used += 1.0
+                _add(work, x - half, model * model, model * residual)
+        _end_row(work, y - half)
+    gradient, step = np.empty(6), np.zeros(6)
+    _system(work, theta, noise, sigma, hessian, gradient)
+    if move:
+        solve_damped(hessian, gradient, 0.0, step)
+        theta += step
+    return squared, used, np.abs(step).max()
+
+
+@compiled()
+def _add(work: Array, x: float, weight: float, residual: float) -> None:
+    """Add a cell to its row's sums of weight·xᵃ (a ≤ 4) and residual·xᵃ (a ≤ 2)."""
+    work[0, 5] += residual
+    work[1, 5] += residual * x
+    work[2, 5] += residual * x * x
+    for a in range(5):
+        work[a, 6] += weight
+        weight *= x
+
+
+@compiled()
+def _end_row(work: Array, y: float) -> None:
+    """Add a row's sums, times powers of y, to the window's, and clear them."""
+    power = 1.0
+    for b in range(5):
+        for a in range(5 - b):
+            work[a, b] += work[a, 6] * power
+            if a + b <= 2:
+                work[a, 7 + b] += work[a, 5] * power
+        power *= y
+    work[:, 5:7] = 0.0
+
+
+@compiled()
+def _system(
+    work: Array, theta: Array, noise: float, sigma: float, hessian: Array, gradient: Array
+) -> None:
+    """Write the normal equations of (1, x, y, −x², −xy, −y²) from the sums, with the prior."""
+    across, down = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
+    curvature = 0.5 / sigma**2
+    weight = noise / (SHAPE_PRIOR * curvature) ** 2 + RIDGE
+    for k in range(6):
+        sign = -1.0 if k >= 3 else 1.0
+        gradient[k] = sign * work[across[k], 7 + down[k]]
+        for m in range(6):
+            value = work[across[k] + across[m], down[k] + down[m]]
+            hessian[k, m] = sign * (-value if m >= 3 else value)
+        hessian[k, k] += weight if k >= 3 else RIDGE
+    gradient[3] += weight * (theta[3] - curvature)
+    gradient[4] += weight * theta[4]
+    gradient[5] += weight * (theta[5] - curvature)
+
+
+@compiled()
+def _mode(window: Array, theta: Array) -> tuple[Array, bool]:
+    """Return where a fitted Gaussian is highest, and whether it is a peak within its own cells.
+
+    If it is none, the middle of the window's highest cells stands for it.
+    """
+    side = len(window)
+    half = side // 2
+    middle, count = np.zeros(2), 0
+    for y in range(half - 2, half + 3):
+        for x in range(half - 2, half + 3):
+            if window[y, x] == window[half, half]:
+                middle[0] += x - half
+                middle[1] += y - half
+                count += 1
+    middle /= count
+    a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
+    determinant = a * c - b * b
+    offset = np.array([c * theta[1] - b * theta[2], a * theta[2] - b * theta[1]]) / determinant
+    smallest = 0.5 * (a + c - math.sqrt((a - c) ** 2 + 4 * b * b))
+    # A cut-off top's cell may be any of it.
+    reach = 1.0 if count < PLATEAU else 2.0
+    sound = smallest > FLATTEST and np.abs(offset - middle).max() <= reach
+    return (offset if sound else middle), sound
+
+
+@compiled()
+def _covariance(
+    theta: Array,
+    offset: Array,
+    sound: bool,
+    hessian: Array,
+    noise: float,
+    sigma: float,
+    out: Array,
+) -> None:
+    """Write a position's covariance; see :func:`fit_peaks`.
+
+    The offset is P⁻¹(p, q) with the precision P = [[2r, t], [t, 2s]] of the Gaussian, so it moves
+    by P⁻¹(dp − 2x·dr − y·dt, dq − x·dt − 2y·ds).
+    """
+    out[:] = 0.0
+    if not sound:
+        out[0, 0] = out[1, 1] = UNCERTAIN
+        return
+    a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
+    determinant = a * c - b * b
+    shape = np.array([[c, -b], [-b, a]]) / determinant
+    x, y = offset[0], offset[1]
+    slopes = np.array([[0.0, 1.0, 0.0, -2 * x, -y, 0.0], [0.0, 0.0, 1.0, 0.0, -x, -2 * y]])
+    slopes = shape @ slopes
+    moved = np.empty(6)
+    for k in range(2):
+        solve_damped(hessian, -slopes[k], 0.0, moved)
+        for m in range(2):
+            out[k, m] = noise * np.sum(slopes[m] * moved)
+    out[0, 1] = out[1, 0]
+    # How uncertain the variance is: that of (r + s)/2 relative to it.
+    mean = np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.5])
+    solve_damped(hessian, -mean, 0.0, moved)
+    relative = math.sqrt(noise * np.sum(mean * moved)) / (0.25 * (a + c))
+    angle = 0.5 * math.atan2(2 * shape[0, 1], shape[0, 0] - shape[1, 1])
+    cosine, sine = math.cos(angle), math.sin(angle)
+    for u, v in ((cosine, sine), (-sine, cosine)):
+        variance = u * u * shape[0, 0] + 2 * u * v * shape[0, 1] + v * v * shape[1, 1]
+        excess = max(variance * (1 - relative) - sigma**2, 0.0)
+        out[0, 0] += excess * u * u
+        out[0, 1] += excess * u * v
+        out[1, 1] += excess * v * v
+    out[1, 0] = out[0, 1]

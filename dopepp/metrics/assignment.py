@@ -1,0 +1,111 @@
+"""Which detection on an image stands for which instance of one object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dopepp.geometry.camera import transform
+from dopepp.metrics.functional import match
+
+
+class PredictedPose(Protocol):
+    """What the accumulator reads of a detection."""
+
+    @property
+    def object(self) -> str:
+        """Name of the part."""
+
+    @property
+    def score(self) -> float:
+        """Confidence; a better one is matched first."""
+
+    @property
+    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+        """Estimated pose, metres."""
+
+
+class TruePose(Protocol):
+    """What the accumulator reads of a ground-truth instance."""
+
+    @property
+    def label(self) -> str:
+        """Name of the part."""
+
+    @property
+    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+        """True pose, metres."""
+
+    @property
+    def visible_fraction(self) -> float:
+        """Visible share of the full silhouette, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One object on one image.
+
+    Attributes:
+        T_est: Estimated pose of each instance that counts; NaN where it was missed.
+        T_gt: Its true pose.
+        scores: Score of its prediction; NaN where it was missed.
+        stray_scores: Scores of the false positives.
+    """
+
+    T_est: Float[np.ndarray, "counted 4 4"]
+    T_gt: Float[np.ndarray, "counted 4 4"]
+    scores: Float[np.ndarray, "counted"]
+    stray_scores: Float[np.ndarray, "strays"]
+
+
+def assign(
+    centre: Float[np.ndarray, "3"],
+    detections: Sequence[PredictedPose],
+    instances: Sequence[TruePose],
+    min_visible_fraction: float,
+) -> Assignment:
+    """Match one object on one image.
+
+    Instances that count are matched first; predictions left over may then explain themselves by
+    instances that do not, and are ignored; the rest are false positives.
+
+    Args:
+        centre: Of the object's cuboid, object frame, metres.
+        detections: Of this object.
+        instances: Of this object.
+        min_visible_fraction: Visible share of the silhouette from which an instance counts.
+    """
+    counted = [i for i in instances if i.visible_fraction >= min_visible_fraction]
+    hidden = [i for i in instances if not i.visible_fraction >= min_visible_fraction]
+    T_est, scores = np.full((len(counted), 4, 4), np.nan), np.full(len(counted), np.nan)
+    left = []
+    for detection, index in zip(detections, _match(centre, detections, counted), strict=True):
+        if index < 0:
+            left.append(detection)
+        else:
+            T_est[index], scores[index] = detection.T_cam_obj, detection.score
+    unexplained = _match(centre, left, hidden) < 0
+    strays = [float(d.score) for d, stray in zip(left, unexplained, strict=True) if stray]
+    T_gt = np.array([i.T_cam_obj for i in counted], np.float64).reshape(-1, 4, 4)
+    return Assignment(T_est, T_gt, scores, np.array(strays, np.float64))
+
+
+def _match(
+    centre: Float[np.ndarray, "3"],
+    detections: Sequence[PredictedPose],
+    instances: Sequence[TruePose],
+) -> Tensor:
+    """Match by the distance between the centres of the objects' cuboids."""
+    # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
+    estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
+    predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
+    true = [transform(np.asarray(i.T_cam_obj, np.float64), centre) for i in instances]
+    offsets = np.reshape(predicted, (-1, 1, 3)) - np.reshape(true, (1, -1, 3))
+    scores = torch.tensor([float(d.score) for d in detections], dtype=torch.float64)
+    return match(scores, torch.from_numpy(np.linalg.norm(offsets, axis=2)))

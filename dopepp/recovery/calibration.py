@@ -1,0 +1,134 @@
+"""The score: how likely a detection's ADD is below a tenth of the diameter.
+
+A logistic model of what recovery knows about a pose. As long as nobody has fitted it, its weights
+make the score the mean belief; ``evaluate.py tune=true`` fits them on validation images. To add a
+feature, name it in ``options.FEATURES``, compute it in :func:`detection_features` and
+give ``RecoveryOptions`` its weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dopepp.geometry.camera import project, transform
+from dopepp.geometry.cuboid import NUM_CORNERS
+from dopepp.recovery.detection import Detection
+from dopepp.recovery.options import FEATURES
+
+__all__ = ["FEATURES", "calibrated", "detection_features", "fit_weights", "score"]
+
+_CERTAIN: Final = 1e-3
+"""Beliefs nearer to 0 or 1 than this are all the same."""
+
+_EXPONENTS: Final = 4.0
+"""Natural logarithms beyond this are cut off: outliers must not rule the score."""
+
+_TYPICAL_MISFIT: Final = 0.01
+"""Reprojection error over the object's size in the image that counts as neither good nor bad."""
+
+_PASSING: Final = 0.1
+"""ADD over the diameter below which a pose is right."""
+
+_RIDGE: Final = 0.1
+"""Weight of the squared weights, in detections: few or perfectly told ones keep them finite."""
+
+_STEPS: Final = 50
+
+
+_MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
+"""The weights that make the score the mean belief."""
+
+
+def calibrated(
+    detection: Detection,
+    cuboid: Float[np.ndarray, "9 3"],
+    K: Float[np.ndarray, "3 3"],
+    weights: Sequence[float],
+) -> Detection:
+    """Return a detection with its score; with nobody's weights that is the mean belief."""
+    if tuple(weights) == _MEAN_BELIEF:
+        return replace(detection, score=detection.belief)
+    features = detection_features(detection, cuboid, K)
+    return replace(detection, score=float(score(features, np.array(weights))))
+
+
+def detection_features(
+    detection: Detection, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "features"]:
+    """Return the features of one detection.
+
+    Args:
+        detection: Anything but its score is read.
+        cuboid: The object's nine keypoints, metres.
+        K: Camera matrix of the image that the detection's pixels belong to.
+    """
+    T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
+    size = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    pixels = project(transform(T, corners), K)
+    extent = max(float(np.ptp(pixels, axis=0).max()), 1.0)
+    sure = float(np.clip(detection.belief, _CERTAIN, 1 - _CERTAIN))
+    spread = _expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
+    logarithms = np.log(
+        [
+            sure / (1 - sure),
+            max(spread, 1e-9) / _PASSING,
+            max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT),
+        ]
+    )
+    missing = float(np.isfinite(detection.peaks).all(axis=1).mean()) - 1
+    return np.array([1.0, *np.clip(logarithms, -2 * _EXPONENTS, 2 * _EXPONENTS), missing])
+
+
+def score(
+    features: Float[np.ndarray, "*n features"], weights: Float[np.ndarray, "features"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the probability that each pose is right, in (0, 1)."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(features @ weights, -30, 30))))
+
+
+def fit_weights(
+    features: Float[np.ndarray, "n features"], correct: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "features"]:
+    """Fit the weights by maximum likelihood (Newton's method), slightly held back.
+
+    Args:
+        features: One row per detection.
+        correct: Whether it is right; one without an instance is not.
+
+    Raises:
+        ValueError: There are no detections, or none of them is right, or all are.
+    """
+    correct = np.asarray(correct, bool)
+    if not correct.any() or correct.all():
+        raise ValueError("a score needs right and wrong detections to learn from")
+    weights = np.zeros(features.shape[1])
+    ridge = _RIDGE * np.eye(len(weights))
+    ridge[0, 0] = 0.0  # the share of right ones is known well
+    for _ in range(_STEPS):
+        said = score(features, weights)
+        gradient = features.T @ (correct - said) - ridge @ weights
+        hessian = (features * (said * (1 - said))[:, None]).T @ features + ridge
+        step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
+        weights = weights + step * min(1.0, _EXPONENTS / max(float(np.abs(step).max()), 1e-12))
+        if np.abs(step).max() < 1e-9:
+            break
+    return weights
+
+
+def _expected_distance(
+    covariance: Float[np.ndarray, "6 6"], points: Float[np.ndarray, "n 3"]
+) -> float:
+    """Return the RMS distance by which points (camera axes, from the origin) are uncertain."""
+    total = 0.0
+    for x, y, z in points:
+        # A turn ω moves p by ω × p.
+        moves = np.array(
+            [[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1]], np.float64
+        )
+        total += float(np.trace(moves @ covariance @ moves.T))
+    return float(np.sqrt(max(total, 0.0) / len(points)))

@@ -1,0 +1,219 @@
+"""How well an image agrees with a part drawn at a pose: a check for people without labels.
+
+The part's outline and creases are drawn at the pose. Across each of their pixels, the image's
+gradient along the contour's normal is read from well inside to well outside: where the pose is
+right, the strongest edge lies at the contour, and everywhere else it may lie anywhere. Reading the
+same profile at the contour and beside it is the comparison with the contour shifted, and dividing
+each profile by its own sum makes strong and weak contrasts count alike.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import transform
+from dopepp.parts.catalogue import BUILTIN, load_part
+from dopepp.parts.part import Part
+from dopepp.virtual.raster.projection import project_object
+from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.scene import NEAR, SceneObject
+from dopepp.virtual.surface import Surface, make_surface
+
+_log = logging.getLogger(__name__)
+
+REACH: Final = 0.2
+"""Of the part's extent on the image, read to each side of the contour."""
+
+LEAST_REACH_PX: Final = 6
+SHARP: Final = 0.12
+BROAD: Final = 0.4
+"""Widths of "at the contour", of the reach: the sharp one tells good poses apart, the broad one bad
+ones."""
+
+WIDEST_CREASE: Final = 0.9
+"""Cosine between the normals of neighbouring pixels below which there is a crease (26°)."""
+
+MOST_POINTS: Final = 1500
+"""Contour pixels that are read."""
+
+BLUR_PX: Final = 1.0
+"""Of the image before its gradient is taken, against noise."""
+
+FLOOR: Final = 2.0
+"""Gradient, grey levels a pixel, that noise has: a profile of nothing else agrees with nothing."""
+
+
+def agreement(
+    image: UInt8[np.ndarray, "height width 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    surface: Surface,
+) -> float:
+    """Compare outline and creases of a part at a pose with an image.
+
+    Args:
+        image: RGB.
+        K: Camera matrix, pixels.
+        T_cam_obj: The pose to check, metres.
+        surface: The part's surface.
+
+    Returns:
+        0 (edges lie anywhere) to 1 (all lie on the contour). 0, too, where the part is not before
+        the camera or has no contour within the image.
+    """
+    if transform(T_cam_obj, surface.hull)[:, 2].min() <= NEAR:
+        return 0.0
+    contour, extent = _contour(SceneObject(surface, T_cam_obj), K, image.shape[1::-1])
+    if not len(contour):
+        return 0.0
+    reach = max(LEAST_REACH_PX, round(REACH * extent))
+    profiles = _profiles(image, contour, reach)
+    offsets = np.arange(-reach, reach + 1)
+    total = 0.0
+    for width in (SHARP, BROAD):
+        kernel = np.exp(-0.5 * (offsets / (width * reach)) ** 2)
+        shifted = cv2.filter2D(profiles, -1, kernel[None], borderType=cv2.BORDER_CONSTANT)
+        best = shifted.max(axis=1) + FLOOR**2 * kernel.sum()
+        total += float(np.mean(shifted[:, reach] / best))
+    return total / 2
+
+
+def meshes_of(
+    known: Sequence[Part], given: Sequence[str], unit: str | None = None
+) -> dict[str, Surface]:
+    """Find the surfaces of a checkpoint's parts, which itself holds no mesh.
+
+    Args:
+        known: The checkpoint's parts.
+        given: Built-in parts, mesh files named as the part, or ``NAME=FILE``. A single file stands
+            for a single part whatever its name. Built-in parts need not be given.
+        unit: Of the files.
+
+    Returns:
+        A surface for every known part, by name. A mesh other than the one that was trained on is
+        used, and the log warns of it.
+
+    Raises:
+        UserError: A part has no mesh, a given one is not known, or a file cannot be used.
+    """
+    names = [part.name for part in known]
+    chosen = {name: name for name in names if name in BUILTIN}
+    for text in given:
+        name, named, path = text.rpartition("=")
+        path = path if named else text
+        if not named:
+            single = len(names) == len(given) == 1
+            name = names[0] if single else text if text in BUILTIN else Path(text).stem
+        if name not in names:
+            raise UserError(
+                f"--part {text}, which is no part of the checkpoint", ", ".join(names),
+                "name the part: --part NAME=FILE",
+            )  # fmt: skip
+        chosen[name] = path
+    surfaces = {}
+    for part in known:
+        if part.name not in chosen:
+            raise UserError(
+                f"no mesh of {part.name}, which a checkpoint does not hold",
+                "a mesh file for every part of the checkpoint",
+                f"add --part {part.name}=FILE and its --unit",
+            )
+        loaded = load_part(chosen[part.name], unit)
+        if loaded.mesh is None:
+            raise UserError(f"part {chosen[part.name]} without a mesh", "a mesh", "give its file")
+        if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
+            _log.warning(
+                "the mesh of %s (%s) is not the one the checkpoint was trained on",
+                part.name, chosen[part.name],
+            )  # fmt: skip
+        surfaces[part.name] = make_surface(loaded.mesh)
+    return surfaces
+
+
+def _contour(
+    item: SceneObject, K: Float[np.ndarray, "3 3"], size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "points 4"], float]:
+    """Return x, y and normal of contour pixels in the image, and the part's extent, pixels."""
+    seen = project_object(item, K)
+    box = seen.box(size)
+    if box is None:
+        return np.empty((0, 4)), 0.0
+    left, top, right, bottom = box
+    # A frame of one empty pixel, so that the outline is inside the canvas.
+    inverse = np.zeros((bottom - top + 2, right - left + 2, 1), np.float32)
+    ids = np.full(inverse.shape, -1, np.int32)
+    surface = item.surface
+    origin = (left - 1, top - 1)
+    rasterise(seen.hom, surface.faces, surface.closed, NEAR, origin, CENTRE_SAMPLE, inverse, ids, 0)
+    edges = _edges(item, ids[..., 0], inverse[..., 0])
+    rows, columns = np.nonzero(edges)
+    x, y = columns + origin[0], rows + origin[1]
+    inside = (x > 0) & (y > 0) & (x < size[0] - 1) & (y < size[1] - 1)
+    normals = _normals(edges)[rows, columns]
+    points = np.column_stack([x, y, normals])[inside]
+    points = points[:: -(-len(points) // MOST_POINTS) or 1]
+    extent = max(seen.extent[2] - seen.extent[0], seen.extent[3] - seen.extent[1])
+    return points, extent
+
+
+def _edges(
+    item: SceneObject,
+    ids: np.ndarray,
+    inverse: np.ndarray,
+) -> Bool[np.ndarray, "height width"]:
+    """Tell the pixels right before an outline, a step in depth or a crease."""
+    a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    drawn = normals[ids]
+    drawn[ids < 0] = 0.0
+    edges = np.zeros(ids.shape, bool)
+    for axis in (0, 1):
+        one = np.take(drawn, range(ids.shape[axis] - 1), axis)
+        other = np.take(drawn, range(1, ids.shape[axis]), axis)
+        crease = (one * other).sum(axis=-1) < WIDEST_CREASE
+        near = np.take(ids, range(ids.shape[axis] - 1), axis) >= 0
+        far = np.take(ids, range(1, ids.shape[axis]), axis) >= 0
+        crease &= near | far
+        if axis == 0:
+            edges[:-1] |= crease
+        else:
+            edges[:, :-1] |= crease
+    return edges
+
+
+def _normals(edges: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 2"]:
+    """Return unit normals of drawn lines: the main direction of their blurred structure tensor."""
+    soft = cv2.GaussianBlur(edges.astype(np.float32), (0, 0), 1.0)
+    gx, gy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
+    xx, xy, yy = (cv2.GaussianBlur(g, (0, 0), 2.0) for g in (gx * gx, gx * gy, gy * gy))
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _profiles(
+    image: UInt8[np.ndarray, "height width 3"],
+    contour: Float[np.ndarray, "points 4"],
+    reach: int,
+) -> Float[np.ndarray, "points offsets"]:
+    """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
+    soft = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+    # Scharr's filter weighs 16 on each side, two pixels apart.
+    gx = cv2.Scharr(soft, cv2.CV_32F, 1, 0, scale=1 / 32)
+    gy = cv2.Scharr(soft, cv2.CV_32F, 0, 1, scale=1 / 32)
+    offsets = np.arange(-reach, reach + 1)
+    x = (contour[:, 0, None] + offsets * contour[:, 2, None]).astype(np.float32)
+    y = (contour[:, 1, None] + offsets * contour[:, 3, None]).astype(np.float32)
+    along_x, along_y = (
+        cv2.remap(g, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) for g in (gx, gy)
+    )
+    along = along_x * contour[:, None, 2, None] + along_y * contour[:, None, 3, None]
+    return np.asarray((along**2).sum(axis=-1), np.float64)

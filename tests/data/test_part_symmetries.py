@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.data.part_symmetries import choose_symmetries
+from dopepp.errors import UserError
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Part
+
+
+@pytest.fixture
+def stl(tmp_path: Path) -> Path:
+    path = tmp_path / "block.stl"
+    trimesh.creation.box((30, 20, 10)).apply_translation((5, 0, 0)).export(path)
+    return path
+
+
+def test_the_command_prints_an_entry_that_training_reads(stl: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["symmetries", str(stl), "--unit", "mm"])
+    assert result.exit_code == 0
+    entry = json.loads(result.stdout)
+    assert entry["diameter"] == pytest.approx(np.sqrt(1400))
+    assert [entry[f"min_{axis}"] for axis in "xyz"] == pytest.approx([-10, -10, -5])
+    assert [entry[f"size_{axis}"] for axis in "xyz"] == pytest.approx([30, 20, 10])
+    assert entry["symmetries_continuous"] == []
+    rows = np.array(entry["symmetries_discrete"])
+    assert rows.shape == (3, 16)
+    # Half a turn about y or z through x = 5 mm moves the origin by 10 mm.
+    assert sorted(rows[:, 3].tolist()) == pytest.approx([0, 10, 10])
+    for content in (entry, {"4": entry}):
+        path = tmp_path / "models_info.json"
+        path.write_text(json.dumps(content))
+        (read,) = choose_symmetries([load_part(stl, "mm")], str(path))
+        (found,) = choose_symmetries([load_part(stl, "mm")], "auto")
+        assert read.symmetries_discrete is not None
+        assert found.symmetries_discrete is not None
+        assert np.allclose(read.symmetries_discrete, found.symmetries_discrete, atol=1e-12)
+
+
+def test_nothing_is_found_or_taken_away_unless_asked(stl: Path) -> None:
+    part = load_part(stl, "mm")
+    assert choose_symmetries([part], None) == [part]
+    assert part.symmetries_discrete is None
+    (found,) = choose_symmetries([part], "auto")
+    assert choose_symmetries([found], None) == [found]
+    (bare,) = choose_symmetries([found], "none")
+    assert bare.symmetries_discrete is None
+    assert bare.symmetries_continuous == ()
+
+
+def test_mistakes_are_named(stl: Path, tmp_path: Path) -> None:
+    part = load_part(stl, "mm")
+    with pytest.raises(UserError, match=r"data.symmetries=gone.json, no such file.*none, auto"):
+        choose_symmetries([part], "gone.json")
+    path = tmp_path / "other.json"
+    path.write_text('{"1": {"name": "other", "diameter": 10}}')
+    with pytest.raises(UserError, match=r"other.json, which has no block.*other"):
+        choose_symmetries([part], str(path))
+    bare = Part("bare", part.cuboid, part.diameter, part.points)
+    with pytest.raises(UserError, match="part bare without a mesh"):
+        choose_symmetries([bare], "auto")
+    result = CliRunner().invoke(app, ["symmetries", str(stl), "--unit", "mm", "--tolerance", "2"])
+    assert result.exit_code == 2
+    result = CliRunner().invoke(app, ["symmetries", str(tmp_path / "gone.stl")])
+    assert result.exit_code == 2
+
+
+def test_a_round_part_has_its_axis_in_millimetres(tmp_path: Path) -> None:
+    path = tmp_path / "can.stl"
+    trimesh.creation.cylinder(33, 100, sections=48).apply_translation((0, 12, 0)).export(path)
+    entry = json.loads(CliRunner().invoke(app, ["symmetries", str(path)]).stdout)
+    (axis,) = entry["symmetries_continuous"]
+    assert axis["axis"] == pytest.approx([0, 0, 1], abs=1e-6)
+    assert axis["offset"] == pytest.approx([0, 12, 0], abs=1e-3)
+    assert len(entry["symmetries_discrete"]) == 1

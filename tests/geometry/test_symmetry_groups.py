@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dopepp.geometry.symmetry import exact_group, symmetry_group
+
+
+def perturbed(rotation: np.ndarray, degrees: float, rng: np.random.Generator) -> np.ndarray:
+    vector = rng.normal(size=3)
+    vector *= np.radians(degrees) / np.linalg.norm(vector)
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix() @ rotation)
+
+
+def is_group(elements: np.ndarray) -> bool:
+    """Brute force: every product is an element, to rounding."""
+    products = (elements[:, None] @ elements[None]).reshape(-1, 1, 9)
+    return bool(np.abs(products - elements.reshape(1, -1, 9)).max(axis=2).min(axis=1).max() < 1e-9)
+
+
+@pytest.mark.parametrize("name", ["C7", "C12", "D2", "D6", "D12", "T", "O", "I"])
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=5, deadline=None)
+def test_measured_generators_make_the_exact_group(name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frame = Rotation.random(random_state=seed).as_matrix()
+    true = frame @ Rotation.create_group(name).as_matrix() @ frame.T
+    group = exact_group(np.array([perturbed(one, 0.7, rng) for one in true[1:]]))
+    assert group is not None
+    assert len(group) == len(true)
+    assert (group[0] == np.eye(3)).all()
+    assert is_group(group)
+    nearest = np.abs(true[:, None] - group[None]).max(axis=(2, 3)).min(axis=1)
+    assert nearest.max() < np.radians(1.5)
+
+
+def test_exact_generators_stay_exact() -> None:
+    half_turns = np.array([np.diag([-1.0, -1, 1]), np.diag([1.0, -1, -1])])
+    group = exact_group(half_turns)
+    assert group is not None
+    assert {tuple(np.diag(one)) for one in group} == {
+        (1, 1, 1),
+        (-1, -1, 1),
+        (1, -1, -1),
+        (-1, 1, -1),
+    }
+    assert is_group(group)
+
+
+def test_rotations_of_no_small_group_are_refused() -> None:
+    odd = Rotation.from_euler("zx", [[40, 10], [75, 50]], degrees=True).as_matrix()
+    assert exact_group(odd) is None
+
+
+def test_an_axis_that_is_stated_twice_counts_once() -> None:
+    once = symmetry_group(None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))], 0.05)
+    twice = symmetry_group(
+        None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)), ((0.0, 0.0, -2.0), (1.0, 0.0, 3.0))], 0.05
+    )
+    assert np.array_equal(once, twice)
+
+
+def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them() -> None:
+    centre = (0.1, -0.2, 0.3)
+    axes = [(tuple(axis), centre) for axis in np.eye(3).tolist()]
+    group = symmetry_group(None, axes)
+    assert 5_000 < len(group) < 20_000
+    assert np.array_equal(group[0], np.eye(4))
+    assert np.allclose(group[:, :3, :3] @ centre + group[:, :3, 3], centre)
+    wanted = Rotation.random(200, random_state=4)
+    have = Rotation.from_matrix(group[:, :3, :3])
+    away = [(one.inv() * have).magnitude().min() for one in wanted]
+    assert max(away) < 0.2

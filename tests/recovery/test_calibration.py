@@ -1,0 +1,115 @@
+"""The score's logistic model against scipy's, and its features against a simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.recovery.calibration import FEATURES, detection_features, fit_weights, score
+from dopepp.recovery.detection import Detection
+
+K = camera_matrix(600, 600, 320, 240)
+CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
+T = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), np.array([0.02, 0, 0.6]))
+
+
+def detection(**changes: object) -> Detection:
+    keypoints = project(transform(T, CUBOID), K)
+    fields = {
+        "object": "box",
+        "score": 0.5,
+        "belief": 0.5,
+        "T_cam_obj": T,
+        "keypoints": keypoints,
+        "peaks": keypoints.copy(),
+        "reprojection_error_px": 1.0,
+        "covariance": np.diag([1e-4] * 3 + [1e-6] * 3),
+    } | changes
+    return Detection(**fields)  # type: ignore[arg-type]
+
+
+def test_without_fitted_weights_the_score_is_the_mean_belief() -> None:
+    weights = np.array([float(name == "belief") for name in FEATURES])
+    for belief in (0.01, 0.3, 0.97):
+        features = detection_features(detection(belief=belief), CUBOID, K)
+        assert score(features, weights) == pytest.approx(belief)
+
+
+def test_the_spread_is_what_poses_with_this_covariance_scatter_by() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(0, 1, (6, 6)) * [0.01, 0.01, 0.01, 0.001, 0.001, 0.001]
+    covariance = root.T @ root
+    moved = []
+    for step in rng.multivariate_normal(np.zeros(6), covariance, 4000):
+        turned = rotation_vector_to_matrix(step[:3]) @ T[:3, :3]
+        moved.append(transform(make_transform(turned, T[:3, 3] + step[3:]), CUBOID[:8]))
+    distance = np.linalg.norm(np.array(moved) - transform(T, CUBOID[:8]), axis=2)
+    size = np.linalg.norm(CUBOID[0] - CUBOID[6])
+    expected = np.log(np.sqrt((distance**2).mean()) / size / 0.1)
+    features = detection_features(detection(covariance=covariance), CUBOID, K)
+    assert features[FEATURES.index("spread")] == pytest.approx(expected, abs=0.05)
+
+
+def test_missing_keypoints_and_worse_fits_are_seen() -> None:
+    peaks = project(transform(T, CUBOID), K)
+    peaks[[1, 4, 6]] = np.nan
+    whole, poor = (
+        detection_features(one, CUBOID, K)
+        for one in (detection(), detection(peaks=peaks, reprojection_error_px=5.0))
+    )
+    assert whole[FEATURES.index("found")] == 0
+    assert poor[FEATURES.index("found")] == pytest.approx(-3 / 9)
+    misfit = FEATURES.index("misfit")
+    assert poor[misfit] - whole[misfit] == pytest.approx(np.log(5))
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    belief=st.floats(0, 1),
+    error=st.floats(0, 1e6),
+    variance=st.floats(0, 1e12),
+)
+def test_features_are_finite_whatever_the_detection(
+    belief: float, error: float, variance: float
+) -> None:
+    one = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))
+    features = detection_features(one, CUBOID, K)
+    assert features.shape == (len(FEATURES),)
+    assert np.isfinite(features).all()
+    assert 0 < float(score(features, 10 * np.ones(len(FEATURES)))) < 1
+
+
+def test_the_fit_is_the_maximum_of_the_likelihood() -> None:
+    rng = np.random.default_rng(3)
+    features = np.column_stack([np.ones(400), rng.normal(size=(400, 4))])
+    truth = np.array([0.5, 1.5, -1.0, 0.0, 0.3])
+    correct = rng.random(400) < score(features, truth)
+
+    def loss(weights: np.ndarray) -> float:
+        said = features @ weights
+        return float(
+            np.logaddexp(0, said).sum() - said[correct].sum() + 0.05 * (weights[1:] ** 2).sum()
+        )
+
+    fitted = fit_weights(features, correct)
+    np.testing.assert_allclose(fitted, minimize(loss, np.zeros(5), tol=1e-12).x, atol=1e-4)
+    np.testing.assert_allclose(fitted, truth, atol=0.5)
+
+
+def test_perfectly_told_ones_keep_the_weights_finite() -> None:
+    features = np.column_stack([np.ones(20), np.linspace(-1, 1, 20)])
+    weights = fit_weights(features, features[:, 1] > 0)
+    assert np.isfinite(weights).all()
+    assert weights[1] > 1
+
+
+@pytest.mark.parametrize("correct", [np.ones(5, bool), np.zeros(5, bool), np.zeros(0, bool)])
+def test_right_and_wrong_ones_are_needed(correct: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="right and wrong"):
+        fit_weights(np.ones((len(correct), 2)), correct)

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from dopepp.errors import UserError
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.parts.part import Part
+from dopepp.virtual.agreement import agreement, meshes_of
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets import PRESETS
+
+
+def test_falls_with_the_error_of_the_pose() -> None:
+    factory = Factory([servoholder()], PRESETS["table"], 3)
+    errors, values, right = [], [], []
+    for index in range(4):
+        rendered = factory.render(0, index)
+        rng = np.random.default_rng(index)
+        item = rendered.scene.objects[rendered.scene.targets[0]]
+        K = rendered.scene.K
+        right.append(agreement(rendered.image, K, item.T_cam_obj, item.surface))
+        for _ in range(10):
+            share, axis, shift = rng.random(), rng.normal(size=3), rng.normal(size=3)
+            R = rotation_vector_to_matrix(axis / np.linalg.norm(axis) * math.radians(20) * share)
+            shift *= 0.02 * share / np.linalg.norm(shift)
+            T = make_transform(R @ item.T_cam_obj[:3, :3], item.T_cam_obj[:3, 3] + shift)
+            errors.append(share)
+            values.append(agreement(rendered.image, K, T, item.surface))
+    assert spearmanr(errors, values).statistic < -0.5
+    assert np.median(right) > np.median(values) + 0.1
+    assert all(0 <= value <= 1 for value in values)
+
+
+def test_nothing_agrees_with_an_empty_image_or_outside_it() -> None:
+    item = Factory([servoholder()], PRESETS["paper"], 0).scene(0, 0).objects[0]
+    K = PRESETS["paper"].K
+    grey = np.full((480, 640, 3), 90, np.uint8)
+    assert agreement(grey, K, item.T_cam_obj, item.surface) < 0.05
+    for place in ((9.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.0, 0.0, 0.0)):
+        T = make_transform(np.eye(3), np.array(place))
+        assert agreement(grey, K, T, item.surface) == 0.0
+
+
+def known(name: str, mesh_hash: str) -> Part:
+    return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
+
+
+def test_meshes_are_found_by_name_and_compared(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    own = servoholder().mesh_hash
+    with caplog.at_level(logging.WARNING):
+        found = meshes_of([known("servoholder", own), known("other", own)], ["other=servoholder"])
+    assert sorted(found) == ["other", "servoholder"]
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        meshes_of([known("bracket", own)], ["pivconnector"])
+    assert "is not the one the checkpoint was trained on" in caplog.text
+
+
+def test_missing_or_unknown_meshes() -> None:
+    part = known("bracket", "")
+    with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
+        meshes_of([part], [])
+    with pytest.raises(UserError, match="no part of the checkpoint"):
+        meshes_of([part, pivconnector()], ["wrong=servoholder"])
