@@ -1,0 +1,138 @@
+"""Weights and threshold from detections; the tuned checkpoint beside the old one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.errors import UserError
+from dopepp.experiment.tuning import LOUD, Scored, choose, score_images, write_tuned
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.functional import expected_calibration_error
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.spec import build_network
+from dopepp.parts import load_part
+from dopepp.recovery.calibration import FEATURES, score
+from dopepp.recovery.detection import Detection
+
+K = camera_matrix(300, 300, 64, 64)
+
+
+def scored(seed: int, count: int, right: bool = True) -> Scored:
+    """Detections whose belief and spread say how likely they are right."""
+    rng = np.random.default_rng(seed)
+    features = np.column_stack([np.ones(count), rng.normal(size=(count, 4)) - (0 if right else 2)])
+    truth = score(features, np.array([0.0, 2.0, -1.0, -0.5, 0.0]))
+    correct = (rng.random(count) < truth) & right
+    image = rng.permutation(count)
+    return Scored(features, rng.random(count), correct, image, count, count)
+
+
+def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
+    options = choose(scored(0, 3000), scored(1, 1000, right=False))
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    shown, empty = scored(2, 3000), scored(3, 1000, right=False)
+    scores = np.concatenate([score(one.features, weights) for one in (shown, empty)])
+    correct = np.concatenate([shown.correct, empty.correct])
+    assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
+    loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
+    assert loud.mean() <= 2 * LOUD
+    assert options["min_score"] < 1
+
+
+def test_the_threshold_lets_no_more_pass_than_it_may() -> None:
+    shown, empty = scored(4, 500), scored(5, 250, right=False)
+    options = choose(shown, empty)
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
+    assert loud.sum() == int(LOUD * 250)
+
+
+def test_silence_needs_no_threshold() -> None:
+    nothing = Scored(
+        np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
+    )
+    assert choose(scored(6, 300), nothing)["min_score"] < 1e-300
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"correct": np.zeros(50, bool)}, "all of them wrong"),
+        ({"correct": np.ones(50, bool)}, "all of them right"),
+    ],
+)
+def test_nothing_to_learn_from_is_said(change: dict[str, Any], message: str) -> None:
+    nothing = Scored(
+        np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 10, 0
+    )
+    with pytest.raises(UserError, match=message):
+        choose(replace(scored(7, 50), **change), nothing)
+    with pytest.raises(UserError, match="no detection on any"):
+        choose(nothing, nothing)
+
+
+class Images:
+    """Two images of one part: at a place, and nowhere."""
+
+    def __init__(self, part: Any, T: np.ndarray) -> None:
+        instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 1.0)
+        blank = np.zeros((128, 128, 3), np.uint8)
+        self.samples = [Sample(blank, K, [instance]), Sample(blank, K)]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def sample(self, index: int, epoch: int) -> Sample:
+        return self.samples[index]
+
+
+def test_right_is_matched_once_and_within_a_tenth_of_the_diameter() -> None:
+    part = load_part("pivconnector")
+    T = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+
+    def found(shift: float, certainty: float) -> Detection:
+        moved = T.copy()
+        moved[0, 3] += shift * part.diameter
+        keypoints = project_keypoints(part.cuboid, moved, K)
+        return Detection(
+            part.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
+        )
+
+    detections = [found(0.05, 0.9), found(0.05, 0.8), found(0.2, 0.7)]
+    estimator = SimpleNamespace(predict=lambda image, K: detections)
+    result = score_images(estimator, [part], Images(part, T))  # type: ignore[arg-type]
+    # A duplicate is wrong, and so is everything on the image without the part.
+    assert result.correct.tolist() == [True, False, False, False, False, False]
+    assert (result.num_images, result.num_instances) == (2, 1)
+    estimator = SimpleNamespace(predict=lambda image, K: [found(0.2, 0.9)])
+    assert not score_images(estimator, [part], Images(part, T)).correct.any()  # type: ignore[arg-type]
+
+
+SPEC = {
+    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.125},
+    "attention": {"_target_": "dopepp.models.attention.CBAM"},
+    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.125},
+    "activation": "exp",
+    "num_objects": 1,
+}
+
+
+def test_the_tuned_checkpoint_stands_beside_the_old_one(tmp_path: Path) -> None:
+    weights = build_network(SPEC).state_dict()
+    part = load_part("pivconnector")
+    old = Checkpoint(SPEC, weights, [part], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
+    path = write_tuned(old, tmp_path / "best.ckpt", {"min_score": 0.5, "score_bias": -1.5})
+    assert path == tmp_path / "best_tuned.ckpt"
+    tuned = PoseEstimator.load(path)
+    assert tuned.recovery.max_angle_deg == 30.0
+    assert tuned.recovery.min_score == 0.5
+    assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)
