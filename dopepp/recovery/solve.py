@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.compiled import Array, compiled
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.recovery.association import KeypointGroup
 
-SIGMA_FLOOR_PX: Final = 0.5
-"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one."""
+SIGMA_FLOOR_PX: Final = 1.0
+"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
+trained network's maps 1 px did as well as 2 and better than 0.5."""
 
 WIDENINGS: Final = (1.0, 2.0, 4.0)
 """Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
@@ -24,6 +23,10 @@ def solve_group(
 ) -> PnPResult:
     """Solve PnP with each keypoint weighted by its own covariance.
 
+    A covariance is averaged over its directions. How wide a network's peak is tells how far it is
+    off; its shape does not tell whither: taken at their word, ellipses left ADD-0.1d of a trained
+    network at 76 %, circles gave 85 %. Where shapes are right, circles cost 2 points.
+
     A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
     agree on a pose, the deviations are widened and the pose solved again.
 
@@ -32,7 +35,7 @@ def solve_group(
         cuboid: The object's nine keypoints, metres.
         K: Camera matrix of the network's input, pixels.
     """
-    covariance = _floored(group.covariance_px, SIGMA_FLOOR_PX**2)
+    covariance = _averaged(group.covariance_px)
     found = int(np.isfinite(group.position[:, 0]).sum())
     best = None
     for widening in WIDENINGS:
@@ -45,19 +48,7 @@ def solve_group(
     return best
 
 
-@compiled()
-def _floored(covariance: Array, floor: float) -> Array:
-    """Raise the variance along either principal axis to the floor; NaN stays NaN.
-
-    Of a symmetric Σ with eigenvalues λ, f(Σ) = αΣ + βI where αλ + β = f(λ) for both of them.
-    """
-    raised = covariance.copy()
-    for k in range(len(covariance)):
-        a, b, c = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 1, 1]
-        middle, radius = (a + c) / 2, math.hypot((a - c) / 2, b)
-        low, high = max(middle - radius, floor), max(middle + radius, floor)
-        alpha = (high - low) / (2 * radius) if radius > 0.0 else 0.0
-        raised[k] *= alpha
-        for axis in range(2):
-            raised[k, axis, axis] += (high + low) / 2 - alpha * middle
-    return raised
+def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 2"]:
+    """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
+    variance = covariance.trace(axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2
+    return np.asarray(variance[:, None, None] * np.eye(2))
