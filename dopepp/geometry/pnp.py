@@ -19,8 +19,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.compiled import Array, compiled
-from dopepp.geometry.camera import make_transform
-from dopepp.geometry.refine import GATE, NO_GATE, Correspondences, Poses, refine
+from dopepp.geometry.refine import (
+    GATE,
+    NO_GATE,
+    Correspondences,
+    Poses,
+    normal_equations,
+    refine,
+    refine_pose,
+    reproject,
+)
 
 MIN_POINTS: Final = 4
 
@@ -50,6 +58,7 @@ PLATE: Final = 0.3
 """Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
 
 _NO_CAMERA: Final = np.eye(3)
+_UNIT: Final = np.eye(2)
 
 
 @dataclass(frozen=True)
@@ -105,34 +114,52 @@ def solve_pnp(
         raise ValueError(
             f"got {len(object_points)} object points, {len(image_points)} image points"
         )
-    n = len(object_points)
     K = _checked_pinhole(K)
-    # Any number may come in and squares may overflow: what comes of it is looked at instead.
-    with np.errstate(all="ignore"):
-        rays = (image_points - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        if covariance_px is None:
-            sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
-            whitening = np.eye(2) / np.where(sigma > 0, sigma, np.nan)[:, None, None]
-        else:
-            whitening = _inverse_root(np.asarray(covariance_px, np.float64).reshape(n, 2, 2))
-        usable = np.isfinite(object_points).all(1) & (np.abs(rays) < MAX_TANGENT).all(1)
-        usable &= np.isfinite(whitening).all((1, 2)) & (whitening[:, 0, 0] > 0)
-        result = _solve(object_points[usable], rays[usable], K[:2, :2], whitening[usable])
+    n = len(object_points)
+    if covariance_px is None:
+        sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
+        # NaN for what is no deviation; an infinite one has no finite square.
+        with np.errstate(all="ignore"):
+            covariance_px = np.where(sigma > 0, sigma, np.nan)[:, None, None] ** 2 * _UNIT
+    covariance_px = np.asarray(covariance_px, np.float64).reshape(n, 2, 2)
+    rays, whitening, usable = _prepared(object_points, image_points, K, covariance_px)
+    result = _solve(object_points[usable], rays[usable], K[:2, :2], whitening[usable])
     inliers = np.zeros(n, bool)
     inliers[usable] = result.inliers
     return replace(result, inliers=inliers)
 
 
-def _inverse_root(covariance: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 2 2"]:
-    """Return W with WᵀW = Σ⁻¹ (W = L⁻¹ of Cholesky's Σ = LLᵀ); NaN where Σ is no covariance."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    first = np.sqrt(a)
-    second = np.sqrt(c - (b / first) ** 2)
-    roots = np.zeros(covariance.shape)
-    roots[:, 0, 0] = 1 / first
-    roots[:, 1, 0] = -b / (a * second)
-    roots[:, 1, 1] = 1 / second
-    return roots
+@compiled()
+def _prepared(
+    object_points: Array, image_points: Array, K: Array, covariance: Array
+) -> tuple[Array, Array, Array]:
+    """Return rays, whitenings and which points can be used.
+
+    A whitening is W with WᵀW = Σ⁻¹: the inverse of Cholesky's L with Σ = LLᵀ. Any number may come
+    in and squares may overflow: what comes of it is looked at instead.
+    """
+    n = len(object_points)
+    rays, whitening, usable = np.empty((n, 2)), np.zeros((n, 2, 2)), np.empty(n, np.bool_)
+    determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
+    for i in range(n):
+        u, v = image_points[i, 0] - K[0, 2], image_points[i, 1] - K[1, 2]
+        rays[i, 0] = (K[1, 1] * u - K[0, 1] * v) / determinant
+        rays[i, 1] = (K[0, 0] * v - K[1, 0] * u) / determinant
+        a, b, c = covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]
+        first = math.sqrt(a) if a > 0.0 else math.nan
+        rest = c - (b / first) ** 2
+        second = math.sqrt(rest) if rest > 0.0 else math.nan
+        whitening[i, 0, 0] = 1.0 / first
+        whitening[i, 1, 0] = -b / (a * second)
+        whitening[i, 1, 1] = 1.0 / second
+        usable[i] = (
+            np.isfinite(object_points[i]).all()
+            and np.abs(rays[i]).max() < MAX_TANGENT
+            and np.isfinite(whitening[i]).all()
+            and whitening[i, 0, 0] > 0.0
+            and whitening[i, 1, 1] > 0.0
+        )
+    return rays, whitening, usable
 
 
 def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -166,45 +193,56 @@ def _solve(
     if agree.sum() < MIN_POINTS:
         reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
         return replace(nothing, reason=reason)
-    # The gate has done its work: among points that agree, least squares is the better estimate.
-    best = refine(points[agree], poses[:1], NO_GATE)
-    rotation, translation = best.rotations[0], best.translations[0]
-    T = make_transform(rotation, size * translation - rotation @ centre)
-    moved = points.object_points[agree] @ rotation.T + translation
-    off = (moved[:, :2] / moved[:, 2:] - rays[agree]) @ to_px.T
-    error = math.sqrt(float((off**2).sum()) / len(off))
-    return PnPResult(
-        T, error, agree, covariance=_covariance(points[agree], best, size, rotation @ centre)
-    )
-
-
-def _covariance(
-    points: Correspondences, pose: Poses, size: float, centre: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "6 6"]:
-    """Invert the information and carry it from the points' centre to the object's origin.
-
-    A turn ω about the centre is the same turn about the origin and a shift by centre × ω.
-
-    Args:
-        points: The inliers.
-        pose: Their pose, translation in sizes.
-        size: Metres per unit of the points.
-        centre: Origin to centre in camera axes, metres.
-    """
-    return np.asarray(_carried(points.information(pose), size, centre))
+    best = poses[:1]
+    T, error, covariance = _concluded(
+        points.object_points[agree], points.rays[agree], points.whitening[agree], to_px,
+        best.rotations[0], best.translations[0], size, centre,
+    )  # fmt: skip
+    return PnPResult(T, error, agree, covariance=covariance)
 
 
 @compiled()
-def _carried(information: Array, size: float, centre: Array) -> Array:
-    """See :func:`_covariance`."""
+def _concluded(
+    object_points: Array,
+    rays: Array,
+    whitening: Array,
+    to_px: Array,
+    R: Array,
+    t: Array,
+    size: float,
+    centre: Array,
+) -> tuple[Array, float, Array]:
+    """Return pose (metres), RMS error (pixels) and covariance from the points that agree.
+
+    The gate has done its work: among points that agree, least squares is the better estimate. A
+    turn ω about the points' centre is the same turn about the object's origin and a shift by
+    centre × ω.
+    """
+    refine_pose(object_points, rays, whitening, R, t, NO_GATE)
+    residuals = np.empty((len(rays), 2))
+    reproject(object_points, rays, whitening, R, t, residuals)
+    information, gradient = np.empty((6, 6)), np.empty(6)
+    normal_equations(
+        object_points, rays, whitening, R, t, residuals, NO_GATE, information, gradient
+    )
+    moved = np.zeros(3)
+    for k in range(3):
+        moved[k] = R[k, 0] * centre[0] + R[k, 1] * centre[1] + R[k, 2] * centre[2]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, size * t - moved
+    pixels = np.empty(whitening.shape)
+    pixels[:] = to_px
+    reproject(object_points, rays, pixels, R, t, residuals)
+    error = math.sqrt((residuals**2).sum() / len(rays))
     carry = np.zeros((6, 6))
     for k in range(3):
-        carry[k, k], carry[3 + k, k + 3] = 1.0, size
-    carry[3, 1], carry[3, 2] = -centre[2], centre[1]
-    carry[4, 0], carry[4, 2] = centre[2], -centre[0]
-    carry[5, 0], carry[5, 1] = -centre[1], centre[0]
+        carry[k, k], carry[3 + k, 3 + k] = 1.0, size
+    carry[3, 1], carry[3, 2] = -moved[2], moved[1]
+    carry[4, 0], carry[4, 2] = moved[2], -moved[0]
+    carry[5, 0], carry[5, 1] = -moved[1], moved[0]
     # Four points that agree but lie on a line leave a direction open: its variance is huge.
-    return carry @ np.linalg.pinv(information, 1e-15) @ carry.T
+    covariance = carry @ np.linalg.pinv(information, 1e-15) @ carry.T
+    return T, error, covariance
 
 
 def _degenerate(

@@ -89,40 +89,29 @@ class Correspondences:
         """Return reprojection errors in standard deviations; NaN behind the camera."""
         residuals = np.empty((len(poses), len(self.rays), 2))
         for number in range(len(poses)):
-            _residuals(
+            reproject(
                 self.object_points, self.rays, self.whitening, poses.rotations[number],
                 poses.translations[number], residuals[number],
             )  # fmt: skip
         return residuals
 
-    def information(self, pose: Poses) -> Float[np.ndarray, "6 6"]:
-        """Return one pose's Fisher information, all points taken at their word.
 
-        It is about a left increment (rotation vector, translation).
-        """
-        hessian, gradient = np.empty((6, 6)), np.empty(6)
-        residuals = self.residuals(pose)[0]
-        _normal_equations(
-            self.object_points, self.rays, self.whitening, pose.rotations[0],
-            pose.translations[0], residuals, NO_GATE, hessian, gradient,
-        )  # fmt: skip
-        return hessian
-
-
-def refine(points: Correspondences, poses: Poses, gate: float = GATE) -> Poses:
-    """Minimise the Geman–McClure cost Σ r²/(r² + gate²) from each start; r in deviations.
+def refine(points: Correspondences, poses: Poses) -> Poses:
+    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from each start; r in deviations.
 
     A step that does not lower the cost is undone and damped more (Levenberg–Marquardt). A start
     with points behind the camera is returned as it is.
     """
     refined = Poses(poses.rotations.copy(), poses.translations.copy())
     for rotation, translation in zip(refined.rotations, refined.translations, strict=True):
-        _refine(points.object_points, points.rays, points.whitening, rotation, translation, gate)
+        refine_pose(
+            points.object_points, points.rays, points.whitening, rotation, translation, GATE
+        )
     return refined
 
 
 @compiled()
-def _refine(
+def refine_pose(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, gate: float
 ) -> None:
     """Refine one pose in place."""
@@ -130,16 +119,16 @@ def _refine(
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
     moved_R, moved_t = np.empty((3, 3)), np.empty(3)
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
-    if not _residuals(object_points, rays, whitening, R, t, residuals):
+    if not reproject(object_points, rays, whitening, R, t, residuals):
         return
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
-    _normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
+    normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
         solve_damped(hessian, gradient, damping, step)
         _turn(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
-        _residuals(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
+        reproject(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
         moved_cost = _robust_cost(moved_residuals, gate)
         if moved_cost < cost:
             arrived = cost - moved_cost <= CONVERGED * cost + ROUNDING
@@ -147,7 +136,7 @@ def _refine(
             if arrived:
                 return
             damping = max(damping / 10, LEAST_DAMPING)
-            _normal_equations(
+            normal_equations(
                 object_points, rays, whitening, R, t, residuals, gate, hessian, gradient
             )
         else:
@@ -157,7 +146,7 @@ def _refine(
 
 
 @compiled()
-def _residuals(
+def reproject(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, out: Array
 ) -> bool:
     """Write reprojection errors, NaN behind the camera; tell whether all are in front."""
@@ -187,7 +176,7 @@ def _robust_cost(residuals: Array, gate: float) -> float:
 
 
 @compiled()
-def _normal_equations(
+def normal_equations(
     object_points: Array,
     rays: Array,
     whitening: Array,
