@@ -70,7 +70,9 @@ def detection_features(
     T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
     size = float(np.linalg.norm(np.ptp(corners, axis=0)))
     pixels = project(transform(T, corners), K)
-    extent = max(float(np.ptp(pixels, axis=0).max()), 1.0)
+    # A corner without a peak may lie behind the camera, where it has no pixel.
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    extent = max(float(np.ptp(seen, axis=0).max()), 1.0) if len(seen) else 1.0
     sure = float(np.clip(detection.belief, _CERTAIN, 1 - _CERTAIN))
     spread = _expected_distance(detection.covariance, corners @ T[:3, :3].T) / size
     logarithms = np.log(

@@ -69,6 +69,13 @@ def test_missing_keypoints_and_worse_fits_are_seen() -> None:
     assert poor[misfit] - whole[misfit] == pytest.approx(np.log(5))
 
 
+def test_corners_behind_the_camera_have_no_say() -> None:
+    near = T.copy()
+    near[2, 3] = 0.02
+    assert np.isnan(project(transform(near, CUBOID[:8]), K)).any()
+    assert np.isfinite(detection_features(detection(T_cam_obj=near), CUBOID, K)).all()
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     belief=st.floats(0, 1),
