@@ -38,7 +38,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.calibration import FEATURES, detection_features, fit_weights, score
 from dopepp.recovery.detection import Detection
 
-LOUD: Final = 0.01
+LOUD: Final = 0.005
 """Share of validation images without objects on which the threshold may let a detection pass."""
 
 _PASSING: Final = 0.1

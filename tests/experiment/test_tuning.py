@@ -44,7 +44,7 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
     correct = np.concatenate([shown.correct, empty.correct])
     assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
     loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
-    assert loud.mean() <= 2 * LOUD
+    assert loud.mean() <= 4 * LOUD
     assert options["min_score"] < 1
 
 
