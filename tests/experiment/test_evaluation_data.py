@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dopepp.errors import UserError
-from dopepp.experiment.evaluation import chosen_data
+from dopepp.experiment.chosen_data import chosen_data
 from dopepp.experiment.labelled import share_of
 
 STORED: dict[str, Any] = {
