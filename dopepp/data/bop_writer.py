@@ -75,16 +75,15 @@ def prepare_models(root: Path, split: str, parts: Sequence[Part]) -> None:
     write_models(root, parts)
 
 
-class BopWriter:
-    """A :class:`~dopepp.data.writing.Writer` of the scenewise layout.
+class BopFolder:
+    """What the writers of BOP's layouts share: a folder with models beside a split of images.
 
     Args:
         root: The data set's folder.
         parts: The objects, numbered from 1 in this order.
-        split: Name of the folder of scenes.
+        split: Name of the split's folder.
     """
 
-    name = "bop"
     chunk_size = IMAGES_A_SCENE
 
     def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
@@ -98,6 +97,12 @@ class BopWriter:
             UserError: The folder holds something else, or a part has no mesh.
         """
         prepare_models(self.root, self.split, self._parts.parts)
+
+
+class BopWriter(BopFolder):
+    """A :class:`~dopepp.data.writing.Writer` of the scenewise layout."""
+
+    name = "bop"
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an image's files, its records last."""

@@ -19,13 +19,12 @@ from typing import Final
 from dopepp.data.bop_images import encode_png
 from dopepp.data.bop_masks import encode_runs
 from dopepp.data.bop_staging import STAGING, sealing, stage
-from dopepp.data.bop_writer import IMAGES_A_SCENE, PartSurfaces, prepare_models
+from dopepp.data.bop_writer import BopFolder
 from dopepp.data.json_file import read_json
 from dopepp.data.sample import Sample
 from dopepp.data.webdataset_tar import members, read_span
 from dopepp.drawing.png import partial_path, write_whole
 from dopepp.errors import UserError
-from dopepp.parts.part import Part
 
 KEY_FILE: Final = "key_to_shard.json"
 
@@ -36,29 +35,10 @@ Content = dict[str, bytes]
 """An image's members by extension."""
 
 
-class WebdatasetWriter:
-    """A :class:`~dopepp.data.writing.Writer` of BOP-WebDataset shards.
-
-    Args:
-        root: The data set's folder.
-        parts: The objects, numbered from 1 in this order.
-        split: Name of the folder of shards.
-    """
+class WebdatasetWriter(BopFolder):
+    """A :class:`~dopepp.data.writing.Writer` of BOP-WebDataset shards."""
 
     name = "webdataset"
-    chunk_size = IMAGES_A_SCENE
-
-    def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
-        self.root, self.split = Path(root), split
-        self._parts = PartSurfaces(parts)
-
-    def prepare(self) -> None:
-        """Write the models.
-
-        Raises:
-            UserError: The folder holds something else, or a part has no mesh.
-        """
-        prepare_models(self.root, self.split, self._parts.parts)
 
     def write(self, index: int, sample: Sample) -> None:
         """Stage an image."""

@@ -6,7 +6,7 @@ at which the network keeps silent on images without its objects. Both go into a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,34 +15,32 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from dopepp.data.sample import Instance, Sample
+from dopepp.data.sample import Instance, Source
 from dopepp.errors import UserError
 from dopepp.experiment.sources import (
     build_source_without_objects,
     build_test_source,
     build_validation_source,
 )
-from dopepp.geometry.camera import transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.functional import (
-    MATCH_DISTANCE,
-    add,
-    expected_calibration_error,
-    match,
-)
+from dopepp.metrics.assignment import match_by_centre
+from dopepp.metrics.functional import add, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import FEATURES, detection_features, fit_weights, score
+from dopepp.recovery.calibration import (
+    FEATURES,
+    PASSING,
+    detection_features,
+    fit_weights,
+    score,
+)
 from dopepp.recovery.detection import Detection
 
 LOUD: Final = 0.005
 """Share of validation images without objects on which the threshold may let a detection pass."""
-
-_PASSING: Final = 0.1
-"""ADD over the diameter below which a pose is right."""
 
 
 @dataclass(frozen=True)
@@ -179,12 +177,12 @@ def choose(shown: Scored, empty: Scored) -> dict[str, float]:
     return {"min_score": threshold} | {f"score_{name}": float(value) for name, value in named}
 
 
-def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Any) -> Scored:
+def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source) -> Scored:
     """Run an estimator over a source and judge every detection."""
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
-    samples: Iterable[Sample] = (source.sample(index, 0) for index in range(len(source)))
-    for number, sample in enumerate(samples):
+    for number in range(len(source)):
+        sample = source.sample(number, 0)
         found = estimator.predict(sample.image, sample.K)
         for part in parts:
             own = [one for one in found if one.object == part.name]
@@ -213,27 +211,19 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
     return target
 
 
-def _right(part: Part, found: Sequence[Detection], true: Sequence[Instance]) -> list[bool]:
+def _right(
+    part: Part, found: Sequence[Detection], true: Sequence[Instance]
+) -> Bool[np.ndarray, "found"]:
     """Tell which detections of one object on one image are right: matched, and within 0.1 d."""
-    if not found or not true:
-        return [False] * len(found)
-    centre = part.cuboid[CENTROID]
-    at = [np.array([transform(one.T_cam_obj, centre) for one in many]) for many in (found, true)]
-    distances = np.linalg.norm(at[0][:, None] - at[1][None], axis=2)
-    scores = torch.tensor([one.score for one in found], dtype=torch.float64)
-    indices = match(scores, torch.from_numpy(distances), MATCH_DISTANCE).tolist()
-    points = torch.from_numpy(np.asarray(part.points, np.float64))
-    right = []
-    for one, index in zip(found, indices, strict=True):
-        if index < 0:
-            right.append(False)
-            continue
-        poses = [torch.from_numpy(np.asarray(T)) for T in (one.T_cam_obj, true[index].T_cam_obj)]
-        error = add(
-            poses[0][None, :3, :3], poses[0][None, :3, 3],
-            poses[1][None, :3, :3], poses[1][None, :3, 3], points,
-        )  # fmt: skip
-        right.append(bool(error[0] < _PASSING * part.diameter))
+    indices = match_by_centre(part.cuboid[CENTROID], found, true)
+    matched = (indices >= 0).nonzero()[:, 0].tolist()
+    right = np.zeros(len(found), bool)
+    if matched:
+        T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
+        T_gt = torch.from_numpy(np.array([true[int(indices[k])].T_cam_obj for k in matched]))
+        points = torch.from_numpy(np.asarray(part.points, np.float64))
+        errors = add(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
+        right[matched] = (errors < PASSING * part.diameter).numpy()
     return right
 
 

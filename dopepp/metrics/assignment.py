@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dopepp.geometry.camera import transform
@@ -85,23 +85,29 @@ def assign(
     hidden = [i for i in instances if not i.visible_fraction >= min_visible_fraction]
     T_est, scores = np.full((len(counted), 4, 4), np.nan), np.full(len(counted), np.nan)
     left = []
-    for detection, index in zip(detections, _match(centre, detections, counted), strict=True):
+    for detection, index in zip(
+        detections, match_by_centre(centre, detections, counted), strict=True
+    ):
         if index < 0:
             left.append(detection)
         else:
             T_est[index], scores[index] = detection.T_cam_obj, detection.score
-    unexplained = _match(centre, left, hidden) < 0
+    unexplained = match_by_centre(centre, left, hidden) < 0
     strays = [float(d.score) for d, stray in zip(left, unexplained, strict=True) if stray]
     T_gt = np.array([i.T_cam_obj for i in counted], np.float64).reshape(-1, 4, 4)
     return Assignment(T_est, T_gt, scores, np.array(strays, np.float64))
 
 
-def _match(
+def match_by_centre(
     centre: Float[np.ndarray, "3"],
     detections: Sequence[PredictedPose],
     instances: Sequence[TruePose],
-) -> Tensor:
-    """Match by the distance between the centres of the objects' cuboids."""
+) -> Int[Tensor, "detections"]:
+    """Match by the distance between the centres of the objects' cuboids.
+
+    Returns:
+        The instance of each detection, −1 where it has none; see :func:`match`.
+    """
     # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
     predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]

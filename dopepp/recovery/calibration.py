@@ -20,7 +20,7 @@ from dopepp.geometry.cuboid import NUM_CORNERS
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.options import FEATURES
 
-__all__ = ["FEATURES", "calibrated", "detection_features", "fit_weights", "score"]
+__all__ = ["FEATURES", "PASSING", "calibrated", "detection_features", "fit_weights", "score"]
 
 _CERTAIN: Final = 1e-3
 """Beliefs nearer to 0 or 1 than this are all the same."""
@@ -31,7 +31,7 @@ _EXPONENTS: Final = 4.0
 _TYPICAL_MISFIT: Final = 0.01
 """Reprojection error over the object's size in the image that counts as neither good nor bad."""
 
-_PASSING: Final = 0.1
+PASSING: Final = 0.1
 """ADD over the diameter below which a pose is right."""
 
 _RIDGE: Final = 0.1
@@ -78,7 +78,7 @@ def detection_features(
     logarithms = np.log(
         [
             sure / (1 - sure),
-            max(spread, 1e-9) / _PASSING,
+            max(spread, 1e-9) / PASSING,
             max(detection.reprojection_error_px, 1e-9) / (extent * _TYPICAL_MISFIT),
         ]
     )
