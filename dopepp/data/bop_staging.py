@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from dopepp.drawing.png import write_whole
 
 STAGING: Final = ".items"
 """Folder of staged items; readers pass over hidden names."""
+
+T = TypeVar("T")
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
@@ -20,13 +22,15 @@ _ATTEMPTS: Final = 100
 
 def stage(path: Path, content: bytes) -> None:
     """Write a staged item, also if a sealer removes the empty folder in the same moment."""
-    for _ in range(_ATTEMPTS - 1):
-        try:
-            write_whole(path, content)
-        except FileNotFoundError:
-            continue
-        return
-    write_whole(path, content)
+    _persistently(lambda: write_whole(path, content))
+
+
+def staged_items(staging: Path, suffix: str) -> list[Path]:
+    """Return the staged items in order, none if a sealer removes the folder in the same moment."""
+    try:
+        return sorted(staging.glob(f"[0-9]*{suffix}"))
+    except FileNotFoundError:
+        return []
 
 
 @contextmanager
@@ -50,11 +54,7 @@ def sealing(staging: Path) -> Iterator[None]:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
-        except FileNotFoundError:  # the folder went after it was made
-            continue
+        descriptor = _persistently(lambda: _open(path))
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             # Whoever held it before may have removed the file: then the next one makes another.
@@ -63,6 +63,25 @@ def _locked(path: Path) -> Iterator[None]:
                 return
         finally:
             os.close(descriptor)
+
+
+def _open(path: Path) -> int:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return os.open(path, os.O_RDWR | os.O_CREAT)
+
+
+def _persistently(act: Callable[[], T]) -> T:
+    """Return what ``act`` does in a folder that it makes and a sealer may remove at any moment.
+
+    Removed before it is used, the folder is not found; removed between ``mkdir`` and its look at
+    what is in the way, it "exists". What stays in the way is raised in the end.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return act()
+        except (FileNotFoundError, FileExistsError):
+            continue
+    return act()
 
 
 def _is_same(descriptor: int, path: Path) -> bool:

@@ -20,7 +20,7 @@ from dopepp.data.bop_labels import Labels, make_labels
 from dopepp.data.bop_model_writer import write_models
 from dopepp.data.bop_models import INFO_FILE, MODEL_FOLDERS
 from dopepp.data.bop_scene import MAX_SCENE_BYTES
-from dopepp.data.bop_staging import STAGING, sealing, stage
+from dopepp.data.bop_staging import STAGING, sealing, stage, staged_items
 from dopepp.data.json_file import read_json
 from dopepp.data.sample import Sample
 from dopepp.drawing.png import write_whole
@@ -163,7 +163,7 @@ class BopWriter(BopFolder):
 
 
 def _staged(scene: Path) -> list[Path]:
-    return sorted((scene / STAGING).glob("[0-9]*.json"))
+    return staged_items(scene / STAGING, ".json")
 
 
 def _read_scene(path: Path) -> Mapping[str, Any]:

@@ -18,7 +18,7 @@ from typing import Final
 
 from dopepp.data.bop_images import encode_png
 from dopepp.data.bop_masks import encode_runs
-from dopepp.data.bop_staging import STAGING, sealing, stage
+from dopepp.data.bop_staging import STAGING, sealing, stage, staged_items
 from dopepp.data.bop_writer import BopFolder
 from dopepp.data.json_file import read_json
 from dopepp.data.sample import Sample
@@ -110,7 +110,7 @@ class WebdatasetWriter(BopFolder):
         return self.root / self.split / STAGING / f"{chunk:06d}"
 
     def _staged(self, chunk: int) -> list[Path]:
-        return sorted(self._staging(chunk).glob("[0-9]*.tar"))
+        return staged_items(self._staging(chunk), ".tar")
 
 
 def _merged(path: Path, chunk: int, staged: dict[int, Path]) -> Iterator[tuple[str, Content]]:

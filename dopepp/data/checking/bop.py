@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.data.bop_scene import IMAGE_FOLDERS, IMAGE_SUFFIXES, MAX_SCENE_BYTES
-from dopepp.data.bop_staging import STAGING
+from dopepp.data.bop_staging import STAGING, staged_items
 from dopepp.data.checking.bop_image import ImageRecords, Silhouettes, check_image_records
 from dopepp.data.checking.bop_models import Models, load_models
 from dopepp.data.checking.report import CheckReport
@@ -73,7 +73,7 @@ class _Scene:
         for name, found in (("depth", self._depths), ("scene_gt_info.json", infos or {})):
             for image in sorted(found.keys() - set(images)):
                 self._report.add(self._folder / name, str(image), "no such image in the scene")
-        staged = len(list((self._folder / STAGING).glob("[0-9]*.json")))
+        staged = len(staged_items(self._folder / STAGING, ".json"))
         if staged:
             self._report.note(f"{self._folder}: {staged} images written and not yet sealed")
 
