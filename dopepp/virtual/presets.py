@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -114,6 +115,13 @@ class Preset:
         )
 
 
+_MILD_LIGHT: Final = Lighting((1, 2), temperature_k=(5000.0, 8000.0))
+_MILD_MATERIALS: Final = Materials(metal_share=0.05, layer_slope=(0.05, 0.3))
+_GOOD_CAMERA: Final = Sensors(
+    exposure_ev=(-0.2, 0.2), blur_px=(0.2, 0.5), motion_px=(0.5, 1.5),
+    read_noise=(0.3, 1.0), shot_noise=(0.3, 1.5), jpeg_quality=(85, 95),
+)  # fmt: skip
+
 PRESETS: dict[str, Preset] = {
     preset.name: preset
     for preset in (
@@ -126,13 +134,14 @@ PRESETS: dict[str, Preset] = {
         Preset(
             "quickstart", 128, 128, turning=FacingTurning(), placement=FillPlacement(),
             min_visible_fraction=0.7,
-            lighting=Lighting((1, 2), temperature_k=(5000.0, 8000.0)),
-            materials=Materials(metal_share=0.05, layer_slope=(0.05, 0.3)),
+            lighting=_MILD_LIGHT, materials=_MILD_MATERIALS, sensors=_GOOD_CAMERA,
             distractors=Distractors(lookalike_share=0.15),
-            sensors=Sensors(
-                exposure_ev=(-0.2, 0.2), blur_px=(0.2, 0.5), motion_px=(0.5, 1.5),
-                read_noise=(0.3, 1.0), shot_noise=(0.3, 1.5), jpeg_quality=(85, 95),
-            ),
+        ),
+        # The quickstart's light, materials and camera, all poses that show the part's face.
+        Preset(
+            "wide", 128, 128, turning=FacingTurning(in_plane_deg=180.0, tilt_deg=60.0),
+            placement=DistancePlacement(0.12, 0.25, margin=0.2), distractors=Distractors((0, 4)),
+            lighting=_MILD_LIGHT, materials=_MILD_MATERIALS, sensors=_GOOD_CAMERA,
         ),
         # Textured household objects as YCB-Video's first camera sees them (scenes 0000 to 0059).
         Preset(
