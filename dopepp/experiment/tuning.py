@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +26,8 @@ from dopepp.experiment.sources import (
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.assignment import match_by_centre
-from dopepp.metrics.functional import add, expected_calibration_error
+from dopepp.metrics.errors import symmetries
+from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.storage import write_atomic
@@ -187,10 +189,9 @@ def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source
         for part in parts:
             own = [one for one in found if one.object == part.name]
             true = [one for one in sample.instances if one.label == part.name]
-            counted = [one for one in true if one.visible_fraction >= MIN_VISIBLE_FRACTION]
-            num_instances += len(counted)
-            right = _right(part, own, counted)
-            for one, is_right in zip(own, right, strict=True):
+            num_instances += sum(one.visible_fraction >= MIN_VISIBLE_FRACTION for one in true)
+            right, judged = _judge(part, own, true)
+            for one, is_right in zip(compress(own, judged), right[judged], strict=True):
                 features = detection_features(one, part.cuboid, sample.K)
                 rows.append((features, one.score, bool(is_right), number))
     return Scored(
@@ -211,20 +212,31 @@ def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]
     return target
 
 
-def _right(
+def _judge(
     part: Part, found: Sequence[Detection], true: Sequence[Instance]
-) -> Bool[np.ndarray, "found"]:
-    """Tell which detections of one object on one image are right: matched, and within 0.1 d."""
-    indices = match_by_centre(part.cuboid[CENTROID], found, true)
+) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
+    """Tell which detections of one object on one image are right, and which are judged at all.
+
+    As in every evaluation, one that finds an instance too hidden to count is neither right nor
+    wrong. Right is ADD below 0.1 d, for a part with symmetries ADD-S.
+    """
+    counted = [one for one in true if one.visible_fraction >= MIN_VISIBLE_FRACTION]
+    hidden = [one for one in true if one.visible_fraction < MIN_VISIBLE_FRACTION]
+    indices = match_by_centre(part.cuboid[CENTROID], found, counted)
     matched = (indices >= 0).nonzero()[:, 0].tolist()
     right = np.zeros(len(found), bool)
     if matched:
         T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
-        T_gt = torch.from_numpy(np.array([true[int(indices[k])].T_cam_obj for k in matched]))
+        T_gt = torch.from_numpy(np.array([counted[int(indices[k])].T_cam_obj for k in matched]))
         points = torch.from_numpy(np.asarray(part.points, np.float64))
-        errors = add(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
+        error = add_s if len(symmetries(part)) > 1 else add
+        errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
         right[matched] = (errors < PASSING * part.diameter).numpy()
-    return right
+    judged = np.ones(len(found), bool)
+    unmatched = (indices < 0).nonzero()[:, 0].tolist()
+    explained = match_by_centre(part.cuboid[CENTROID], [found[k] for k in unmatched], hidden) >= 0
+    judged[np.array(unmatched, int)[explained.numpy()]] = False
+    return right, judged
 
 
 def _figures(

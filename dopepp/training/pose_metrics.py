@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from dopepp.data.batch import Batch
 from dopepp.data.sample import Instance
-from dopepp.metrics.pose import PoseMetrics
+from dopepp.metrics.pose import MEAN, PoseMetrics
+from dopepp.metrics.row import PoseRow
 from dopepp.parts.part import Part
 from dopepp.training.system import PoseSystem, ValidationOutput
 
-LOGGED = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg", "miss_rate")
+LOGGED: Final = (
+    "add_01d", "add_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm", "ar_mssd",
+    "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
+)  # fmt: skip
+_OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")
+"""These do not exist where nothing was found."""
 
 
 class PoseMetricsCallback(Callback):
     """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
+
+    ``val/selection`` is what the best checkpoint is chosen by: the mean over objects of the exact
+    AUC up to 0.1 m, of ADD, or of ADD-S for an object with symmetries ("ADD(-S)").
 
     The metrics stay readable on :attr:`metrics` for callbacks further down the list.
     """
@@ -45,20 +55,29 @@ class PoseMetricsCallback(Callback):
         """Recover the batch's poses and compare them with its instances."""
         detections = pl_module.recover(outputs, batch)
         truths = batch_instances(batch, pl_module.parts)
-        for found, instances in zip(detections, truths, strict=True):
-            self.metrics.update(found, instances)
+        width = batch.images.shape[-1]
+        cameras = batch.K.double().cpu().numpy()
+        for found, instances, K in zip(detections, truths, cameras, strict=True):
+            self.metrics.update(found, instances, K, width)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the mean over objects; what does not exist (nothing matched) is left out."""
-        mean = self.metrics.compute()["mean"]
-        for name in LOGGED:
-            value = getattr(mean, name)
+        rows = self.metrics.compute()
+        values = {name: getattr(rows[MEAN], name) for name in LOGGED}
+        values["selection"] = _selection([row for name, row in rows.items() if name != MEAN])
+        for name, value in values.items():
             # A selection needs a number even where no object was in the validation images.
-            if value is None and name != "median_rotation_deg":
+            if value is None and name not in _OF_MATCHES:
                 value = math.nan
             if value is not None:
                 on_bar = name == "add_01d"
                 pl_module.log(f"val/{name}", float(value), prog_bar=on_bar, rank_zero_only=False)
+
+
+def _selection(rows: Sequence[PoseRow]) -> float | None:
+    areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in rows]
+    known = [area for area in areas if area is not None]
+    return sum(known) / len(known) if known else None
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:

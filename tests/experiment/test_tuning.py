@@ -20,6 +20,7 @@ from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.spec import build_network
 from dopepp.parts import load_part
+from dopepp.parts.part import Part
 from dopepp.recovery.calibration import FEATURES, score
 from dopepp.recovery.detection import Detection
 
@@ -83,8 +84,9 @@ def test_nothing_to_learn_from_is_said(change: dict[str, Any], message: str) -> 
 class Images:
     """Two images of one part: at a place, and nowhere."""
 
-    def __init__(self, part: Any, T: np.ndarray) -> None:
-        instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 1.0)
+    def __init__(self, part: Any, T: np.ndarray, visible_fraction: float = 1.0) -> None:
+        keypoints = project_keypoints(part.cuboid, T, K)
+        instance = Instance(part.name, T, keypoints, visible_fraction)
         blank = np.zeros((128, 128, 3), np.uint8)
         self.samples = [Sample(blank, K, [instance]), Sample(blank, K)]
 
@@ -95,26 +97,54 @@ class Images:
         return self.samples[index]
 
 
+POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+
+
+def found(part: Part, T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
+    """A detection at a pose, shifted by a share of the part's diameter."""
+    moved = T.copy()
+    moved[0, 3] += shift * part.diameter
+    keypoints = project_keypoints(part.cuboid, moved, K)
+    return Detection(
+        part.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
+    )
+
+
+def estimator(*detections: Detection) -> Any:
+    return SimpleNamespace(predict=lambda image, K: list(detections))
+
+
 def test_right_is_matched_once_and_within_a_tenth_of_the_diameter() -> None:
-    part = load_part("pivconnector")
-    T = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
-
-    def found(shift: float, certainty: float) -> Detection:
-        moved = T.copy()
-        moved[0, 3] += shift * part.diameter
-        keypoints = project_keypoints(part.cuboid, moved, K)
-        return Detection(
-            part.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
-        )
-
-    detections = [found(0.05, 0.9), found(0.05, 0.8), found(0.2, 0.7)]
-    estimator = SimpleNamespace(predict=lambda image, K: detections)
-    result = score_images(estimator, [part], Images(part, T))  # type: ignore[arg-type]
+    part, T = load_part("pivconnector"), POSE
+    detections = [found(part, T, 0.9, 0.05), found(part, T, 0.8, 0.05), found(part, T, 0.7, 0.2)]
+    result = score_images(estimator(*detections), [part], Images(part, T))
     # A duplicate is wrong, and so is everything on the image without the part.
     assert result.correct.tolist() == [True, False, False, False, False, False]
     assert (result.num_images, result.num_instances) == (2, 1)
-    estimator = SimpleNamespace(predict=lambda image, K: [found(0.2, 0.9)])
-    assert not score_images(estimator, [part], Images(part, T)).correct.any()  # type: ignore[arg-type]
+    far = estimator(found(part, T, 0.9, 0.2))
+    assert not score_images(far, [part], Images(part, T)).correct.any()
+
+
+def test_what_finds_a_hidden_instance_is_not_judged() -> None:
+    part = load_part("pivconnector")
+    result = score_images(
+        estimator(found(part, POSE, 0.9), found(part, POSE, 0.8)), [part], Images(part, POSE, 0.05)
+    )
+    # One explains itself by the instance that is hardly visible; its duplicate is wrong, and so
+    # are both on the image without the part.
+    assert result.correct.tolist() == [False, False, False]
+    assert result.scores.tolist() == [0.8, 0.9, 0.8]
+    assert result.num_instances == 0
+
+
+def test_a_symmetric_part_is_right_at_any_of_its_poses() -> None:
+    part = load_part("pivconnector")
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    mirrored = replace(part, points=np.vstack([part.points, part.points @ flip[:3, :3]]))
+    turned = estimator(found(part, POSE @ flip, 0.9))
+    assert not score_images(turned, [mirrored], Images(part, POSE)).correct.any()
+    symmetric = replace(mirrored, symmetries_discrete=flip[None])
+    assert score_images(turned, [symmetric], Images(part, POSE)).correct.tolist() == [True, False]
 
 
 SPEC = {

@@ -110,7 +110,8 @@ def test_figures_pictures_and_throughput(
     # The logged figures are PoseMetrics' on the same poses and the samples' own ground truth.
     metrics = PoseMetrics(run.system.parts)
     for index, detections in enumerate(run.recorder.detections):
-        metrics.update(detections, run.data.val_item(0, index).instances)
+        item = run.data.val_item(0, index)
+        metrics.update(detections, item.instances, item.K, item.size[0])
     assert len(run.recorder.detections) == 3
     mean = metrics.compute()["mean"]
     assert mean.num_instances == 3
@@ -138,6 +139,8 @@ def test_figures_pictures_and_throughput(
     assert float(last["throughput/images_per_s"]) > 0
     assert 0 <= float(last["throughput/loader_wait"]) <= 1
     assert float(last["val/auc_10cm"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+    assert float(last["val/selection"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+    assert 0 < float(last["val/ar_mspd"]) < 1
 
     # … and said in a line per epoch.
     said = [r.getMessage() for r in caplog.get_records("setup") if "images/s" in r.getMessage()]
@@ -175,4 +178,5 @@ def test_no_counted_instance_still_gives_a_number_to_select_by(
 
     run = Run(tmp_path, make_system(system_class=Blind), make_datamodule())
     assert np.isnan(run.recorder.logged["val/auc_10cm"])
+    assert np.isnan(run.recorder.logged["val/selection"])
     assert "val/median_rotation_deg" not in run.recorder.logged

@@ -83,7 +83,9 @@ def test_wrong_changes_are_refused_in_one_line(changes: dict[str, Any], message:
 
 
 def test_unknown_presets_are_refused() -> None:
-    with pytest.raises(UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"):
+    with pytest.raises(
+        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"
+    ):
         customised_preset("shelf", {})
 
 
