@@ -8,10 +8,10 @@ from dopepp.experiment.command_line import entry, run_job
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> None:
-    """Run one training job."""
-    from dopepp.experiment.run import train
+    """Run one job."""
+    from dopepp.experiment.jobs import do_job
 
-    run_job(config, train)
+    run_job(config, do_job)
 
 
 if __name__ == "__main__":

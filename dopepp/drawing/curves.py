@@ -94,7 +94,7 @@ def training_figure(
     x_label: str = "step",
     log_y: bool = False,
 ) -> Figure:
-    """Draw values over training, e.g. losses (paper Fig. 12).
+    """Draw values over training or time, e.g. losses (paper Fig. 12).
 
     Args:
         curves: For each name the steps and the values at them; NaN leaves a gap.

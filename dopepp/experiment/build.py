@@ -47,8 +47,7 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         for name, value in config[group].items():
             check_number(f"{group}.{name}", value, lowest, _MAX_THRESHOLD)
     loss = LOSSES.build(model["loss"])
-    spec = {name: model[name] for name in ("backbone", "attention", "head")}
-    spec |= {"activation": loss.activation, "num_objects": len(parts)}
+    spec = network_spec(model, loss.activation, len(parts))
     network = build_network(spec)
     geometry = MapGeometry(network.stride, maps["sigma"], maps["field_radius"])
     recovery = parse_recovery({"sigma": geometry.sigma, **config["recovery"]})
@@ -77,6 +76,12 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         compile_network=config["compile"],
         symmetry=SymmetryOptions(**config["symmetry"]),
     )
+
+
+def network_spec(model: Mapping[str, Any], activation: str, num_objects: int) -> dict[str, Any]:
+    """Return the network's spec: the chosen components, what the loss and the objects decide."""
+    spec = {name: model[name] for name in ("backbone", "attention", "head")}
+    return {**spec, "activation": activation, "num_objects": num_objects}
 
 
 def _start_from(network: torch.nn.Module, path: Path) -> None:

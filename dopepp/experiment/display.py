@@ -88,6 +88,16 @@ def show_comparison(rows: Sequence[Mapping[str, str]]) -> None:
     console.print(table)
 
 
+def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
+    """Print rows that all have the same columns."""
+    table = Table(title=title)
+    for number, heading in enumerate(rows[0]):
+        table.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row.values())
+    console.print(table)
+
+
 def show_tuning(tuning: Tuning, path: Path) -> None:
     """Print what tuning changed, measured on test images, and where the checkpoint is."""
     shown, empty = tuning.num_images
