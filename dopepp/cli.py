@@ -232,20 +232,28 @@ def download(
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="run folders; a model `dope` comes first")],
-    out: Annotated[Path, typer.Option(help="folder for table and figure")] = Path("compare"),
+    runs: Annotated[
+        list[Path],
+        typer.Argument(help="folders of trainings, of evaluations, or of whole multiruns"),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="folder; a new one under outputs/compare if left out")
+    ] = None,
+    baseline: Annotated[
+        str | None, typer.Option(help="method that Δ is against; `dope` or the first if left out")
+    ] = None,
+    pictures: Annotated[
+        int, typer.Option(min=0, help="test images that are shown through every model")
+    ] = 3,
 ) -> None:
-    """Put finished runs into one table (CSV, Markdown) and one figure."""
-    from dopepp.experiment.compare import compare as compare_results
-    from dopepp.experiment.sweep import read_job
+    """Compare runs: a table with Δ and how sure it is, training and AUC curves, test pictures.
+
+    Runs that differ in their seed only are one method. Failed and unfinished runs are rows.
+    """
+    from dopepp.experiment.compare.compare import compare_paths
 
     with _mistakes_told():
-        results = [read_job(run) for run in runs]
-        names = [result.name for result in results]
-        for run, result in zip(runs, results, strict=True):
-            if names.count(result.name) > 1:
-                result.name = f"{result.name} {run.name}"
-        compare_results(results, out)
+        typer.echo(compare_paths(runs, out, baseline, pictures))
 
 
 @app.command()

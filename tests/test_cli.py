@@ -67,11 +67,14 @@ def test_a_wrong_file_is_one_line_and_code_2(picture: Path) -> None:
 
 
 def test_compare_tells_an_unfinished_run(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".hydra").mkdir(parents=True)
     out = tmp_path / "out"
     done = CliRunner().invoke(app, ["compare", str(tmp_path / "run"), "--out", str(out)])
     assert done.exit_code == 0, done.output
     assert "unfinished" in (out / "compare.md").read_text()
+    done = CliRunner().invoke(app, ["compare", str(tmp_path / "missing")])
+    assert done.exit_code == 2
+    assert "missing, which holds no run" in done.stderr
 
 
 PLATE = "Seeedstudio_Mounting_Plate_SO101.stl"

@@ -44,6 +44,7 @@ def accuracy_figure(
     curves: Mapping[str, Float[np.ndarray, "n"]],
     max_threshold: float = MAX_THRESHOLD,
     title: str = "",
+    colours: Mapping[str, str] | None = None,
 ) -> Figure:
     """Draw accuracy-threshold curves of several methods, their exact AUC in the legend.
 
@@ -51,16 +52,18 @@ def accuracy_figure(
         curves: Errors in metres by name; a miss is infinite.
         max_threshold: End of the curves, metres.
         title: Title of the figure.
+        colours: Matplotlib's names of colours by method; its own order by default.
     """
-    figure, axes = _axes("error threshold (m)", "share of instances below (%)", title)
+    figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
         thresholds, accuracy = accuracy_curve(errors, max_threshold)
         area = 100 * _area(np.asarray(errors, np.float64), max_threshold)
-        axes.plot(thresholds, 100 * accuracy, label=f"{name} (AUC {area:.1f} %)")
+        colour = None if colours is None else colours[name]
+        axes.plot(thresholds, 100 * accuracy, label=f"{name} (AUC {area:.1f} %)", color=colour)
     axes.set_xlim(0, max_threshold)
     axes.set_ylim(0, 101)
     if curves:
-        axes.legend(loc="lower right")
+        axes.legend(loc="lower right", fontsize="small")
     return figure
 
 
@@ -102,7 +105,7 @@ def training_figure(
         x_label: What counts the progress.
         log_y: Logarithmic values; those that are not positive leave a gap.
     """
-    figure, axes = _axes(x_label, y_label, "")
+    figure, axes = figure_with_axes(x_label, y_label)
     for name, (steps, values) in curves.items():
         axes.plot(np.asarray(steps, np.float64), np.asarray(values, np.float64), label=name)
     if log_y:
@@ -112,7 +115,8 @@ def training_figure(
     return figure
 
 
-def _axes(x_label: str, y_label: str, title: str) -> tuple[Figure, Axes]:
+def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figure, Axes]:
+    """Return an empty figure with labelled axes."""
     figure = Figure(figsize=(6.4, 4.4), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.set_xlabel(x_label)

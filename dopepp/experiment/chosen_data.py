@@ -35,6 +35,19 @@ def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> d
     return data
 
 
+def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the data config that a checkpoint names, None where it names none.
+
+    Args:
+        description: What the checkpoint says about its data. Where it is older than
+            ``data.eval_seed``, held-out images were rendered with the training's own seed.
+    """
+    config = description.get("config")
+    if not isinstance(config, dict):
+        return None
+    return {"eval_seed": description.get("seed", 0), **config}
+
+
 def _are_renders(data: Mapping[str, Any]) -> bool:
     """Tell whether the test images are rendered."""
     return data.get("root") is None or data["test"]["renderer"] is not None

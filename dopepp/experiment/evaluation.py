@@ -16,8 +16,8 @@ from dopepp.drawing.png import write_png
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.errors import UserError
 from dopepp.experiment import display, record
-from dopepp.experiment.chosen_data import chosen_data
-from dopepp.experiment.compare import compare
+from dopepp.experiment.chosen_data import chosen_data, trained_on
+from dopepp.experiment.compare.write import compare_reports
 from dopepp.experiment.methods import (
     EstimatorMethod,
     FileMethod,
@@ -27,7 +27,7 @@ from dopepp.experiment.methods import (
 )
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import Report, measure
-from dopepp.experiment.sources import build_test_source
+from dopepp.experiment.sources import build_test_source, held_out_seed
 from dopepp.experiment.tuning import tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag, check_integer
@@ -93,7 +93,7 @@ def measure_and_record(
     if measured.tiles:
         write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
     if len(reports) > 1:
-        compare(reports, run_dir, baseline=reports[0].name)
+        compare_reports(reports, run_dir, baseline=reports[0].name)
     display.show_files(run_dir)
     return reports
 
@@ -163,12 +163,12 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     loaded = [PoseEstimator.load(path, device, config["refine"]) for path in paths]
     own = loaded[-1].checkpoint if loaded else None
     stored = own.data if own is not None else {}
-    data = chosen_data(config, stored.get("config"), str(file if own is None else paths[-1]))
+    data = chosen_data(config, trained_on(stored), str(file if own is None else paths[-1]))
     record.write_config(run_dir, config)
     fingerprint = "" if own is None else own.data_fingerprint
-    environment = record.environment(int(config["seed"]), fingerprint)
+    seed = held_out_seed(data)
+    environment = record.environment(seed, fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
-    seed = int(stored.get("seed", config["seed"]))
     if check_flag("tune", config["tune"]):
         _tune(config, loaded, data, seed, run_dir)
         return []

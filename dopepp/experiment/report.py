@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -16,6 +16,7 @@ from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile
 from dopepp.experiment.methods import Cost, MeasuredPose, Method, image_id
+from dopepp.experiment.test_set import Fingerprint
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow
 from dopepp.models.cost import network_cost
@@ -37,6 +38,9 @@ class Report:
         cost: The network's cost.
         num_images: Size of the test set.
         details: Further plain facts, e.g. the range of poses.
+        rotation_deg: Rotation error of every instance, degrees, infinite where missed, by object.
+        diameters: The objects' diameters, metres.
+        test_set: Fingerprint of the images it was measured on; empty where that is not known.
     """
 
     name: str
@@ -46,6 +50,9 @@ class Report:
     cost: Cost
     num_images: int
     details: dict[str, Any] = field(default_factory=dict)
+    rotation_deg: dict[str, Float[np.ndarray, "instances"]] = field(default_factory=dict)
+    diameters: dict[str, float] = field(default_factory=dict)
+    test_set: str = ""
 
     @property
     def mean(self) -> PoseRow:
@@ -62,18 +69,17 @@ class Report:
                 reference: {name: row.to_record() for name, row in rows.items()}
                 for reference, rows in self.references.items()
             },
-            "add": {
-                name: [float(error) if np.isfinite(error) else None for error in errors]
-                for name, errors in self.errors.items()
-            },
+            "add": _listed(self.errors),
+            "rotation_deg": _listed(self.rotation_deg),
+            "diameters": self.diameters,
+            "test_set": self.test_set,
             "cost": vars(self.cost),
             **self.details,
         }
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Report:
-        """Read ``metrics.json`` back."""
-        known = ("name", "num_images", "objects", "references", "add", "cost")
+        """Read ``metrics.json`` back; files of earlier versions lack the optional fields."""
         return cls(
             name=record["name"],
             rows={name: PoseRow(**row) for name, row in record["objects"].items()},
@@ -81,14 +87,39 @@ class Report:
                 reference: {name: PoseRow(**row) for name, row in rows.items()}
                 for reference, rows in record["references"].items()
             },
-            errors={
-                name: np.array([np.inf if error is None else error for error in errors])
-                for name, errors in record["add"].items()
-            },
+            errors=_unlisted(record["add"]),
             cost=Cost(**record["cost"]),
             num_images=record["num_images"],
-            details={key: value for key, value in record.items() if key not in known},
+            details={key: value for key, value in record.items() if key not in _FIELDS},
+            rotation_deg=_unlisted(record.get("rotation_deg", {})),
+            diameters=dict(record.get("diameters", {})),
+            test_set=record.get("test_set", ""),
         )
+
+
+_FIELDS: Final = (
+    "name", "num_images", "objects", "references", "add", "rotation_deg", "diameters", "test_set",
+    "cost",
+)  # fmt: skip
+"""Keys of ``metrics.json`` that are no details."""
+
+
+def _listed(errors: Mapping[str, Float[np.ndarray, "instances"]]) -> dict[str, list[float | None]]:
+    """Return errors as JSON has them, null where missed."""
+    return {
+        name: [float(error) if np.isfinite(error) else None for error in values]
+        for name, values in errors.items()
+    }
+
+
+def _unlisted(
+    record: Mapping[str, Sequence[float | None]],
+) -> dict[str, Float[np.ndarray, "instances"]]:
+    """Undo :func:`_listed`."""
+    return {
+        name: np.array([np.inf if error is None else error for error in values], np.float64)
+        for name, values in record.items()
+    }
 
 
 @dataclass
@@ -128,8 +159,11 @@ def measure(
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     measured = Measured([], [], {name: [] for name in methods})
     num_images = 0
+    parts = {part.name: part for method in methods.values() for part in method.parts}
+    seen = Fingerprint(list(parts.values()))
     for index, sample in enumerate(samples):
         num_images += 1
+        seen.add(sample)
         image = image_id(sample, index)
         wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
         for number, (name, method) in enumerate(methods.items()):
@@ -149,6 +183,11 @@ def measure(
             {part.name: metrics[name].errors(part.name) for part in method.parts},
             method.cost(seconds[name]),
             num_images,
+            rotation_deg={
+                part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
+            },
+            diameters={part.name: float(part.diameter) for part in method.parts},
+            test_set=seen.word(),
         )
         for name, method in methods.items()
     ]

@@ -19,7 +19,7 @@ from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.sources import build_datamodule
+from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_integer
@@ -120,7 +120,7 @@ def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> 
     return measure_and_record(
         {str(config["model"]["name"]): estimator},
         config["data"],
-        int(config["seed"]),
+        held_out_seed(config["data"]),
         run_dir,
         num_pictures=12,
         details=details,

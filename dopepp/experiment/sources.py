@@ -20,6 +20,7 @@ from dopepp.experiment.renders import (
     kept,
     training_renders,
 )
+from dopepp.models.gate import check_integer
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -38,8 +39,8 @@ def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) 
 
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
-        val=_held_out_source(data, parts, seed, "val"),
-        test=_held_out_source(data, parts, seed, "test"),
+        val=_held_out_source(data, parts, held_out_seed(data), "val"),
+        test=_held_out_source(data, parts, held_out_seed(data), "test"),
         object_names=[part.name for part in parts],
         input_size=input_size,
         batch_size=data["batch_size"],
@@ -56,6 +57,15 @@ def _num_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def held_out_seed(data: Mapping[str, Any]) -> int:
+    """Return the seed of validation and test images, which is not that of the training.
+
+    Raises:
+        UserError: It is no seed.
+    """
+    return check_integer("data.eval_seed", data["eval_seed"], 0, 2**32 - 1)
 
 
 def build_test_source(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> DescribedSource:

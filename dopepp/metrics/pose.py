@@ -36,6 +36,9 @@ MIN_VISIBLE_FRACTION: Final = 0.1
 CurveMeasure = Literal["add", "add_s", "mssd"]
 """An error in metres, of which a curve can be drawn."""
 
+InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
+"""An error that every instance has; angles are in degrees, the others in metres."""
+
 _WIDTH: Final = 1 + 16 + 16 + 9 + 1 + 1
 """One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
 where unknown), score (NaN for a miss)."""
@@ -145,8 +148,8 @@ class PoseMetrics(Metric):
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
 
-    def errors(self, name: str, measure: CurveMeasure = "add") -> Float[np.ndarray, "instances"]:
-        """Return an error of every instance of a part, metres, infinite where it was missed.
+    def errors(self, name: str, measure: InstanceError = "add") -> Float[np.ndarray, "instances"]:
+        """Return an error of every instance of a part, infinite where it was missed.
 
         Like ``compute``, all ranks must call it, unless they have called ``compute`` since the
         last update.

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dopepp.errors import UserError
-from dopepp.experiment.chosen_data import chosen_data
+from dopepp.experiment.chosen_data import chosen_data, trained_on
 from dopepp.experiment.labelled import share_of
 
 STORED: dict[str, Any] = {
@@ -74,3 +74,14 @@ def test_a_folder_that_splits_share_is_divided() -> None:
     assert share_of({"train": "a", "val": "b", "test": "b"}, "test") == (0.5, 1.0)
     assert share_of({"train": "a", "val": "a", "test": "b"}, "val") == (0.8, 1.0)
     assert share_of({"train": "a", "val": "b", "test": "a"}, "test") == (0.8, 1.0)
+
+
+def test_checkpoints_from_before_the_seed_of_evaluation_keep_their_images() -> None:
+    assert trained_on({"seed": 7, "config": STORED}) == {"eval_seed": 7, **STORED}
+    newer = {**STORED, "eval_seed": 3}
+    assert trained_on({"seed": 7, "config": newer}) == newer
+    assert trained_on({"seed": 7}) is None
+    data = chosen_data(
+        {"data": {"eval_seed": 5}}, trained_on({"seed": 7, "config": STORED}), "best.ckpt"
+    )
+    assert data["eval_seed"] == 5

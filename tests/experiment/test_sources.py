@@ -58,6 +58,22 @@ def test_one_seed_decides_everything(tiny: Composer) -> None:
     parts = build_parts(data)
     a, b, other = (build_datamodule(data, parts, seed) for seed in (1, 1, 2))
     assert a.fingerprint() == b.fingerprint() != other.fingerprint()
+    assert not np.array_equal(
+        a.train_source.sample(0, 0).image, other.train_source.sample(0, 0).image
+    )
+
+
+def test_every_seed_is_measured_on_the_same_images(tiny: Composer) -> None:
+    data = tiny()["data"]
+    parts = build_parts(data)
+    one, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
+    changed = build_datamodule({**data, "eval_seed": 5}, parts, 1)
+    for split in ("val_source", "test_source"):
+        images = [getattr(module, split).sample(0, 0).image for module in (one, other, changed)]
+        np.testing.assert_array_equal(images[0], images[1])
+        assert not np.array_equal(images[0], images[2])
+    with pytest.raises(UserError, match=r"data\.eval_seed=-1"):
+        build_datamodule({**data, "eval_seed": -1}, parts, 1)
     np.testing.assert_array_equal(a.train_item(2, 3).image, b.train_item(2, 3).image)
     assert (a.train_item(2, 3).image != other.train_item(2, 3).image).any()
 

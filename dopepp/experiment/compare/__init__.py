@@ -1,0 +1,1 @@
+"""Several results side by side: one table, how sure its differences are, curves and pictures."""

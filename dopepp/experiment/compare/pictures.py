@@ -1,0 +1,105 @@
+"""The same test images through every model (paper Fig. 14): truth green, predictions beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from dopepp.data.sample import Sample
+from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
+from dopepp.drawing.panels import message_picture
+from dopepp.drawing.sheet import Tile
+from dopepp.errors import UserError
+from dopepp.experiment.chosen_data import chosen_data, trained_on
+from dopepp.experiment.compare.entry import Entry
+from dopepp.experiment.compare.runs import Run
+from dopepp.experiment.objects import build_parts
+from dopepp.experiment.sources import build_test_source, held_out_seed
+from dopepp.inference.estimator import PoseEstimator
+
+NUM_PICTURES: Final = 3
+"""Test images, the first ones: nobody has chosen them."""
+
+
+@dataclass
+class _Model:
+    """A method's network, of its first run; or why there is none."""
+
+    name: str
+    run: Run | None = None
+    estimator: PoseEstimator | None = None
+    reason: str = ""
+
+
+def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
+    """Predict on the first test images of the first method whose images can be opened.
+
+    Args:
+        entries: The methods, the baseline first; of several seeds the first run is shown.
+        num: Test images.
+
+    Returns:
+        Row by row the tiles of an image, one per method; and why there are none, where they are
+        missing.
+    """
+    models = [_load(entry) for entry in entries]
+    samples, reasons = [], []
+    for model in models:
+        if model.run is None or model.estimator is None:
+            continue
+        try:
+            samples = _test_images(model.run, model.estimator, num)
+            break
+        except UserError as error:
+            reasons.append(f"{model.name}: {error}")
+    if not samples:
+        why = "; ".join(reasons or [f"{one.name}: {one.reason}" for one in models])
+        return [], f"No pictures of the same test images. {why}"
+    first = next(model for model in models if model.estimator is not None)
+    return [_tile(model, sample, BLUE if model is first and len(models) > 1 else YELLOW)
+            for sample in samples for model in models], ""  # fmt: skip
+
+
+def _load(entry: Entry) -> _Model:
+    """Load a method's checkpoint, or say why that cannot be."""
+    if not entry.runs:
+        return _Model(entry.name, reason="there is no checkpoint of it")
+    run = entry.runs[0]
+    if run.checkpoint is None or not run.checkpoint.is_file():
+        return _Model(entry.name, run, reason=entry.failure or f"no file {run.checkpoint}")
+    try:
+        estimator = PoseEstimator.load(run.checkpoint, refine=run.config.get("refine"))
+    except UserError as error:
+        return _Model(entry.name, run, reason=str(error))
+    return _Model(entry.name, run, estimator)
+
+
+def _test_images(run: Run, estimator: PoseEstimator, num: int) -> list[Sample]:
+    """Open the images that a run was measured on."""
+    stored = trained_on(estimator.checkpoint.data)
+    # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
+    given = run.config if "ckpt_path" in run.config else {}
+    data = chosen_data(given, stored, str(run.checkpoint))
+    if data["root"] is not None:
+        data = {**data, "objects": [part.name for part in estimator.parts]}
+    source = build_test_source(data, build_parts(data), held_out_seed(data))
+    return [source.sample(index, 0) for index in range(min(num, len(source)))]
+
+
+def _tile(model: _Model, sample: Sample, colour: tuple[int, int, int]) -> Tile:
+    """Draw one method's answer to one image."""
+    width, height = sample.size
+    factor = max(1, -(-MIN_WIDTH_PX // width))
+    if model.estimator is None:
+        return Tile(message_picture(width * factor, height * factor, model.reason), model.name)
+    try:
+        found = model.estimator.predict(sample.image, sample.K, depth=sample.depth)
+    except UserError as error:
+        return Tile(message_picture(width * factor, height * factor, str(error)), model.name)
+    known = {part.name for part in model.estimator.parts}
+    truths = [one for one in sample.instances if one.label in known]
+    wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in truths]
+    wireframes += [Wireframe(one.keypoints, colour, "predicted") for one in found]
+    missed = "" if found else ": finds nothing"
+    return Tile(overlay(sample.image, wireframes), f"{model.name}{missed} ({sample.key})")

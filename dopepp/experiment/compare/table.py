@@ -1,0 +1,212 @@
+"""The comparison as a table: a compact one to read, and a full one for programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from dopepp.experiment.compare.differences import COMPARED, differences
+from dopepp.experiment.compare.entry import Entry
+from dopepp.experiment.methods import Cost
+from dopepp.experiment.report import FULL_SIZE_COST
+from dopepp.metrics.bootstrap import Difference
+from dopepp.metrics.pose import MEAN
+from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow
+
+Row = dict[str, str]
+"""Heading to text."""
+
+WITHIN: Final = "within noise"
+BEYOND: Final = "beyond noise"
+
+_HEADLINE: Final = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg",
+                    "miss_rate")  # fmt: skip
+"""Fields of the compact table."""
+
+_TEXTS: Final = ("method", "object", "overrides", "folder")
+"""Headings of what is no number."""
+
+_WITH_INTERVAL: Final = ("add_01d", "auc_10cm", "median_rotation_deg")
+"""Those of them whose Δ stands beside them; the full table has every one of ``COMPARED``."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method on one object, or a reference row.
+
+    Attributes:
+        method: The method's name.
+        object: The object's name, or why there is no result.
+        entry: The method; None for a reference row.
+        row: The measures, averaged over seeds; None where there are none.
+        differences: To the baseline, by the measure's field.
+    """
+
+    method: str
+    object: str
+    entry: Entry | None = None
+    row: PoseRow | None = None
+    differences: Mapping[str, Difference | None] = field(default_factory=dict)
+
+
+def lines(entries: Sequence[Entry]) -> list[Line]:
+    """Return a line per method and object; the first entry with a result is the baseline.
+
+    The reference rows of the baseline's test set stand at the end.
+    """
+    baseline = next((entry for entry in entries if entry.reports), None)
+    found = []
+    for entry in entries:
+        if baseline is None or not entry.reports:
+            found.append(Line(entry.name, f"failed: {entry.failure}"))
+            continue
+        for name in entry.objects:
+            known = {} if entry is baseline else differences(entry, baseline, name)
+            found.append(Line(entry.name, name, entry, entry.row(name), known))
+    for reference, rows in baseline.reports[0].references.items() if baseline else ():
+        row = rows[MEAN] if len(rows) > 2 else next(iter(rows.values()))
+        found.append(Line(reference, row.object, None, row))
+    return found
+
+
+def headline(table: Sequence[Line]) -> list[Row]:
+    """Return the compact table: ``value ± deviation`` and ``Δ [interval]`` in one cell each."""
+    several = _has_seeds(table)
+    columns = {column.field: column for column in COLUMNS}
+    rows = []
+    for line in table:
+        row = {"method": line.method, "object": line.object}
+        if line.row is not None:
+            if several:
+                row["seeds"] = _seeds(line)
+            for name in _HEADLINE:
+                column = columns[name]
+                row[column.heading] = _with_deviation(line, column)
+                if name in _WITH_INTERVAL:
+                    row[f"Δ {column.heading}"] = _interval(line, column)
+            row |= _costs(line, full_size=False)
+        rows.append(row)
+    return rows
+
+
+def full(table: Sequence[Line]) -> list[Row]:
+    """Return everything, a number a cell: measures, deviations, Δ, its interval and verdict."""
+    rows, several = [], _has_seeds(table)
+    for line in table:
+        row = {"method": line.method, "object": line.object}
+        if line.row is not None:
+            row["seeds"] = _seeds(line)
+            for column in COLUMNS:
+                row[column.heading] = column.text(line.row)
+                if several:
+                    row[f"± {column.heading}"] = _deviation(line, column)
+                if column.field in COMPARED:
+                    row |= _difference(line, column)
+            row |= _costs(line, full_size=True)
+        rows.append(row)
+    return rows
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Return a CSV; what a row lacks is empty."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, _header(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def markdown_text(rows: Sequence[Row]) -> str:
+    """Return a Markdown table, numbers to the right."""
+    header = _header(rows)
+    aligned = ["---" if heading in _TEXTS else "---:" for heading in header]
+    cells = [header, aligned, *([row.get(key, "") for key in header] for row in rows)]
+    return "".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in cells
+    )
+
+
+def _header(rows: Sequence[Row]) -> list[str]:
+    """Return all headings in the order of the fullest row."""
+    return list(rows[max(range(len(rows)), key=lambda number: len(rows[number]))])
+
+
+def _has_seeds(table: Sequence[Line]) -> bool:
+    """Tell whether any method was trained with several seeds."""
+    return any(line.entry is not None and len(line.entry.reports) > 1 for line in table)
+
+
+def _seeds(line: Line) -> str:
+    """Return the seeds, or how many there are where they have no numbers."""
+    if line.entry is None or line.entry.seeds == [None]:
+        return ""
+    return ", ".join(sorted(map(str, line.entry.seeds), key=lambda text: (len(text), text)))
+
+
+def _deviation(line: Line, column: Column) -> str:
+    """Return the standard deviation over seeds; empty of one seed."""
+    if line.entry is None or len(line.entry.reports) < 2:
+        return ""
+    value = line.entry.deviation(line.object, column.field)
+    return NOT_AVAILABLE if value is None else f"{value * column.scale:.{max(column.decimals, 1)}f}"
+
+
+def _with_deviation(line: Line, column: Column) -> str:
+    assert line.row is not None
+    deviation = _deviation(line, column)
+    text = column.text(line.row)
+    return f"{text} ± {deviation}" if deviation not in ("", NOT_AVAILABLE) else text
+
+
+def _numbers(difference: Difference, column: Column) -> tuple[str, str, str]:
+    """Return Δ and the ends of its interval in the table's unit."""
+    ends = (difference.value, difference.low, difference.high)
+    value, low, high = (f"{end * column.scale:+.{column.decimals}f}" for end in ends)
+    return value, low, high
+
+
+def _interval(line: Line, column: Column) -> str:
+    """Return Δ with its interval and, where it may be chance, that word."""
+    if column.field not in line.differences:
+        return ""
+    difference = line.differences[column.field]
+    if difference is None:
+        return NOT_AVAILABLE
+    value, low, high = _numbers(difference, column)
+    return f"{value} [{low}, {high}]" + (f" {WITHIN}" if difference.within_noise else "")
+
+
+def _difference(line: Line, column: Column) -> Row:
+    """Return Δ, its interval and its verdict as cells of their own."""
+    headings = [f"Δ {column.heading}{end}" for end in ("", " low", " high", " verdict")]
+    if column.field not in line.differences:
+        return dict.fromkeys(headings, "")
+    difference = line.differences[column.field]
+    if difference is None:
+        return dict.fromkeys(headings, NOT_AVAILABLE)
+    verdict = WITHIN if difference.within_noise else BEYOND
+    return dict(zip(headings, (*_numbers(difference, column), verdict), strict=True))
+
+
+def _costs(line: Line, full_size: bool) -> Row:
+    """Return the cost in this run and, of a narrowed network, at full size beside it."""
+    if line.entry is None:
+        return {}
+    texts = _cost(line.entry.cost, "")
+    wide = line.entry.reports[0].details.get(FULL_SIZE_COST)
+    if full_size and wide is not None:
+        texts |= _cost(Cost(**wide), "full-size ")
+    return texts
+
+
+def _cost(cost: Cost, prefix: str) -> Row:
+    """Return what is known of a cost."""
+    facts = {"parameters": (cost.parameters, ","), "GMACs": (cost.gmacs, ".3f"),
+             "ms/frame": (cost.ms_per_frame, ".1f")}  # fmt: skip
+    return {
+        f"{prefix}{heading}": NOT_AVAILABLE if value is None else format(value, form)
+        for heading, (value, form) in facts.items()
+    }

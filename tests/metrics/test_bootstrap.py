@@ -1,0 +1,215 @@
+"""The paired bootstrap against scipy's, against closed forms, and against what it is for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import bootstrap, norm
+
+from dopepp.errors import UserError
+from dopepp.metrics.bootstrap import STATISTICS, fewest_differing, paired_difference
+
+Z = norm.ppf(0.975)
+
+
+def finite_median(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    return np.asarray(np.median(values, axis=axis))
+
+
+@pytest.mark.parametrize(("name", "reference"), [("mean", np.mean), ("median", finite_median)])
+def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(11)
+    mine, other = rng.gamma(2, 5, 121), rng.gamma(2, 6, 121)
+    mine = 0.6 * mine + 0.4 * other
+    found = paired_difference([mine[None]], [other[None]], name, num_resamples=20_000, seed=5)
+    expected = bootstrap(
+        (mine, other),
+        lambda x, y, axis=-1: reference(x, axis=axis) - reference(y, axis=axis),
+        paired=True, n_resamples=20_000, method="percentile", rng=np.random.default_rng(6),
+    ).confidence_interval  # fmt: skip
+    assert found is not None
+    assert found.value == pytest.approx(reference(mine) - reference(other), abs=1e-12)
+    width = expected.high - expected.low
+    assert found.low == pytest.approx(expected.low, abs=0.04 * width)
+    assert found.high == pytest.approx(expected.high, abs=0.04 * width)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+def test_the_interval_of_a_pass_rate_is_the_normal_one(confidence: float) -> None:
+    rng = np.random.default_rng(2)
+    mine, other = (rng.random(3000) < 0.6).astype(float), (rng.random(3000) < 0.55).astype(float)
+    found = paired_difference(
+        [mine[None]], [other[None]], confidence=confidence, num_resamples=8000
+    )
+    assert found is not None
+    half = norm.ppf((1 + confidence) / 2) * np.std(mine - other) / np.sqrt(3000)
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.06)
+    assert (found.high + found.low) / 2 == pytest.approx(found.value, abs=0.15 * half)
+
+
+def test_seeds_and_instances_add_their_variances() -> None:
+    """Crossed resampling of S seeds and N instances: the closed form of its variance."""
+    rng = np.random.default_rng(3)
+    num_seeds, num = 12, 400
+    d = (
+        rng.normal(0, 1.0, num)[None]
+        + rng.normal(0, 0.15, num_seeds)[:, None]
+        + rng.normal(0, 0.8, (num_seeds, num))
+    )
+    base = rng.normal(size=(num_seeds, num))
+    found = paired_difference([base + d], [base], few_seeds=False, num_resamples=12_000)
+    by_seed, by_instance = d.mean(axis=1), d.mean(axis=0)
+    rest = d - by_seed[:, None] - by_instance + d.mean()
+    variance = by_instance.var() / num + by_seed.var() / num_seeds + rest.var() / (num_seeds * num)
+    assert found is not None
+    assert (found.high - found.low) / 2 == pytest.approx(Z * np.sqrt(variance), rel=0.06)
+
+
+def covered(few_seeds: bool, num_seeds: int, trials: int = 150) -> float:
+    """Share of intervals that hold the true difference, where training noise outweighs the rest."""
+    rng = np.random.default_rng(8)
+    hits = 0
+    for trial in range(trials):
+        noise = rng.normal(0, 0.1, (2, num_seeds))[:, :, None]
+        mine, other = rng.normal(0, 0.05, (2, num_seeds, 40)) + noise
+        found = paired_difference(
+            [mine + 0.05], [other], few_seeds=few_seeds, num_resamples=400, seed=trial
+        )
+        assert found is not None
+        hits += found.low <= 0.05 <= found.high
+    return hits / trials
+
+
+@pytest.mark.parametrize("num_seeds", [2, 3, 5])
+def test_few_seeds_are_not_believed_too_much(num_seeds: int) -> None:
+    assert covered(True, num_seeds) > 0.9
+
+
+def test_without_stretching_three_seeds_are() -> None:
+    """Of three seeds, plain resamples never leave their range: ¼ of all intervals is wrong."""
+    assert covered(False, 3) < 0.88
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000), num=st.integers(1, 30), seeds=st.integers(1, 3),
+    name=st.sampled_from(["mean", "median"]), same=st.booleans(),
+)  # fmt: skip
+def test_the_methods_change_places_and_the_interval_its_sign(
+    seed: int, num: int, seeds: int, name: str, same: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    mine, other = rng.integers(0, 4, (2, seeds, num)).astype(float)
+    options = {"same_seeds": True, "num_resamples": 200, "seed": seed}
+    one = paired_difference([mine], [other], name, **options)  # type: ignore[arg-type]
+    back = paired_difference([other], [mine], name, **options)  # type: ignore[arg-type]
+    assert one is not None
+    assert back is not None
+    assert (one.low, one.high) == pytest.approx((-back.high, -back.low), abs=1e-9)
+    assert one.value == -back.value
+    assert one.num_differing == back.num_differing
+    again = paired_difference([mine], [other], name, **options)  # type: ignore[arg-type]
+    assert one == again
+    itself = paired_difference([mine], [mine], name, same_seeds=same)  # type: ignore[arg-type]
+    assert itself is not None
+    assert itself.value == 0
+    assert itself.within_noise
+    assert itself.num_differing == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(values=st.lists(st.floats(0, 180) | st.just(np.inf) | st.just(np.nan), min_size=1))
+def test_the_median_is_of_what_is_finite(values: list[float]) -> None:
+    finite = [value for value in values if np.isfinite(value)]
+    result = STATISTICS["median"](np.array([values, values]))
+    expected = np.median(finite) if finite else np.nan
+    np.testing.assert_allclose(result, [expected, expected], rtol=1e-12)
+
+
+def test_a_median_over_misses_does_not_exist() -> None:
+    hit, missed = np.full((1, 9), 5.0), np.full((1, 9), np.inf)
+    assert paired_difference([hit], [missed], "median") is None
+    # Nor that of the whole, where one of several seeds has found nothing.
+    half = np.concatenate([hit, missed])
+    assert paired_difference([half], [np.concatenate([hit, hit])], "median") is None
+
+
+def test_resamples_without_a_hit_are_left_out() -> None:
+    mine = np.array([[3.0, np.inf, np.inf, np.inf]])
+    found = paired_difference([mine], [np.full((1, 4), 5.0)], "median", num_resamples=500)
+    assert found is not None
+    assert (found.value, found.low, found.high) == (-2, -2, -2)
+    assert found.within_noise  # all of four instances: not enough
+
+
+@pytest.mark.parametrize("num", [1, 5, 6])
+def test_fewer_than_six_differing_instances_prove_nothing(num: int) -> None:
+    other = np.zeros((1, 50))
+    mine = other.copy()
+    mine[0, :num] = 1
+    found = paired_difference([mine], [other])
+    assert found is not None
+    assert (found.num_differing, found.fewest) == (num, 6)
+    assert found.within_noise == (num < 6)
+    one = paired_difference([mine[:, :1]], [other[:, :1]])
+    assert one is not None
+    assert (one.low, one.high) == (1, 1)
+    assert one.within_noise
+
+
+def test_the_sign_test_says_how_many() -> None:
+    for confidence in (0.5, 0.8, 0.95, 0.99, 0.999):
+        fewest = fewest_differing(confidence)
+        assert 2 * 0.5**fewest <= 1 - confidence + 1e-12 < 2 * 0.5 ** (fewest - 1) + 1e-12
+
+
+def test_several_objects_count_alike() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 2, 30)), rng.random((2, 2, 300))
+    found = paired_difference([a[0], b[0]], [a[1], b[1]])
+    expected = ((a[0] - a[1]).mean() + (b[0] - b[1]).mean()) / 2
+    assert found is not None
+    assert found.value == pytest.approx(expected, abs=1e-12)
+    alone = paired_difference([a[0]], [a[1]])
+    assert alone is not None
+    assert found.high - found.low < alone.high - alone.low
+
+
+def test_pairs_of_seeds_cancel_what_they_share() -> None:
+    rng = np.random.default_rng(4)
+    shared = rng.normal(0, 1, (4, 1))
+    mine, other = shared + 0.2 + rng.normal(0, 0.01, (2, 4, 100))
+    paired = paired_difference([mine], [other])
+    loose = paired_difference([mine], [other], same_seeds=False)
+    fewer = paired_difference([mine], [other[:1]], same_seeds=False)
+    assert paired is not None
+    assert loose is not None
+    assert fewer is not None
+    assert loose.high - loose.low > 10 * (paired.high - paired.low)
+    assert loose.value == pytest.approx(paired.value, abs=1e-12)
+
+
+PASSES = np.array([[0.0, 1.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("mine", "baseline", "options", "message"),
+    [
+        ([PASSES], [PASSES[:, :2]], {}, "same instances"),
+        ([PASSES[:, :0]], [PASSES[:, :0]], {}, "same instances"),
+        ([PASSES[0]], [PASSES[0]], {}, "seeds, instances"),
+        ([PASSES], [PASSES, PASSES], {}, "for each object"),
+        ([], [], {}, "for each object"),
+        ([PASSES, np.concatenate([PASSES, PASSES])], [PASSES, PASSES], {}, "for each object"),
+        ([np.concatenate([PASSES, PASSES])], [PASSES], {}, "2 seeds against 1"),
+        ([PASSES], [PASSES + np.inf], {}, "not finite"),
+        ([PASSES], [PASSES], {"statistic": "mode"}, "'mode'; allowed: mean, median"),
+        ([PASSES], [PASSES], {"confidence": 1.0}, r"confidence=1\.0"),
+        ([PASSES], [PASSES], {"num_resamples": 0}, "num_resamples=0"),
+    ],
+)
+def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, message) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(UserError, match=message):
+        paired_difference(mine, baseline, **options)
