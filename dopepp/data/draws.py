@@ -19,6 +19,7 @@ class Purpose(IntEnum):
     CYCLE = 103
     AUGMENT = 104
     BACKGROUND = 105
+    SHADING = 106
 
 
 def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> np.random.Generator:

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from dopepp.data.sample import Instance, Sample
+from dopepp.data.covering import (
+    MAX_DRAWS,
+    MIN_CONTRAST,
+    MIN_PATCH_PX,
+    BackgroundCrops,
+    covered_instance,
+    has_contrast,
+)
+from dopepp.data.sample import Sample
 from dopepp.data.silhouette import silhouette
 from dopepp.virtual.backgrounds import Backgrounds
-
-MIN_PATCH_PX = 2
-"""A patch of one pixel is a solid colour, whatever it shows."""
 
 
 class RandomMask:
@@ -42,8 +46,8 @@ class RandomMask:
         probability: float = 0.5,
         max_height: float = 0.8,
         max_width: float = 0.8,
-        min_contrast: float = 3.0,
-        max_draws: int = 8,
+        min_contrast: float = MIN_CONTRAST,
+        max_draws: int = MAX_DRAWS,
     ) -> None:
         if not all(0.0 <= share <= 1.0 for share in (probability, max_height, max_width)):
             raise ValueError(
@@ -64,11 +68,8 @@ class RandomMask:
         silhouettes = [
             silhouette(instance, sample.image.shape[:2]) for instance in sample.instances
         ]
-        occupied = np.zeros(sample.image.shape[:2], bool)
-        for seen in silhouettes:
-            occupied |= seen
-        free = cv2.integral(occupied.astype(np.uint8))
-        image, covered = sample.image.copy(), np.zeros_like(occupied)
+        crops = BackgroundCrops(sample.image, silhouettes, self.min_contrast, self.max_draws)
+        image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
         for seen in silhouettes:
             if rng.random() >= self.probability or not seen.any():
                 continue
@@ -77,11 +78,11 @@ class RandomMask:
                 continue
             rows, columns = patch
             size = (rows.stop - rows.start, columns.stop - columns.start)
-            crop = self._crop(sample.image, free, size, rng, other)
+            crop = self._crop(crops, size, rng, other)
             if crop is not None:
                 image[rows, columns], covered[rows, columns] = crop, True
         instances = [
-            _covered_instance(instance, seen, covered)
+            covered_instance(instance, seen, covered)
             for instance, seen in zip(sample.instances, silhouettes, strict=True)
         ]
         return replace(sample, image=image, instances=instances)
@@ -104,52 +105,20 @@ class RandomMask:
 
     def _crop(
         self,
-        image: UInt8[np.ndarray, "height width 3"],
-        free: np.ndarray,
+        crops: BackgroundCrops,
         size: tuple[int, int],
         rng: np.random.Generator,
         other: Backgrounds,
     ) -> UInt8[np.ndarray, "rows columns 3"] | None:
         """Draw a crop from the image's background, else from another picture."""
-        height, width = size
-        # Sum of occupied pixels in every window of this size, from the integral image.
-        occupied = (
-            free[height:, width:]
-            - free[:-height, width:]
-            - free[height:, :-width]
-            + free[:-height, :-width]
-        )
-        places = np.flatnonzero(occupied.ravel() == 0)
-        for _ in range(self.max_draws if len(places) else 0):
-            row, column = divmod(int(rng.choice(places)), occupied.shape[1])
-            crop = image[row : row + height, column : column + width]
-            if self._has_contrast(crop):
-                return crop
+        crop = crops.draw(size, rng)
+        if crop is not None:
+            return crop
         for _ in range(self.max_draws):
-            crop = _crop_of_other(other, image.shape[:2], size, rng)
-            if self._has_contrast(crop):
+            crop = _crop_of_other(other, crops.image.shape[:2], size, rng)
+            if has_contrast(crop, self.min_contrast):
                 return crop
         return None
-
-    def _has_contrast(self, crop: UInt8[np.ndarray, "rows columns 3"]) -> bool:
-        return float(crop.reshape(-1, 3).std(axis=0).max()) >= self.min_contrast
-
-
-def _covered_instance(
-    instance: Instance,
-    seen: Bool[np.ndarray, "height width"],
-    covered: Bool[np.ndarray, "height width"],
-) -> Instance:
-    before = int(np.count_nonzero(seen))
-    if before == 0:
-        return instance
-    share = int(np.count_nonzero(seen & covered)) / before
-    return replace(
-        instance,
-        mask=None if instance.mask is None else instance.mask & ~covered,
-        visible_fraction=instance.visible_fraction * (1 - share),
-        masked_fraction=share,
-    )
 
 
 def _crop_of_other(
