@@ -88,11 +88,13 @@ def show_comparison(rows: Sequence[Mapping[str, str]]) -> None:
     console.print(table)
 
 
-def show_table(title: str, rows: Sequence[Mapping[str, str]]) -> None:
-    """Print rows that all have the same columns."""
+def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
+    """Print rows that all have the same columns, the first ones of words, the others of numbers."""
     table = Table(title=title)
     for number, heading in enumerate(rows[0]):
-        table.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
+        table.add_column(
+            heading, justify="left" if number < num_labels else "right", overflow="fold"
+        )
     for row in rows:
         table.add_row(*row.values())
     console.print(table)

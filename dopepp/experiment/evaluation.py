@@ -16,6 +16,7 @@ from dopepp.drawing.png import write_png
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.errors import UserError
 from dopepp.experiment import display, record
+from dopepp.experiment.breakdown import record_breakdown
 from dopepp.experiment.chosen_data import chosen_data, trained_on
 from dopepp.experiment.compare.write import compare_reports
 from dopepp.experiment.methods import (
@@ -26,7 +27,11 @@ from dopepp.experiment.methods import (
     object_numbers,
 )
 from dopepp.experiment.objects import build_parts
+from dopepp.experiment.pass_rates import reported_rates
+from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.report import Report, measure
+from dopepp.experiment.shading import check_masks, check_methods, measure_shading
+from dopepp.experiment.shading_report import record_shading
 from dopepp.experiment.sources import build_test_source, held_out_seed
 from dopepp.experiment.tuning import tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
@@ -45,19 +50,21 @@ def measure_and_record(
     results: Mapping[str, Path] | None = None,
     bop_csv: bool = False,
     all_measures: bool = False,
+    protocols: Protocols | None = None,
 ) -> list[Report]:
     """Measure methods on a test set; show and write tables, curves and pictures.
 
     Args:
         estimators: By name, the baseline first where there is one.
         data: The data config.
-        seed: Of the test images, where they are renders.
+        seed: Of the test images, where they are renders, and of the shading's patches.
         run_dir: Folder that everything is written to.
         num_pictures: How many of the first images are drawn.
         details: Further plain facts of the last report.
         results: BOP challenge CSVs of other methods, by name.
         bop_csv: Whether to write one of each method.
         all_measures: Whether to print the symmetric measures of every object.
+        protocols: What else is measured; None for nothing.
 
     Returns:
         A report per estimator, then per file.
@@ -65,6 +72,7 @@ def measure_and_record(
     Raises:
         UserError: The data or a file are wrong.
     """
+    protocols = protocols or Protocols()
     parts = _parts_of(list(estimators.values()), data)
     source = build_test_source(data, parts, seed)
     numbers = object_numbers(data, parts)
@@ -73,6 +81,9 @@ def measure_and_record(
         **{name: EstimatorMethod(one, parts) for name, one in estimators.items()},
         **files,
     }
+    if protocols.shading:
+        check_methods(methods)
+        check_masks(source)
     samples = (source.sample(index, 0) for index in range(len(source)))
     measured = measure(methods, samples, num_pictures)
     for file in files.values():
@@ -94,6 +105,12 @@ def measure_and_record(
         write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
     if len(reports) > 1:
         compare_reports(reports, run_dir, baseline=reports[0].name)
+    rates = reported_rates(data, parts)
+    for quantity in protocols.by:
+        record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
+    if protocols.shading:
+        shaded = measure_shading(methods, source, protocols.shading, seed, reports, num_pictures)
+        record_shading(run_dir, *shaded, rates)
     display.show_files(run_dir)
     return reports
 
@@ -152,6 +169,7 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     Raises:
         UserError: A checkpoint, an option, a file or the data are wrong.
     """
+    protocols = Protocols.of(config)
     device = config["device"]
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -170,6 +188,10 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     environment = record.environment(seed, fingerprint)
     record.write_json(run_dir / record.VERSIONS_FILE, environment)
     if check_flag("tune", config["tune"]):
+        if protocols:
+            raise UserError(
+                "tune=true with shading or by", "one of the two", "tune first, then measure"
+            )
         _tune(config, loaded, data, seed, run_dir)
         return []
     names = _names(loaded, [] if file is None else [_method_name(config)])
@@ -182,6 +204,7 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
         results={} if file is None else {names[-1]: Path(file)},
         bop_csv=check_flag("bop_csv", config["bop_csv"]),
         all_measures=check_flag("all_measures", config["all_measures"]),
+        protocols=protocols,
     )
 
 

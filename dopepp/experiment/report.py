@@ -130,11 +130,13 @@ class Measured:
         reports: One per method.
         tiles: Pictures of the first images.
         poses: Every pose of each method.
+        metrics: The accumulator of each method.
     """
 
     reports: list[Report]
     tiles: list[Tile]
     poses: dict[str, list[MeasuredPose]]
+    metrics: dict[str, PoseMetrics]
 
 
 def measure(
@@ -157,7 +159,7 @@ def measure(
         for name, method in methods.items()
     }
     seconds: dict[str, list[float]] = {name: [] for name in methods}
-    measured = Measured([], [], {name: [] for name in methods})
+    measured = Measured([], [], {name: [] for name in methods}, metrics)
     num_images = 0
     parts = {part.name: part for method in methods.values() for part in method.parts}
     seen = Fingerprint(list(parts.values()))

@@ -54,12 +54,14 @@ class Assignment:
     Attributes:
         T_est: Estimated pose of each instance that counts; NaN where it was missed.
         T_gt: Its true pose.
+        visible_fractions: Visible share of its silhouette.
         scores: Score of its prediction; NaN where it was missed.
         stray_scores: Scores of the false positives.
     """
 
     T_est: Float[np.ndarray, "counted 4 4"]
     T_gt: Float[np.ndarray, "counted 4 4"]
+    visible_fractions: Float[np.ndarray, "counted"]
     scores: Float[np.ndarray, "counted"]
     stray_scores: Float[np.ndarray, "strays"]
 
@@ -95,7 +97,8 @@ def assign(
     unexplained = match_by_centre(centre, left, hidden) < 0
     strays = [float(d.score) for d, stray in zip(left, unexplained, strict=True) if stray]
     T_gt = np.array([i.T_cam_obj for i in counted], np.float64).reshape(-1, 4, 4)
-    return Assignment(T_est, T_gt, scores, np.array(strays, np.float64))
+    visible = np.array([i.visible_fraction for i in counted], np.float64)
+    return Assignment(T_est, T_gt, visible, scores, np.array(strays, np.float64))
 
 
 def match_by_centre(

@@ -39,9 +39,9 @@ CurveMeasure = Literal["add", "add_s", "mssd"]
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
 """An error that every instance has; angles are in degrees, the others in metres."""
 
-_WIDTH: Final = 1 + 16 + 16 + 9 + 1 + 1
+_WIDTH: Final = 1 + 16 + 16 + 9 + 1 + 1 + 1
 """One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
-where unknown), score (NaN for a miss)."""
+where unknown), visible fraction, score (NaN for a miss)."""
 
 
 class PoseMetrics(Metric):
@@ -78,7 +78,7 @@ class PoseMetrics(Metric):
         self.add_state("poses", default=[], dist_reduce_fx="cat")
         # Object index and score of every false positive.
         self.add_state("strays", default=[], dist_reduce_fx="cat")
-        self._gathered: dict[str, _Gathered] = {}
+        self._gathered: dict[str, Gathered] = {}
 
     def update(
         self,
@@ -125,6 +125,7 @@ class PoseMetrics(Metric):
                 found.T_est.reshape(n, 16),
                 found.T_gt.reshape(n, 16),
                 np.tile(camera, (n, 1)),
+                found.visible_fractions[:, None],
                 found.scores[:, None],
             )
             self.poses.append(torch.from_numpy(np.hstack(columns).ravel()).to(self.device))
@@ -140,7 +141,7 @@ class PoseMetrics(Metric):
         poses, strays = _table(self.poses, _WIDTH), _table(self.strays, 2)
         rows = {}
         for index, (name, part) in enumerate(self.parts.items()):
-            gathered = _Gathered(
+            gathered = Gathered(
                 part, poses[poses[:, 0] == index, 1:], strays[strays[:, 0] == index, 1]
             )
             self._gathered[name] = gathered
@@ -174,6 +175,14 @@ class PoseMetrics(Metric):
             table[reference][MEAN] = mean_row(rows, reference)
         return table
 
+    def instances(self, name: str) -> Gathered:
+        """Return the instances of a part that count, in the order of :meth:`errors`.
+
+        All ranks must call it, as :meth:`errors`.
+        """
+        self.compute()
+        return self._gathered[name]
+
     def plot(self, measure: CurveMeasure = "add") -> tuple[Figure, Axes]:
         """Draw each object's accuracy-threshold curve up to 0.1 m, of ADD or another error."""
         curves = {name: self.errors(name, measure) for name in self.parts}
@@ -181,17 +190,28 @@ class PoseMetrics(Metric):
         return figure, figure.axes[0]
 
 
-class _Gathered:
-    """All instances of one object, and the scores of its false positives."""
+class Gathered:
+    """All instances of one object that count, and the scores of its false positives.
+
+    Attributes:
+        part: The object.
+        T_gt: True poses, metres.
+        K: Camera matrices, pixels; NaN where unknown.
+        visible_fractions: Visible share of each silhouette, in [0, 1].
+        scores: Score of each instance's prediction, (n, 1); NaN for a miss.
+        errors: Every error of each instance.
+        strays: Scores of the false positives.
+    """
 
     def __init__(
-        self, part: Part, table: Float[Tensor, "n 43"], strays: Float[Tensor, "strays"]
+        self, part: Part, table: Float[Tensor, "n 44"], strays: Float[Tensor, "strays"]
     ) -> None:
-        T_est, T_gt, K, width, self.scores = torch.split(table, [16, 16, 9, 1, 1], dim=1)
-        self.T_gt, self.strays = T_gt.reshape(-1, 4, 4), strays
-        self.errors = PoseErrors.of(
-            part, T_est.reshape(-1, 4, 4), self.T_gt, K.reshape(-1, 3, 3), width[:, 0]
+        T_est, T_gt, K, width, visible, self.scores = torch.split(
+            table, [16, 16, 9, 1, 1, 1], dim=1
         )
+        self.part, self.strays, self.visible_fractions = part, strays, visible[:, 0]
+        self.T_gt, self.K = T_gt.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
+        self.errors = PoseErrors.of(part, T_est.reshape(-1, 4, 4), self.T_gt, self.K, width[:, 0])
 
     def row(self, part: Part, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""

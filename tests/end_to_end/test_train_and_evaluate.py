@@ -126,6 +126,33 @@ def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
     assert set(rows(folder / "auc.csv")[0]) >= {"dopepp pivconnector"}
 
 
+def test_shading_and_bins_are_measured_of_both_networks(
+    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
+) -> None:
+    run, _ = trained
+    best, last = (run / "checkpoints" / name for name in ("best.ckpt", "last.ckpt"))
+    done = call(
+        "evaluate.py", f"ckpt_path={best}", f"baseline={last}", "shading=[0.4,0.8]",
+        "by=[distance,size]", "num_bins=2", f"output_dir={tmp_path}",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    folder = find_run(tmp_path)
+    shading = rows(folder / "shading.csv")
+    assert [row["method"] for row in shading] == ["dopepp (baseline)"] * 3 + ["dopepp"] * 3
+    assert [row["share"] for row in shading] == ["0.0", "0.4", "0.8"] * 2
+    assert {row["num_instances"] for row in shading} == {"3"}
+    bins = rows(folder / "by_distance.csv")
+    assert [row["num_instances"] for row in bins] in (["1", "1", "2", "2"], ["2", "2", "1", "1"])
+    for name in ("shading.png", "shading_examples.png", "by_distance.png", "by_size.png"):
+        assert cv2.imread(str(folder / name)) is not None, name
+    assert "shading: share of the visible area covered" in done.out
+    wrong = ("by=[distance,colour]", "shading=[20]", "tune=true")
+    for option in wrong:
+        others = ["by=size"] if option == "tune=true" else []
+        done = call("evaluate.py", f"ckpt_path={best}", option, *others, f"output_dir={tmp_path}")
+        assert option.partition("=")[0] in done.line
+
+
 def test_other_data_must_show_the_checkpoints_objects(
     trained: tuple[Path, Any], call: Runner, tmp_path: Path
 ) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -25,9 +23,6 @@ BEYOND: Final = "beyond noise"
 _HEADLINE: Final = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg",
                     "miss_rate")  # fmt: skip
 """Fields of the compact table."""
-
-_TEXTS: Final = ("method", "object", "overrides", "folder")
-"""Headings of what is no number."""
 
 _WITH_INTERVAL: Final = ("add_01d", "auc_10cm", "median_rotation_deg")
 """Those of them whose Δ stands beside them; the full table has every one of ``COMPARED``."""
@@ -108,30 +103,6 @@ def full(table: Sequence[Line]) -> list[Row]:
             row |= _costs(line, full_size=True)
         rows.append(row)
     return rows
-
-
-def csv_text(rows: Sequence[Row]) -> str:
-    """Return a CSV; what a row lacks is empty."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, _header(rows), restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def markdown_text(rows: Sequence[Row]) -> str:
-    """Return a Markdown table, numbers to the right."""
-    header = _header(rows)
-    aligned = ["---" if heading in _TEXTS else "---:" for heading in header]
-    cells = [header, aligned, *([row.get(key, "") for key in header] for row in rows)]
-    return "".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in cells
-    )
-
-
-def _header(rows: Sequence[Row]) -> list[str]:
-    """Return all headings in the order of the fullest row."""
-    return list(rows[max(range(len(rows)), key=lambda number: len(rows[number]))])
 
 
 def _has_seeds(table: Sequence[Line]) -> bool:

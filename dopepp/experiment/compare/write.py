@@ -13,8 +13,9 @@ from dopepp.drawing.png import write_whole
 from dopepp.experiment import display
 from dopepp.experiment.compare.entry import Entry, ordered
 from dopepp.experiment.compare.notes import notes
-from dopepp.experiment.compare.table import csv_text, full, headline, lines, markdown_text
+from dopepp.experiment.compare.table import full, headline, lines
 from dopepp.experiment.report import Report
+from dopepp.experiment.tables import csv_text, markdown_text
 
 TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"

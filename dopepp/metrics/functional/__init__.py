@@ -9,6 +9,7 @@ against an independent implementation.
 """
 
 from dopepp.metrics.functional.calibration import expected_calibration_error
+from dopepp.metrics.functional.confidence import wilson_interval
 from dopepp.metrics.functional.distances import add, add_s, mssd
 from dopepp.metrics.functional.matching import MATCH_DISTANCE, average_precision, match
 from dopepp.metrics.functional.offsets import rotation_error_deg, translation_error
@@ -40,4 +41,5 @@ __all__ = [
     "rotation_error_deg",
     "translation_error",
     "vsd",
+    "wilson_interval",
 ]
