@@ -76,27 +76,19 @@ def show_report(report: Report, all_measures: bool = False) -> None:
         console.print(table)
 
 
-def show_comparison(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print a comparison table of rows by heading; a row may lack columns."""
-    table = Table(title="comparison")
-    fullest = max(rows, key=len)
-    header = list(fullest)
-    for number, heading in enumerate(header):
-        table.add_column(heading, justify="left" if number < 2 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*(row.get(heading, "") for heading in header))
-    console.print(table)
-
-
 def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
-    """Print rows that all have the same columns, the first ones of words, the others of numbers."""
+    """Print rows by heading, the first columns of words, the others of numbers.
+
+    The columns are those of the fullest row; a row may lack some.
+    """
     table = Table(title=title)
-    for number, heading in enumerate(rows[0]):
+    header = list(rows[max(range(len(rows)), key=lambda number: len(rows[number]))])
+    for number, heading in enumerate(header):
         table.add_column(
             heading, justify="left" if number < num_labels else "right", overflow="fold"
         )
     for row in rows:
-        table.add_row(*row.values())
+        table.add_row(*(row.get(heading, "") for heading in header))
     console.print(table)
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from dopepp.errors import UserError
 from dopepp.experiment.cost import measure_cost
+from dopepp.experiment.paper_table import PaperTable
 from dopepp.experiment.run import train
 
 JOBS: Final[Mapping[str, Callable[[dict[str, Any], Path], object]]] = {
@@ -28,4 +29,6 @@ def do_job(config: dict[str, Any], run_dir: Path) -> object:
     job = config["job"]
     if not isinstance(job, str) or job not in JOBS:
         raise UserError(f"job={job!r}", ", ".join(JOBS), "choose one of them")
+    if config["table"] is not None:
+        PaperTable.of(config["table"])  # a mistake in it shows before the work, not after
     return JOBS[job](config, run_dir)

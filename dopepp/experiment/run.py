@@ -18,7 +18,9 @@ from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
 from dopepp.experiment.objects import build_parts
+from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
+from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
@@ -48,6 +50,9 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     parts = build_parts(config["data"])
     datamodule = build_datamodule(config["data"], parts, seed)
     datamodule.check_objects()
+    protocols = Protocols.of(config)
+    if protocols.shading:
+        check_masks(datamodule.test_source)
     fingerprint = datamodule.fingerprint()
     system = build_system(config, parts, fingerprint)
     resume_from = _resume_path(config["resume"], system)
@@ -66,7 +71,7 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         raise
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
-    return _measure_run(config, run_dir, trainer)
+    return _measure_run(config, run_dir, trainer, protocols)
 
 
 def _announce_duration(
@@ -104,7 +109,9 @@ def _resume_path(resume: str | None, system: PoseSystem) -> Path | None:
     return path
 
 
-def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> Report:
+def _measure_run(
+    config: Mapping[str, Any], run_dir: Path, trainer: Trainer, protocols: Protocols
+) -> Report:
     """Measure the best checkpoint of a finished run and write everything down."""
     checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
     path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
@@ -124,4 +131,5 @@ def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> 
         run_dir,
         num_pictures=12,
         details=details,
+        protocols=protocols,
     )[0]

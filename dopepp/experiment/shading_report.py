@@ -23,6 +23,8 @@ from dopepp.metrics.row import COLUMNS
 
 _log = logging.getLogger(__name__)
 
+SHADING_FILE: Final = "shading.csv"
+
 _FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
 """Measures that stand beside the pass rates."""
 
@@ -53,7 +55,7 @@ def record_shading(
     display.show_table("shading: share of the visible area covered", shown, num_labels=3)
     for line in (notes := _notes(measured)):
         _log.warning("%s", line)
-    write_whole(run_dir / "shading.csv", csv_text(_records(measured, fields)).encode())
+    write_whole(run_dir / SHADING_FILE, csv_text(_records(measured, fields)).encode())
     parts = [f"## {heading(name)}\n\n{markdown_text(rows)}" for name, rows in tables.items()]
     text = "\n".join([f"{_INTRODUCTION}\n", *(f"{line}\n" for line in notes), *parts])
     write_whole(run_dir / "shading.md", text.encode())

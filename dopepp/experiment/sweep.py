@@ -1,4 +1,4 @@
-"""Multirun: every job is a row, failed ones too, and the sweep ends with one comparison."""
+"""Multirun: every job is a row, failed ones too; it ends with a comparison and its table."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dopepp.experiment import display
 from dopepp.experiment.compare.compare import compare_runs
+from dopepp.experiment.compare.grouping import group
 from dopepp.experiment.compare.runs import read_run
+from dopepp.experiment.paper_table import PaperTable, write_paper_table
 
 
 class CompareJobs(Callback):
@@ -30,7 +32,11 @@ class CompareJobs(Callback):
         jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
         if not jobs:
             return
-        entries = compare_runs([read_run(job) for job in jobs], folder)
+        runs = [read_run(job) for job in jobs]
+        entries = group(runs) if config.job == "cost" else compare_runs(runs, folder)
+        if config.table is not None:
+            table: Any = OmegaConf.to_container(config.table, resolve=True)
+            write_paper_table(PaperTable.of(table), entries, folder)
         display.console.print(f"comparison in {folder}")
         if any(entry.failure for entry in entries):
             raise SystemExit(1)

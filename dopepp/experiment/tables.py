@@ -7,6 +7,9 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+Row = dict[str, str]
+"""Heading to text."""
+
 _TEXTS: Final = ("method", "object", "overrides", "folder")
 """Headings of what is no number."""
 

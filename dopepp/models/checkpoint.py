@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from dopepp.errors import UserError
+from dopepp.models import released
 from dopepp.models.network import PoseNetwork
 from dopepp.models.spec import architecture, build_network
 from dopepp.models.storage import check_container, read_mapping, write_atomic
@@ -95,12 +96,19 @@ class Checkpoint:
 def read(path: Path) -> Checkpoint:
     """Read a checkpoint and check that its weights fit its own spec.
 
+    Args:
+        path: A file that training or ``dopepp release`` has written, or ``pretrained/NAME``.
+
     Raises:
         UserError: The file is missing, damaged, foreign, too large, written by a newer version,
             names something that may not be built, or is not consistent.
     """
-    size = check_container(path, _WHAT)
-    content = read_mapping(path, _WHAT)
+    path = released.find(Path(path))
+    if path.suffix == released.SUFFIX:
+        content, size = released.read_content(path)
+    else:
+        size = check_container(path, _WHAT)
+        content = read_mapping(path, _WHAT)
     if KEY not in content:
         raise UserError(f"{path} without {KEY!r} entry", _WHAT, "pass a file written by train.py")
     try:

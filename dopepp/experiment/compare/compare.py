@@ -20,7 +20,6 @@ from dopepp.experiment.compare.entry import BASELINE, Entry, ordered
 from dopepp.experiment.compare.grouping import group
 from dopepp.experiment.compare.pictures import NUM_PICTURES, picture_tiles
 from dopepp.experiment.compare.runs import Run, find_runs
-from dopepp.experiment.compare.table import Row
 from dopepp.experiment.compare.training import training_lines
 from dopepp.experiment.compare.write import (
     TABLE_FILE,
@@ -28,7 +27,7 @@ from dopepp.experiment.compare.write import (
     accuracy_curves,
     write_comparison,
 )
-from dopepp.experiment.tables import markdown_text
+from dopepp.experiment.tables import Row, markdown_text
 
 PANELS_FILE: Final = "compare.png"
 LOSS_FILE: Final = "compare_loss.png"

@@ -12,6 +12,7 @@ import yaml
 
 from dopepp.errors import UserError
 from dopepp.experiment import record
+from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.report import Report
 
 _HYDRA: Final = Path(".hydra")
@@ -114,6 +115,8 @@ def _result(folder: Path) -> tuple[Report | None, str]:
     try:
         if failed.is_file():
             return None, str(record.read_json(failed).get("reason", "without a reason"))
+        if (folder / COST_FILE).is_file():
+            return None, ""
         if metrics.is_file():
             return Report.from_record(record.read_json(metrics)), ""
     except UserError as error:

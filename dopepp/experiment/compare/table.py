@@ -10,12 +10,10 @@ from dopepp.experiment.compare.differences import COMPARED, differences
 from dopepp.experiment.compare.entry import Entry
 from dopepp.experiment.methods import Cost
 from dopepp.experiment.report import FULL_SIZE_COST
+from dopepp.experiment.tables import Row
 from dopepp.metrics.bootstrap import Difference
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, Column, PoseRow
-
-Row = dict[str, str]
-"""Heading to text."""
 
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
@@ -79,7 +77,7 @@ def headline(table: Sequence[Line]) -> list[Row]:
                 row["seeds"] = _seeds(line)
             for name in _HEADLINE:
                 column = columns[name]
-                row[column.heading] = _with_deviation(line, column)
+                row[column.heading] = with_deviation(line, column)
                 if name in _WITH_INTERVAL:
                     row[f"Δ {column.heading}"] = _interval(line, column)
             row |= _costs(line, full_size=False)
@@ -125,7 +123,8 @@ def _deviation(line: Line, column: Column) -> str:
     return NOT_AVAILABLE if value is None else f"{value * column.scale:.{max(column.decimals, 1)}f}"
 
 
-def _with_deviation(line: Line, column: Column) -> str:
+def with_deviation(line: Line, column: Column) -> str:
+    """Return the mean over seeds and, of several, the standard deviation."""
     assert line.row is not None
     deviation = _deviation(line, column)
     text = column.text(line.row)

@@ -39,8 +39,10 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
     """
     table = lines(entries)
     compact, said = headline(table), notes(entries, table)
-    display.show_comparison(
-        [{key: text for key, text in row.items() if key not in _TOO_WIDE} for row in compact]
+    display.show_table(
+        "comparison",
+        [{key: text for key, text in row.items() if key not in _TOO_WIDE} for row in compact],
+        num_labels=2,
     )
     for note in said:
         display.console.print(note)
