@@ -10,7 +10,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from dopepp.experiment import display
 from dopepp.experiment.compare.compare import compare_runs
-from dopepp.experiment.compare.grouping import group
 from dopepp.experiment.compare.runs import read_run
 from dopepp.experiment.paper_table import PaperTable, write_paper_table
 
@@ -32,9 +31,8 @@ class CompareJobs(Callback):
         jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
         if not jobs:
             return
-        runs = [read_run(job) for job in jobs]
-        entries = group(runs) if config.job == "cost" else compare_runs(runs, folder)
-        if config.table is not None:
+        entries = compare_runs([read_run(job) for job in jobs], folder)
+        if config.get("table") is not None:
             table: Any = OmegaConf.to_container(config.table, resolve=True)
             write_paper_table(PaperTable.of(table), entries, folder)
         display.console.print(f"comparison in {folder}")

@@ -24,6 +24,7 @@ from dopepp.experiment.compare.runs import find_runs, read_run
 from dopepp.experiment.compare.table import full, headline, lines
 from dopepp.experiment.compare.training import logged
 from dopepp.experiment.compare.write import compare_reports, write_comparison
+from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.methods import Cost
 from dopepp.experiment.report import Report
 from dopepp.experiment.sweep import CompareJobs
@@ -299,6 +300,20 @@ def test_a_damaged_result_is_a_row_with_the_reason(
     (one,) = group(find_runs([tmp_path]))
     assert reason in one.failure
     assert "\n" not in one.failure
+
+
+def test_a_job_that_measures_costs_has_nothing_else(tmp_path: Path) -> None:
+    stored = {"parameters": 1234, "gmacs": 2.5, "ms_per_frame": 12.0, "name": "dopepp"}
+    record.write_json(write_run(tmp_path / "0") / COST_FILE, stored)
+    (one,) = group(find_runs([tmp_path]))
+    assert one.failure == ""
+    for table in (headline(lines([one])), full(lines([one]))):
+        (row,) = table
+        assert (row["object"], row["parameters"], row["ms/frame"]) == ("cost only", "1,234", "12.0")
+    write_comparison([entry("dope", report("dope", BAD)), one], tmp_path)
+    assert read_csv(tmp_path / "compare.csv")[1]["GMACs"] == "2.500"
+    record.write_json(tmp_path / "0" / COST_FILE, {})
+    assert "cost.json is not of this version" in read_run(tmp_path / "0").failure
 
 
 def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:

@@ -55,12 +55,10 @@ def job(folder: Path, overrides: list[str], errors: list[float] | None) -> None:
     )
 
 
-def end(folder: Path, table: dict[str, Any], job_name: str = "train") -> None:
+def end(folder: Path, table: dict[str, Any]) -> None:
     """What Hydra does when the last job of a sweep has ended."""
     hydra = {"sweep": {"dir": str(folder)}}
-    CompareJobs().on_multirun_end(
-        OmegaConf.create({"hydra": hydra, "job": job_name, "table": table})
-    )
+    CompareJobs().on_multirun_end(OmegaConf.create({"hydra": hydra, "table": table}))
 
 
 def read_table(folder: Path) -> list[dict[str, str]]:
@@ -124,7 +122,7 @@ def test_costs(composed: Composer, tmp_path: Path, experiment: str) -> None:
         job(folder, [f"model={name}"], None)
         (folder / record.FAILURE_FILE).unlink()
         measure_cost(composed(f"experiment={experiment}", f"model={name}", *small), folder)
-    end(tmp_path, {**config["table"], "labels": LABELS, "paper": {}}, "cost")
+    end(tmp_path, {**config["table"], "labels": LABELS, "paper": {}})
     dope, dopepp = read_table(tmp_path)
     assert (dope["method"], dopepp["method"]) == ("DOPE", "DOPE++")
     if experiment == "table4_parameters":

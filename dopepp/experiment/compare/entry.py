@@ -26,7 +26,7 @@ class Entry:
         name: Its name.
         reports: Its results on one test set, one per seed; empty where there is none.
         seeds: The trainings' seeds, as many; None where unknown.
-        failure: Why there is no result, in one line.
+        failure: Why there is no result, in one line; empty where only the cost was asked for.
         runs: The run folders; empty where reports do not come from any.
     """
 
@@ -71,6 +71,7 @@ class Entry:
     def cost(self) -> Cost:
         """What the method costs; the time is the mean over seeds."""
         costs = [report.cost for report in self.reports]
+        costs = costs or [run.cost or Cost() for run in self.runs[:1]]
         times = [cost.ms_per_frame for cost in costs if cost.ms_per_frame is not None]
         return replace(costs[0], ms_per_frame=float(np.mean(times)) if times else None)
 

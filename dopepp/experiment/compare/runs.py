@@ -13,6 +13,7 @@ import yaml
 from dopepp.errors import UserError
 from dopepp.experiment import record
 from dopepp.experiment.cost import COST_FILE
+from dopepp.experiment.methods import Cost
 from dopepp.experiment.report import Report
 
 _HYDRA: Final = Path(".hydra")
@@ -22,6 +23,9 @@ _TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
 
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
 """Options that say where something is, not what is measured."""
+
+_UNKNOWN_MODEL: Final = "run"
+"""What a run is called that left nothing but its folder."""
 
 
 @dataclass
@@ -33,12 +37,13 @@ class Run:
         model: The model's name.
         overrides: What it was overridden with, without options that only name places.
         report: Its result, None where there is none.
-        failure: Why there is none, in one line.
+        failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
         seed: Of the training; None where unknown.
         config: The resolved config, empty where there is none.
         checkpoint: Its best checkpoint, None where unknown.
         recipe: Everything but the seed that decides about the result, as one text; empty where
             unknown.
+        cost: What its network costs; None where unknown.
     """
 
     folder: Path
@@ -50,6 +55,7 @@ class Run:
     config: dict[str, Any] = field(default_factory=dict)
     checkpoint: Path | None = None
     recipe: str = ""
+    cost: Cost | None = None
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
@@ -78,54 +84,94 @@ def _folders(path: Path) -> Iterator[Path]:
 
 def read_run(folder: Path) -> Run:
     """Read one run folder; whatever is missing or damaged in it becomes its failure."""
-    report, failure = _result(folder)
+    cost, failure, report = None, "", None
+    try:
+        report = _result(folder)
+        cost = _cost(folder) if report is None else report.cost
+    except _FailedError as error:
+        failure = str(error)
     config = _mapping(folder / record.CONFIG_FILE)
-    composed = config or _mapping(folder / _HYDRA / "config.yaml")
-    overrides = _overrides(folder)
-    training, recipe = config, [_without_places(config)] if config else []
     checkpoint = folder / record.BEST_CHECKPOINT
     if report is not None and "checkpoint" in report.details:
         checkpoint = folder / str(report.details["checkpoint"])
-    if "ckpt_path" in composed:  # an evaluation: what it measured says what was trained
-        checkpoint = Path(str(composed["ckpt_path"]))
+    training, overrides = config, _overrides(folder)
+    configs = [config] if config else []
+    if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
+        checkpoint = Path(str(config["ckpt_path"]))
         trained = checkpoint.parent.parent
-        training = composed = _mapping(trained / record.CONFIG_FILE)
+        training = _mapping(trained / record.CONFIG_FILE)
         overrides = [*_overrides(trained), *overrides]
-        recipe = [*recipe, _without_places(training)] if training else []
+        configs = [config, training] if training else []
     seed = training.get("seed")
-    model = composed.get("model") or {}
-    chosen = [text.partition("=")[2] for text in overrides if text.startswith("model=")]
-    named = [str(model["name"])] if "name" in model else chosen[-1:]
     return Run(
         folder,
-        (named or [report.name if report is not None else "dopepp"])[0],
+        _model(training or _mapping(folder / _HYDRA / "config.yaml"), overrides, report),
         overrides,
         report,
         failure,
         seed if isinstance(seed, int) else None,
         config,
         checkpoint,
-        json.dumps(recipe, sort_keys=True, default=str) if recipe else "",
+        _recipe(configs),
+        cost,
     )
 
 
-def _result(folder: Path) -> tuple[Report | None, str]:
-    """Return a run's result, or why there is none."""
+def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report | None) -> str:
+    """Return the model's name, of a run that ended early as far as it is known."""
+    model = config.get("model")
+    if isinstance(model, dict) and "name" in model:
+        return str(model["name"])
+    chosen = [text.partition("=")[2] for text in overrides if text.startswith("model=")]
+    if chosen:
+        return chosen[-1]
+    return _UNKNOWN_MODEL if report is None else report.name
+
+
+def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
+    """Return configs as one text, without the seed and without what only names places."""
+    kept = [
+        {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}
+        for config in configs
+    ]
+    return json.dumps(kept, sort_keys=True, default=str) if kept else ""
+
+
+class _FailedError(Exception):
+    """Why a run has no result, in one line."""
+
+
+def _result(folder: Path) -> Report | None:
+    """Return a run's result; None of a job that was to measure its network's cost alone.
+
+    Raises:
+        _FailedError: It failed, did not finish, or left a damaged file.
+    """
     failed, metrics = folder / record.FAILURE_FILE, folder / record.METRICS_FILE
     try:
         if failed.is_file():
-            return None, str(record.read_json(failed).get("reason", "without a reason"))
-        if (folder / COST_FILE).is_file():
-            return None, ""
+            raise _FailedError(record.read_json(failed).get("reason", "without a reason"))
         if metrics.is_file():
-            return Report.from_record(record.read_json(metrics)), ""
+            return Report.from_record(record.read_json(metrics))
     except UserError as error:
-        return None, str(error)
+        raise _FailedError(str(error)) from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        return None, f"{metrics.name} is not of this version: {error!r}"
+        raise _FailedError(f"{metrics.name} is not of this version: {error!r}") from error
+    if (folder / COST_FILE).is_file():
+        return None
+    unfinished = f"unfinished: it left no {metrics.name}"
     if (folder / record.LAST_CHECKPOINT).is_file():
-        return None, f"unfinished: it left no {metrics.name}; go on with resume={folder}"
-    return None, f"unfinished: it left no {metrics.name}"
+        unfinished += f"; go on with resume={folder}"
+    raise _FailedError(unfinished)
+
+
+def _cost(folder: Path) -> Cost:
+    """Return what a job that measures costs has left."""
+    try:
+        stored = record.read_json(folder / COST_FILE)
+        return Cost(stored["parameters"], stored["gmacs"], stored["ms_per_frame"])
+    except (UserError, KeyError) as error:
+        raise _FailedError(f"{COST_FILE} is not of this version: {error}") from error
 
 
 def _overrides(folder: Path) -> list[str]:
@@ -135,11 +181,8 @@ def _overrides(folder: Path) -> list[str]:
     except (OSError, ValueError, yaml.YAMLError):  # cut short where the disk was full
         listed = []
     texts = [str(text).lstrip("+") for text in listed or []]
-    return [text for text in texts if not text.startswith(("hydra.", *_places()))]
-
-
-def _places() -> tuple[str, ...]:
-    return tuple(f"{name}=" for name in _ELSEWHERE)
+    places = tuple(f"{name}=" for name in _ELSEWHERE)
+    return [text for text in texts if not text.startswith(("hydra.", *places))]
 
 
 def _mapping(path: Path) -> dict[str, Any]:
@@ -149,8 +192,3 @@ def _mapping(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, yaml.YAMLError):  # as above
         content = {}
     return content if isinstance(content, dict) else {}
-
-
-def _without_places(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a config without the seed and without what only names places."""
-    return {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}

@@ -32,9 +32,9 @@ class Line:
 
     Attributes:
         method: The method's name.
-        object: The object's name, or why there is no result.
+        object: The object's name, or what there is instead of a result.
         entry: The method; None for a reference row.
-        row: The measures, averaged over seeds; None where there are none.
+        row: The measures, averaged over seeds; None where there are none but perhaps the cost.
         differences: To the baseline, by the measure's field.
     """
 
@@ -53,8 +53,11 @@ def lines(entries: Sequence[Entry]) -> list[Line]:
     baseline = next((entry for entry in entries if entry.reports), None)
     found = []
     for entry in entries:
-        if baseline is None or not entry.reports:
+        if entry.failure:
             found.append(Line(entry.name, f"failed: {entry.failure}"))
+            continue
+        if baseline is None or not entry.reports:
+            found.append(Line(entry.name, "cost only", entry))
             continue
         for name in entry.objects:
             known = {} if entry is baseline else differences(entry, baseline, name)
@@ -80,7 +83,7 @@ def headline(table: Sequence[Line]) -> list[Row]:
                 row[column.heading] = with_deviation(line, column)
                 if name in _WITH_INTERVAL:
                     row[f"Δ {column.heading}"] = _interval(line, column)
-            row |= _costs(line, full_size=False)
+        row |= _costs(line, full_size=False)
         rows.append(row)
     return rows
 
@@ -98,7 +101,7 @@ def full(table: Sequence[Line]) -> list[Row]:
                     row[f"± {column.heading}"] = _deviation(line, column)
                 if column.field in COMPARED:
                     row |= _difference(line, column)
-            row |= _costs(line, full_size=True)
+        row |= _costs(line, full_size=True)
         rows.append(row)
     return rows
 
@@ -166,7 +169,8 @@ def _costs(line: Line, full_size: bool) -> Row:
     if line.entry is None:
         return {}
     texts = _cost(line.entry.cost, "")
-    wide = line.entry.reports[0].details.get(FULL_SIZE_COST)
+    details = line.entry.reports[0].details if line.entry.reports else {}
+    wide = details.get(FULL_SIZE_COST)
     if full_size and wide is not None:
         texts |= _cost(Cost(**wide), "full-size ")
     return texts
