@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dopepp.errors import UserError
+from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
 
 _log = logging.getLogger(__name__)
@@ -48,6 +48,8 @@ def run_job(config: DictConfig, job: Job) -> None:
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
             _exit(str(error), USERS_MISTAKE)
+        except RunError as error:
+            _exit(str(error), FAILED)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
         return
@@ -57,7 +59,7 @@ def run_job(config: DictConfig, job: Job) -> None:
         job(plain, run_dir)
     except Exception as error:
         reason = " ".join(str(error).split()) or repr(error)
-        expected = isinstance(error, UserError)
+        expected = isinstance(error, (UserError, RunError))
         _log.error("job %s failed: %s", hydra.job.num, reason, exc_info=not expected)
         run_dir.mkdir(parents=True, exist_ok=True)
         record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
@@ -71,12 +73,16 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 
 
 def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
-    devices = config.get("trainer", {}).get("devices", 1)
-    if devices != 1:
+    """Refuse jobs of several processes, of which each would start as the first one did."""
+    from dopepp.experiment.devices import num_processes
+
+    options = config.get("trainer", {})
+    if num_processes(options) > 1:
+        asked = {key: options[key] for key in ("devices", "num_nodes") if key in options}
         raise UserError(
-            f"trainer.devices={devices} in a multirun",
-            "one device per job: each further process would run the whole sweep again",
-            "set trainer.devices=1, or run the jobs one by one",
+            " ".join(f"trainer.{key}={value}" for key, value in asked.items()) + " in a multirun",
+            "one process per job: each further process would run the whole sweep again",
+            "set trainer.devices=1 and start one process, or run the jobs one by one",
         )
 
 

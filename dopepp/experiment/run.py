@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.errors import UserError
+from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.evaluation import measure_and_record
@@ -25,6 +25,7 @@ from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_integer
+from dopepp.training.processes import ProcessDiedError
 from dopepp.training.system import PoseSystem
 
 _log = logging.getLogger(__name__)
@@ -69,6 +70,12 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         if isinstance(end.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt(f"go on with resume={run_dir}") from end
         raise
+    except RunError as error:
+        if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
+            raise SystemExit(1) from error  # all processes end for one reason, and the first says it
+        kept = (run_dir / record.LAST_CHECKPOINT).is_file()
+        advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
+        raise RunError(f"{error}; {advice}") from error
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
     return _measure_run(config, run_dir, trainer, protocols)

@@ -29,6 +29,7 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
+from dopepp.training.finite import check_state
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
 
@@ -209,5 +210,10 @@ class PoseSystem(LightningModule):
                     group["lr"] = rate
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Make the file self-describing: anybody can load it without this module or a config."""
+        """Make the file self-describing: anybody can load it without this module or a config.
+
+        Raises:
+            RunError: The weights are not finite: no file gets them.
+        """
+        check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
