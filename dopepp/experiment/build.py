@@ -43,8 +43,20 @@ _MAX_THRESHOLD: Final = 1000
 """Above any map size in cells, angle in degrees and number of peaks that means something."""
 
 
-def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str) -> PoseSystem:
-    """Build the network, its loss and its optimiser as the config names them."""
+def build_system(
+    config: Mapping[str, Any],
+    parts: list[Part],
+    fingerprint: str,
+    images: Mapping[str, Any] | None = None,
+) -> PoseSystem:
+    """Build the network, its loss and its optimiser as the config names them.
+
+    Args:
+        config: The whole config.
+        parts: The objects.
+        fingerprint: Of the data, for the checkpoint.
+        images: What the images are, by split, for the checkpoint.
+    """
     model, maps = config["model"], config["maps"]
     for group, lowest in (("maps", _MIN_CELLS), ("recovery", 0)):
         for name, value in config[group].items():
@@ -62,7 +74,12 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         stride=network.stride,
         sigma=geometry.sigma,
         recovery=vars(recovery),
-        data={"name": model["name"], "seed": config["seed"], "config": config["data"]},
+        data={
+            "name": model["name"],
+            "seed": config["seed"],
+            "config": config["data"],
+            **({} if images is None else {"images": images}),
+        },
         data_fingerprint=fingerprint,
     )
     if config["init_from"] is not None:
@@ -111,7 +128,9 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     elif accelerator == "gpu" and torch.cuda.is_available():
         accelerator = "cuda"
     timeout_s = check_number("trainer.ddp_timeout_s", options.pop("ddp_timeout_s"), 1, _MAX_WAIT_S)
-    if options["strategy"] == "ddp" or (options["strategy"] == "auto" and num_processes(options) > 1):
+    if options["strategy"] == "ddp" or (
+        options["strategy"] == "auto" and num_processes(options) > 1
+    ):
         options["strategy"] = WatchedDDP(timeout_s)
     options["precision"], reason = choose_precision(options["precision"], accelerator)
     display.console.print(f"precision {options['precision']}: {reason}")

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -25,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
+from dopepp.experiment.resume import read_overrides
 
 _log = logging.getLogger(__name__)
 
@@ -100,11 +100,14 @@ def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
     # Lightning's own lines say again, and less exactly, what this package says.
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    sys.argv = [sys.argv[0], *_resumed([_opened(text, open_nodes) for text in sys.argv[1:]])]
     try:
+        arguments = _resumed([_opened(text, open_nodes) for text in sys.argv[1:]])
+        sys.argv = [sys.argv[0], *arguments]
         main()
     except KeyboardInterrupt as interrupt:
         _exit(": ".join(["interrupted", *map(str, interrupt.args)]), INTERRUPTED)
+    except UserError as error:
+        _exit(str(error), USERS_MISTAKE)
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)
@@ -128,12 +131,11 @@ def _resumed(arguments: list[str]) -> list[str]:
     if not runs or runs[-1] in ("", "null"):
         return arguments
     run = Path(runs[-1])
-    stored = run / ".hydra" / "overrides.yaml"
-    if not stored.is_file():
+    overrides = read_overrides(run)
+    if overrides is None:
         return arguments  # the run itself says what is wrong with the folder
-    overrides = [str(text) for text in yaml.safe_load(stored.read_text())]
-    kept = [text for text in overrides if not text.startswith(("resume=", "hydra.run.dir="))]
-    return [*kept, *arguments, f"hydra.run.dir={run}"]
+    # No file of the run changes before it is known whether it may go on like this.
+    return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
 
 def _explain(error: Exception, config_dir: Path | None) -> str:

@@ -42,5 +42,7 @@ def _num_devices(devices: object, options: Mapping[str, Any]) -> int:
     if type(devices) is int and devices > 0:
         return devices
     raise UserError(
-        f"trainer.devices={devices}", "a positive number, a list of devices, auto or -1", "correct it"
+        f"trainer.devices={devices}",
+        "a positive number, a list of devices, auto or -1",
+        "correct it",
     )

@@ -46,5 +46,7 @@ def _tiles(batch: Batch) -> list[Tile]:
     images = batch.images[:_MAX_TILES].permute(0, 2, 3, 1).cpu().numpy()
     return [
         Tile(overlay(image, [Wireframe(points, GREEN, "true") for points in truths]), key)
-        for image, truths, key in zip(images, batch.keypoints.cpu().numpy(), batch.keys, strict=False)
+        for image, truths, key in zip(
+            images, batch.keypoints.cpu().numpy(), batch.keys, strict=False
+        )
     ]

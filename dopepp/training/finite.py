@@ -95,8 +95,7 @@ class FiniteSteps(Callback):
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         statistics = [buffer for buffer in self._buffers if buffer.is_floating_point()]
         norms = [
-            torch.nn.utils.get_total_norm(some).to(self._loss)
-            for some in (gradients, statistics)
+            torch.nn.utils.get_total_norm(some).to(self._loss) for some in (gradients, statistics)
         ]
         bad = ~torch.stack([self._loss, *norms]).isfinite()
         self._passes.append(_Pass(self._batch, self._loss, bad))

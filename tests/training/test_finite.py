@@ -1,4 +1,4 @@
-"""Steps that are not finite: what they leave as it was, how they are counted, how they end a run."""
+"""Steps that are not finite: what they leave as it was, how they count, how they end a run."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NUM_BATCHES = 4
 class Faulty(PoseSystem):
     """Has one pass after the other; those listed are bad in the way that is named."""
 
-    faults: Mapping[int, str] = {}  # noqa: RUF012 -- set by each test
+    faults: Mapping[int, str] = {}
     passes = 0
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -257,9 +257,7 @@ def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(
 def test_good_steps_between_bad_ones_keep_the_run_going(
     make_system: SystemMaker, batches: list[Batch], tmp_path: Path
 ) -> None:
-    run = Run(
-        faulty(make_system, {0: "loss", 2: "gradient"}), batches, tmp_path, max_in_a_row=2
-    )
+    run = Run(faulty(make_system, {0: "loss", 2: "gradient"}), batches, tmp_path, max_in_a_row=2)
     assert run.guard.skipped == 2
 
 
