@@ -102,7 +102,8 @@ def check_resume(
             " where the network is the same",
         )
     learnt = [one for one in found if _is_learnt_from(one.key)]
-    learnt += image_differences(saved.data.get("images"), payload["data"].get("images"))
+    if not learnt:  # else the images are others for that reason
+        learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and config["resume_anyway"] is not True:
         raise UserError(
             f"resume={run} with other data or another loss ({_listed(learnt)})",
