@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -30,9 +31,10 @@ def end_of(pid: int, within_s: float) -> int:
     """Wait for a process that this one has started or adopted; return its exit code."""
     deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:
-        found, status = os.waitpid(pid, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status)
+        with contextlib.suppress(ChildProcessError):  # not adopted yet
+            found, status = os.waitpid(pid, os.WNOHANG)
+            if found:
+                return os.waitstatus_to_exitcode(status)
         time.sleep(0.2)
     os.kill(pid, signal.SIGKILL)
     raise AssertionError(f"process {pid} is still there after {within_s} s")
