@@ -1,4 +1,4 @@
-"""The one exception for a user's mistake: what was got, what is allowed, what to do."""
+"""The two ends of a run that are told in one line: a user's mistake, and a run that failed."""
 
 from __future__ import annotations
 
@@ -22,3 +22,13 @@ class UserError(ValueError):
     def __reduce__(self) -> tuple[type[UserError], tuple[str, str, str]]:
         """Survive the pickling between a loader's worker and its parent."""
         return type(self), (self.got, self.allowed, self.fix)
+
+
+class RunError(RuntimeError):
+    """A run that cannot go on, through no mistake that could have been told at its start.
+
+    Entry points print it as one line and exit with code 1.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(" ".join(reason.split()))

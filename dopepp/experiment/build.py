@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import Logger
 
 from dopepp.errors import UserError
 from dopepp.experiment import display
+from dopepp.experiment.devices import num_processes
 from dopepp.experiment.gates import (
     CALLBACKS,
     LOGGERS,
@@ -29,19 +30,33 @@ from dopepp.models.gate import TARGET, check_integer, check_number
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.training.loggers import GuardedLogger, MetricsTable
+from dopepp.training.processes import WatchedDDP
 from dopepp.training.saving import AtomicCheckpointIO
 from dopepp.training.symmetry import SymmetryOptions
 from dopepp.training.system import PoseSystem
 
 _MAX_EPOCHS: Final = 10**9
+_MAX_WAIT_S: Final = 7 * 24 * 3600
 _MIN_CELLS: Final = 0.1
 """A peak or disc narrower than this, in cells, is on no cell at all."""
 _MAX_THRESHOLD: Final = 1000
 """Above any map size in cells, angle in degrees and number of peaks that means something."""
 
 
-def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str) -> PoseSystem:
-    """Build the network, its loss and its optimiser as the config names them."""
+def build_system(
+    config: Mapping[str, Any],
+    parts: list[Part],
+    fingerprint: str,
+    images: Mapping[str, Any] | None = None,
+) -> PoseSystem:
+    """Build the network, its loss and its optimiser as the config names them.
+
+    Args:
+        config: The whole config.
+        parts: The objects.
+        fingerprint: Of the data, for the checkpoint.
+        images: What the images are, by split, for the checkpoint.
+    """
     model, maps = config["model"], config["maps"]
     for group, lowest in (("maps", _MIN_CELLS), ("recovery", 0)):
         for name, value in config[group].items():
@@ -59,7 +74,12 @@ def build_system(config: Mapping[str, Any], parts: list[Part], fingerprint: str)
         stride=network.stride,
         sigma=geometry.sigma,
         recovery=vars(recovery),
-        data={"name": model["name"], "seed": config["seed"], "config": config["data"]},
+        data={
+            "name": model["name"],
+            "seed": config["seed"],
+            "config": config["data"],
+            **({} if images is None else {"images": images}),
+        },
         data_fingerprint=fingerprint,
     )
     if config["init_from"] is not None:
@@ -107,6 +127,11 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     elif accelerator == "gpu" and torch.cuda.is_available():
         accelerator = "cuda"
+    timeout_s = check_number("trainer.ddp_timeout_s", options.pop("ddp_timeout_s"), 1, _MAX_WAIT_S)
+    if options["strategy"] == "ddp" or (
+        options["strategy"] == "auto" and num_processes(options) > 1
+    ):
+        options["strategy"] = WatchedDDP(timeout_s)
     options["precision"], reason = choose_precision(options["precision"], accelerator)
     display.console.print(f"precision {options['precision']}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]

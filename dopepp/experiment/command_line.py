@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -23,8 +22,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dopepp.errors import UserError
+from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
+from dopepp.experiment.resume import read_overrides
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +48,8 @@ def run_job(config: DictConfig, job: Job) -> None:
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
             _exit(str(error), USERS_MISTAKE)
+        except RunError as error:
+            _exit(str(error), FAILED)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
         return
@@ -57,7 +59,7 @@ def run_job(config: DictConfig, job: Job) -> None:
         job(plain, run_dir)
     except Exception as error:
         reason = " ".join(str(error).split()) or repr(error)
-        expected = isinstance(error, UserError)
+        expected = isinstance(error, (UserError, RunError))
         _log.error("job %s failed: %s", hydra.job.num, reason, exc_info=not expected)
         run_dir.mkdir(parents=True, exist_ok=True)
         record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
@@ -71,12 +73,16 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 
 
 def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
-    devices = config.get("trainer", {}).get("devices", 1)
-    if devices != 1:
+    """Refuse jobs of several processes, of which each would start as the first one did."""
+    from dopepp.experiment.devices import num_processes
+
+    options = config.get("trainer", {})
+    if num_processes(options) > 1:
+        asked = {key: options[key] for key in ("devices", "num_nodes") if key in options}
         raise UserError(
-            f"trainer.devices={devices} in a multirun",
-            "one device per job: each further process would run the whole sweep again",
-            "set trainer.devices=1, or run the jobs one by one",
+            " ".join(f"trainer.{key}={value}" for key, value in asked.items()) + " in a multirun",
+            "one process per job: each further process would run the whole sweep again",
+            "set trainer.devices=1 and start one process, or run the jobs one by one",
         )
 
 
@@ -94,11 +100,14 @@ def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
     # Lightning's own lines say again, and less exactly, what this package says.
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    sys.argv = [sys.argv[0], *_resumed([_opened(text, open_nodes) for text in sys.argv[1:]])]
     try:
+        arguments = _resumed([_opened(text, open_nodes) for text in sys.argv[1:]])
+        sys.argv = [sys.argv[0], *arguments]
         main()
     except KeyboardInterrupt as interrupt:
         _exit(": ".join(["interrupted", *map(str, interrupt.args)]), INTERRUPTED)
+    except UserError as error:
+        _exit(str(error), USERS_MISTAKE)
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)
@@ -122,12 +131,11 @@ def _resumed(arguments: list[str]) -> list[str]:
     if not runs or runs[-1] in ("", "null"):
         return arguments
     run = Path(runs[-1])
-    stored = run / ".hydra" / "overrides.yaml"
-    if not stored.is_file():
+    overrides = read_overrides(run)
+    if overrides is None:
         return arguments  # the run itself says what is wrong with the folder
-    overrides = [str(text) for text in yaml.safe_load(stored.read_text())]
-    kept = [text for text in overrides if not text.startswith(("resume=", "hydra.run.dir="))]
-    return [*kept, *arguments, f"hydra.run.dir={run}"]
+    # No file of the run changes before it is known whether it may go on like this.
+    return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
 
 def _explain(error: Exception, config_dir: Path | None) -> str:

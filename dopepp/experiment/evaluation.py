@@ -27,6 +27,7 @@ from dopepp.experiment.methods import (
     object_numbers,
 )
 from dopepp.experiment.objects import build_parts
+from dopepp.experiment.other_images import warn_of_other_images
 from dopepp.experiment.pass_rates import reported_rates
 from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.report import Report, measure
@@ -185,8 +186,9 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     record.write_config(run_dir, config)
     fingerprint = "" if own is None else own.data_fingerprint
     seed = held_out_seed(data)
-    environment = record.environment(seed, fingerprint)
-    record.write_json(run_dir / record.VERSIONS_FILE, environment)
+    record.write_environment(run_dir, seed, fingerprint)
+    if loaded:
+        warn_of_other_images(loaded[-1].checkpoint, data, _parts_of(loaded, data), seed)
     if check_flag("tune", config["tune"]):
         if protocols:
             raise UserError(

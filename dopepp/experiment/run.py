@@ -12,19 +12,22 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.errors import UserError
+from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
+from dopepp.experiment.images import describe_images
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
+from dopepp.experiment.resume import Difference, check_resume, remember_overrides
 from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint import read
-from dopepp.models.gate import check_integer
+from dopepp.models.gate import check_flag, check_integer
+from dopepp.training.processes import ProcessDiedError
 from dopepp.training.system import PoseSystem
 
 _log = logging.getLogger(__name__)
@@ -54,13 +57,22 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     if protocols.shading:
         check_masks(datamodule.test_source)
     fingerprint = datamodule.fingerprint()
-    system = build_system(config, parts, fingerprint)
-    resume_from = _resume_path(config["resume"], system)
+    images = {
+        "train": describe_images(datamodule.train_source),
+        "val": describe_images(datamodule.val_source),
+        "test": describe_images(datamodule.test_source),
+    }
+    system = build_system(config, parts, fingerprint, images)
+    resume_from, changes = _resume_path(config, system)
     trainer = build_trainer(config, run_dir)  # whatever it refuses, nothing is written yet
     display.show_config(config)
-    record.write_config(run_dir, config)
-    environment = record.environment(seed, fingerprint)
-    record.write_json(run_dir / record.VERSIONS_FILE, environment)
+    for change in changes:
+        display.console.print(f"changed since the run began: {change}")
+    if not getattr(rank_zero_only, "rank", 0):
+        record.write_config(run_dir, config)
+        record.write_environment(run_dir, seed, fingerprint, [str(one) for one in changes])
+        if config["resume"] is not None:
+            remember_overrides(run_dir)
     display.show_sources(datamodule.summary())
     _announce_duration(config, system, datamodule, trainer)
     try:
@@ -69,6 +81,14 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         if isinstance(end.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt(f"go on with resume={run_dir}") from end
         raise
+    except RunError as error:
+        if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
+            raise SystemExit(
+                1
+            ) from error  # all processes end for one reason, and the first says it
+        kept = (run_dir / record.LAST_CHECKPOINT).is_file()
+        advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
+        raise RunError(f"{error}; {advice}") from error
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
     return _measure_run(config, run_dir, trainer, protocols)
@@ -89,10 +109,15 @@ def _announce_duration(
     display.console.print(f"no accelerator: about {duration} to finish{advice}")
 
 
-def _resume_path(resume: str | None, system: PoseSystem) -> Path | None:
-    """Return the interrupted run's checkpoint after checking that this run continues it."""
+def _resume_path(
+    config: Mapping[str, Any], system: PoseSystem
+) -> tuple[Path | None, list[Difference]]:
+    """Return the interrupted run's checkpoint, and what has changed since and may have."""
+    anyway, resume = check_flag("resume_anyway", config["resume_anyway"]), config["resume"]
     if resume is None:
-        return None
+        if anyway:
+            raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
+        return None, []
     path = Path(resume) / record.LAST_CHECKPOINT
     if not path.is_file():
         raise UserError(
@@ -100,13 +125,7 @@ def _resume_path(resume: str | None, system: PoseSystem) -> Path | None:
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
         )
-    if read(path).spec != system.payload["spec"]:
-        raise UserError(
-            f"resume={resume}, whose network differs from the chosen one",
-            "the model and the number of objects of that run",
-            "leave the model as it was, or start anew with init_from",
-        )
-    return path
+    return path, check_resume(Path(resume), config, read(path), system.payload)
 
 
 def _measure_run(

@@ -29,6 +29,7 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
+from dopepp.training.finite import check_state
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
 
@@ -181,8 +182,10 @@ class PoseSystem(LightningModule):
         """Build the optimiser, and its schedule over all steps of the run."""
         optimizer = self.make_optimizer(self.network.parameters())
         if self.make_scheduler is None:
+            self._settings = [dict(group) for group in optimizer.param_groups]
             return optimizer
         scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        self._settings = [dict(group) for group in optimizer.param_groups]
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
@@ -200,6 +203,7 @@ class PoseSystem(LightningModule):
         for logger in self.loggers:
             if isinstance(logger, MetricsTable):
                 logger.forget_after(self.global_step - 1)
+        self._apply_settings()
         for config in self.trainer.lr_scheduler_configs:
             # Schedules that multiply the last rate would stay at zero where a shorter one ended.
             closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
@@ -208,6 +212,24 @@ class PoseSystem(LightningModule):
                 for group, rate in zip(groups, closed_form(), strict=True):
                     group["lr"] = rate
 
+    def _apply_settings(self) -> None:
+        """Use the present config's rate, decay and so on: a checkpoint brings its own ones back.
+
+        What a schedule sets in every step is left to it.
+        """
+        scheduled = {"lr"} if self.trainer.lr_scheduler_configs else set()
+        for optimizer in self.trainer.optimizers:
+            for group, settings in zip(optimizer.param_groups, self._settings, strict=True):
+                cycled = {"momentum", "betas"} if "max_momentum" in settings else set()
+                group.update(
+                    {k: v for k, v in settings.items() if k not in {"params", *scheduled, *cycled}}
+                )
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Make the file self-describing: anybody can load it without this module or a config."""
+        """Make the file self-describing: anybody can load it without this module or a config.
+
+        Raises:
+            RunError: The weights are not finite: no file gets them.
+        """
+        check_state(checkpoint)
         checkpoint["dopepp"] = self.payload

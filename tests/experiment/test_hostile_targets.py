@@ -12,8 +12,10 @@ import torch
 from dopepp.errors import UserError
 from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.gates import (
+    AUGMENTATIONS,
     CALLBACKS,
     LOGGERS,
+    MASKINGS,
     OPTIMIZERS,
     SCHEDULERS,
     optimizer_factory,
@@ -21,6 +23,8 @@ from dopepp.experiment.gates import (
 )
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.sources import build_datamodule
+from dopepp.models.gate import Gate
+from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
 Composer = Callable[..., dict[str, Any]]
 HOSTILE = (
@@ -31,6 +35,9 @@ HOSTILE = (
     "dopepp.models.spec.build_network",
     "dopepp.training.system.PoseSystem",
     "not_a_module.Thing",
+    "torch.utils.collect_env.run",  # these three pass Hydra's own list of forbidden names
+    "sympy.sympify",
+    "torch.load",
     "torch.optim",
     "",
 )
@@ -57,7 +64,7 @@ def build_all(config: dict[str, Any], run_dir: Path) -> None:
 
 @pytest.mark.parametrize(
     ("place", "target"),
-    [(place, HOSTILE[0]) for place in PLACES] + [("optimizer", target) for target in HOSTILE[1:]],
+    [(place, HOSTILE[number % len(HOSTILE)]) for number, place in enumerate(PLACES)],
 )
 def test_a_hostile_target_is_refused(
     place: str, target: str, tiny: Composer, tmp_path: Path
@@ -67,6 +74,19 @@ def test_a_hostile_target_is_refused(
         build_all(config, tmp_path)
     assert repr(target) in error.value.got
     assert "\n" not in str(error.value)
+
+
+GATES: tuple[Gate[Any], ...] = (
+    OPTIMIZERS, SCHEDULERS, CALLBACKS, LOGGERS, MASKINGS, AUGMENTATIONS,
+    BACKBONES, ATTENTIONS, HEADS, LOSSES,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("target", HOSTILE)
+def test_no_gate_lets_a_hostile_target_through(target: str) -> None:
+    for gate in GATES:
+        with pytest.raises(UserError, match="_target_"):
+            gate.build({"_target_": target})
 
 
 @pytest.mark.parametrize("place", ["optimizer", "callbacks.checkpoint", "data.masking"])

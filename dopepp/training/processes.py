@@ -1,0 +1,144 @@
+"""Several processes on one machine that do not outlive one another.
+
+A process that waits in a collective for one that has died would wait for the process group's
+timeout, half an hour; and Lightning kills the first process without a word when another one ends.
+Here every process watches: the first one its children, the children their parent.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from typing import Any, Final
+
+from lightning.fabric.utilities.distributed import _set_num_threads_if_needed
+from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+
+from dopepp.errors import RunError
+
+_log = logging.getLogger(__name__)
+
+_STARTED_BY: Final = "DOPEPP_STARTED_BY"
+"""Environment variable that tells a process which one of the run has started it."""
+_POLL_S: Final = 1.0
+"""How often a process looks after the others."""
+_NOTICE_S: Final = 5.0
+"""A broken connection is seen before the death that broke it; so long it may take to show."""
+_GRACE_S: Final = 20.0
+"""What is still waiting in a collective so long after a death is ended from outside."""
+
+
+class ProcessDiedError(RunError):
+    """Another process of the run has ended before it should."""
+
+
+class Watch(threading.Thread):
+    """Looks after the other processes of this machine.
+
+    Args:
+        children: The processes that this one has started; rank 1 comes first.
+        parent: The process that has started this one, where it belongs to the run.
+    """
+
+    def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
+        super().__init__(daemon=True, name="process-watch")
+        self._children, self._parent = children, parent
+        self._stopped = threading.Event()
+
+    def run(self) -> None:
+        """End this process some time after another has died, should it still be there."""
+        while not self._stopped.wait(_POLL_S):
+            death = self.death()
+            if death is not None:
+                time.sleep(_GRACE_S)
+                _end_now(death)
+
+    def stop(self) -> None:
+        """Stop looking: from now on a process may end."""
+        self._stopped.set()
+
+    def death(self, wait_s: float = 0.0) -> str | None:
+        """Say which process has died, after waiting for a death to show; None if none has."""
+        deadline = time.monotonic() + wait_s
+        while True:
+            for rank, child in enumerate(self._children, start=1):
+                code = child.poll()
+                if code:
+                    how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+                    return f"process {child.pid} (rank {rank} on this machine) {how}"
+            if self._parent is not None and os.getppid() != self._parent:
+                return f"process {self._parent} (rank 0 on this machine) has died"
+            if time.monotonic() >= deadline:
+                return None
+            time.sleep(0.1)
+
+
+def _end_now(reason: str) -> None:
+    sys.stderr.write(f"{reason}: the run ends\n")
+    sys.stderr.flush()
+    os._exit(1)  # the main thread hangs in a collective, where no exception reaches it
+
+
+class WatchedLauncher(_SubprocessScriptLauncher):
+    """Starts the other processes as Lightning does, and has each watch the others."""
+
+    def launch(
+        self, function: Callable[..., Any], *args: Any, trainer: Trainer | None = None, **kw: Any
+    ) -> Any:
+        """Start the other processes, then call the function.
+
+        Raises:
+            ProcessDiedError: Another process has died, so that the function has failed.
+        """
+        self.cluster_environment.validate_settings(self.num_processes, self.num_nodes)
+        started_by = os.environ.pop(_STARTED_BY, None)
+        if not self.cluster_environment.creates_processes_externally:
+            os.environ[_STARTED_BY] = str(os.getpid())
+            self._call_children_scripts()
+            del os.environ[_STARTED_BY]
+        _set_num_threads_if_needed(num_processes=self.num_processes)
+        watch = Watch(self.procs, None if started_by is None else int(started_by))
+        watch.start()
+        try:
+            result = function(*args, **kw)
+        except RunError:
+            watch.stop()
+            raise
+        except Exception as error:
+            death = watch.death(_NOTICE_S)
+            if death is None:
+                watch.stop()
+                raise
+            # The watch goes on: what follows may hang, too.
+            raise ProcessDiedError(f"{death}: the run ends") from error
+        except BaseException:
+            watch.stop()
+            raise
+        watch.stop()
+        return result
+
+
+class WatchedDDP(DDPStrategy):
+    """Distributed data parallel whose processes notice each other's death.
+
+    Args:
+        timeout_s: How long a process waits for the others in a collective, seconds; what tells
+            that a process on another machine is gone.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        super().__init__(timeout=timedelta(seconds=timeout_s))
+
+    def _configure_launcher(self) -> None:
+        assert self.cluster_environment is not None
+        self._launcher = WatchedLauncher(
+            self.cluster_environment, self.num_processes, self.num_nodes
+        )

@@ -1,0 +1,126 @@
+"""Runs that go on changed, break, or are measured on images that have changed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dopepp.models.losses import SpatialCrossEntropy
+from dopepp.virtual.factory import Factory
+
+Runner = Callable[..., Any]
+FindRun = Callable[[Path], Path]
+
+
+@pytest.fixture
+def run(call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path) -> Path:
+    done = call("train.py", *tiny, f"output_dir={tmp_path / 'outputs'}")
+    assert done.code == 0, done.err
+    return find_run(tmp_path / "outputs")
+
+
+def test_a_run_that_goes_on_tells_what_changed(run: Path, call: Runner) -> None:
+    before = (run / ".hydra" / "overrides.yaml").read_text()
+    refused = call("train.py", f"resume={run}", "seed=5", "trainer.max_epochs=2")
+    assert "(seed: 0 → 5)" in refused.line
+    refused = call("train.py", f"resume={run}", "optimizer=sgd", "resume_anyway=true")
+    assert "another optimiser" in refused.line
+    # What was refused has left nothing, so the run can go on as it was.
+    assert (run / ".hydra" / "overrides.yaml").read_text() == before
+
+    # A folder from anybody: Hydra builds what its own nodes name, on the user's word alone.
+    trace = run / "trace"
+    hostile = f"++hydra.callbacks.x={{_target_: os.mkdir, path: '{trace}'}}"
+    stored = yaml.safe_dump([*yaml.safe_load(before), hostile])
+    (run / ".hydra" / "overrides.yaml").write_text(stored)
+    done = call("train.py", f"resume={run}", "trainer.max_epochs=2", "optimizer.weight_decay=0.5",
+                "data.batch_size=2", "resume_anyway=true")  # fmt: skip
+    assert done.code == 0, done.err
+    assert not trace.exists()
+    said = [line for line in done.out.splitlines() if line.startswith("changed since")]
+    assert [line.partition(": ")[2] for line in said] == [
+        "data.batch_size: 4 → 2",
+        "optimizer.weight_decay: 0.01 → 0.5",
+        "trainer.max_epochs: 1 → 2",
+    ]
+    versions = json.loads((run / "versions.json").read_text())
+    assert versions["changes"] == [line.partition(": ")[2] for line in said]
+    (earlier,) = versions["earlier"]
+    assert earlier["changes"] == []
+    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    (group,) = content["optimizer_states"][0]["param_groups"]
+    assert group["weight_decay"] == 0.5  # and not the one that the checkpoint brought back
+    overrides = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text())
+    assert "trainer.max_epochs=2" in overrides
+    assert hostile not in overrides
+
+
+def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(
+    run: Path, call: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = (run / "checkpoints" / "best.ckpt").read_bytes()
+    compare = SpatialCrossEntropy.forward
+
+    def broken(self: Any, *args: Any) -> Any:
+        loss, terms = compare(self, *args)
+        return loss * (torch.nan if self.training else 1), terms
+
+    monkeypatch.setattr(SpatialCrossEntropy, "forward", broken)
+    again = ("trainer.max_epochs=4", "callbacks.finite.max_in_a_row=3")
+    done = call("train.py", f"resume={run}", *again)
+    assert done.code == 1
+    line = done.err.rstrip("\n").rpartition("\n")[2]
+    assert "loss and gradient not finite in step 4 (3 steps in a row): the run ends" in line
+    assert f"its batch is in {run / 'nonfinite'}; go on with resume={run}" in line
+    assert "Traceback" not in done.err
+    for name in ("best.ckpt", "last.ckpt"):
+        content = torch.load(run / "checkpoints" / name, weights_only=True)
+        assert all(value.isfinite().all() for value in content["state_dict"].values())
+    assert (run / "checkpoints" / "best.ckpt").read_bytes() == good
+    dumped = torch.load(run / "nonfinite" / "step_4_rank_0.pt", weights_only=True)
+    assert dumped["images"].shape == (4, 3, 64, 64)
+
+    monkeypatch.undo()
+    done = call("train.py", f"resume={run}", *again)
+    assert done.code == 0, done.err
+
+
+def test_an_evaluation_says_when_the_images_are_no_longer_those(
+    run: Path,
+    call: Runner,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def warnings(*overrides: str) -> list[str]:
+        caplog.clear()
+        done = call("evaluate.py", *measured, *overrides)
+        assert done.code == 0, done.err
+        said = [record.getMessage() for record in caplog.records]
+        return [line for line in said if line.startswith("the test images are not those of")]
+
+    measured = (f"ckpt_path={run / 'checkpoints' / 'best.ckpt'}", f"output_dir={tmp_path / 'e'}")
+    assert warnings() == []
+
+    render = Factory.render
+
+    def darker(self: Factory, epoch: int, index: int) -> Any:
+        rendered = render(self, epoch, index)
+        np.floor_divide(rendered.image, 2, out=rendered.image)
+        return rendered
+
+    monkeypatch.setattr(Factory, "render", darker)
+    (line,) = warnings()
+    assert line.endswith("though their configuration is the same: pixels of the first image")
+    # Another test set is what its user asks for.
+    assert warnings("virtual.preset=table") == []
+    # … and in training these are other data.
+    refused = call("train.py", f"resume={run}", "trainer.max_epochs=2")
+    assert "train images: as trained on → others (pixels of the first image)" in refused.line

@@ -1,0 +1,87 @@
+"""What a process does when another one of its run is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+from dopepp.training.processes import Watch
+
+ROOT = Path(__file__).parents[2]
+
+
+def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", code])
+
+
+def test_a_death_is_told_with_its_cause() -> None:
+    quiet, killed = sleeper(), sleeper()
+    failed, done = sleeper("raise SystemExit(3)"), sleeper("pass")
+    try:
+        assert Watch([quiet, killed], None).death() is None
+        killed.send_signal(signal.SIGKILL)
+        expected = f"process {killed.pid} (rank 2 on this machine) was killed by signal 9"
+        assert Watch([quiet, killed], None).death(10) == expected
+        failed.wait()
+        assert "ended with code 3" in str(Watch([failed], None).death())
+        done.wait()
+        assert Watch([done], None).death() is None  # it was finished
+        assert Watch([], os.getppid()).death() is None
+        assert "rank 0 on this machine) has died" in str(Watch([], 2**22).death())
+    finally:
+        for process in (quiet, killed):
+            process.kill()
+            process.wait()
+
+
+def test_what_hangs_is_ended_from_outside() -> None:
+    """As in a collective on GPUs, where no exception reaches the main thread."""
+    script = """
+        import subprocess, sys, time
+        from dopepp.training import processes
+        processes._POLL_S = processes._GRACE_S = 0.2
+        child = subprocess.Popen([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"])
+        processes.Watch([child], None).start()
+        time.sleep(120)
+    """
+    ended = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True, text=True, timeout=100, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert ended.returncode == 1
+    assert ended.stderr.endswith("was killed by signal 9: the run ends\n")
+
+
+def test_a_stopped_watch_lets_processes_end() -> None:
+    child = sleeper("raise SystemExit(3)")
+    watch = Watch([child], None)
+    watch.stop()
+    watch.run()  # returns at once, and this process is still here
+    child.wait()
+
+
+def test_a_child_sees_that_its_parent_is_gone() -> None:
+    script = """
+        import os, subprocess, sys, time
+        code = '''
+        import os
+        from dopepp.training.processes import Watch
+        print(Watch([], int(os.environ["STARTED_BY"])).death(60), flush=True)
+        '''
+        import textwrap
+        environment = {**os.environ, "STARTED_BY": str(os.getpid())}
+        subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], env=environment)
+        time.sleep(1)
+        os.kill(os.getpid(), 9)
+    """
+    ended = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True, text=True, timeout=100, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert "(rank 0 on this machine) has died" in ended.stdout
