@@ -26,7 +26,7 @@ from dopepp.experiment.methods import (
     Method,
     object_numbers,
 )
-from dopepp.experiment.objects import build_parts
+from dopepp.experiment.objects import build_parts, check_data
 from dopepp.experiment.other_images import warn_of_other_images
 from dopepp.experiment.pass_rates import reported_rates
 from dopepp.experiment.protocols import Protocols
@@ -182,7 +182,9 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     loaded = [PoseEstimator.load(path, device, config["refine"]) for path in paths]
     own = loaded[-1].checkpoint if loaded else None
     stored = own.data if own is not None else {}
-    data = chosen_data(config, trained_on(stored), str(file if own is None else paths[-1]))
+    measured = str(file if own is None else paths[-1])
+    data = chosen_data(config, trained_on(stored), measured)
+    check_data(data, measured)
     record.write_config(run_dir, config)
     fingerprint = "" if own is None else own.data_fingerprint
     seed = held_out_seed(data)

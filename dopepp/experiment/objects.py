@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any, Final
 
 from dopepp.data.bop_models import bop_parts
@@ -27,6 +28,49 @@ PAPER_OBJECTS: Final = (
 
 MAX_WORKERS: Final = 1024
 """More loader processes than any machine here has cores: a slip of the keyboard."""
+
+
+_KINDS: Final[Mapping[str, tuple[type, ...]]] = {
+    "name": (str,),
+    "format": (str,),
+    "root": (str, NoneType),
+    "objects": (list, NoneType),
+    "parts": (list,),
+    "frames": (list, NoneType),
+    "unit": (str, NoneType),
+    "image_sets": (dict,),
+    "virtual": (dict, NoneType),
+    "samples_per_epoch": (int,),
+    "eval_seed": (int,),
+    "num_val": (int,),
+    "num_test": (int,),
+    "batch_size": (int,),
+    "num_workers": (int, NoneType),
+    "input_size": (list,),
+    "real_fraction": (int, float),
+    "synthetic_fraction": (int, float),
+}
+"""Options that every data config has, with what their values may be."""
+
+
+def check_data(data: Mapping[str, Any], source: str) -> None:
+    """Refuse a data config that is none: a checkpoint's may be by anybody.
+
+    Args:
+        data: The config.
+        source: Where it is from, for the error.
+
+    Raises:
+        UserError: An option is missing or of another kind.
+    """
+    for name, kinds in _KINDS.items():
+        if name not in data or type(data[name]) not in kinds:
+            got = f"{name}={data[name]!r:.80}" if name in data else f"no {name}"
+            raise UserError(
+                f"{source}, whose data config has {got}",
+                f"{name} as {' or '.join(kind.__name__ for kind in kinds)}",
+                "choose the data with data=…, or use a checkpoint written by train.py",
+            )
 
 
 def build_parts(data: Mapping[str, Any]) -> list[Part]:

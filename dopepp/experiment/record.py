@@ -18,6 +18,7 @@ import torch
 import yaml
 
 import dopepp
+from dopepp.data.json_file import read_json as read_strict_json
 from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
 from dopepp.virtual.version import code_hash
@@ -51,12 +52,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         UserError: The file is missing or no JSON object.
     """
-    try:
-        record = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path}, unreadable: {error}", "a file written by a run", "check the run folder"
-        ) from error
+    record = read_strict_json(path)
     if not isinstance(record, dict):
         raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", "check the file")
     return record

@@ -22,6 +22,7 @@ from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
 from dopepp.experiment import record
 from dopepp.experiment.images import differing_images, flat
+from dopepp.experiment.yaml_file import read_yaml
 from dopepp.models.checkpoint import Checkpoint
 
 _log = logging.getLogger(__name__)
@@ -45,9 +46,6 @@ _COPY: Final = "data.virtual"
 """Says again what the node ``virtual`` says."""
 
 _ABSENT: Final = "not set"
-_MAX_BYTES: Final = 1_000_000
-"""Far more than a config has: a run's folder may come from anybody."""
-
 _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re.DOTALL)
 
 
@@ -169,7 +167,7 @@ def read_overrides(run: Path) -> list[str] | None:
         UserError: The file holds something else.
     """
     path = run / OVERRIDES
-    return trusted_overrides(_read_yaml(path), path) if path.is_file() else None
+    return trusted_overrides(read_yaml(path), path) if path.is_file() else None
 
 
 def remember_overrides(run: Path) -> None:
@@ -180,28 +178,10 @@ def remember_overrides(run: Path) -> None:
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    config = _read_yaml(path)
+    config = read_yaml(path)
     if not isinstance(config, dict):
         raise UserError(f"{path} with a {type(config).__name__}", "a config", "check the run")
     return config
-
-
-def _read_yaml(path: Path) -> object:
-    """Read plain values; aliases, with which a few lines can become billions, are refused."""
-    if path.stat().st_size > _MAX_BYTES:
-        raise UserError(
-            f"{path} of {path.stat().st_size} bytes", "a file of a run", "check the run"
-        )
-    try:
-        text = path.read_text()
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise UserError(f"{path} with YAML aliases", "a file of a run", "check the run")
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(
-            f"{path}, unreadable: {reason:.200}", "a file of a run", "check the run"
-        ) from error
 
 
 def _text(entries: Mapping[str, object], key: str) -> str:

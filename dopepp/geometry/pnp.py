@@ -157,7 +157,9 @@ def _prepared(
 def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     K = np.asarray(K, np.float64)
     proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and K[2].tolist() == [0, 0, 1]
-    if not proper or K[0, 0] * K[1, 1] == K[0, 1] * K[1, 0]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0] if proper else 0.0
+    if not (np.isfinite(determinant) and determinant != 0):
         raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
     return K
 

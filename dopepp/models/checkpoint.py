@@ -8,7 +8,7 @@ module alone knows the file; training writes it, inference and experiment read i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -29,6 +29,14 @@ __all__ = ["Checkpoint", "load_network", "read", "write_atomic"]
 KEY: Final = "dopepp"
 STATE_PREFIX: Final = "network."
 FORMAT_VERSION: Final = 1
+
+MAX_SIDE: Final = 8192
+"""Pixels of an input: an image is enlarged to it, so it decides about memory."""
+
+_MAX_VALUES: Final = 4_000_000
+_MAX_DEPTH: Final = 32
+_MAX_BITS: Final = 128
+"""Values, levels of nesting, bits of a whole number: more than any file of ours has."""
 
 _WHAT: Final = "a checkpoint (.ckpt) written by train.py"
 
@@ -135,15 +143,20 @@ def _parse(content: Mapping[str, Any]) -> Checkpoint:
     payload = content[KEY]
     if not isinstance(payload, dict):
         raise UserError(f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train again")
+    _check_plain(payload)
     version = _take(payload, "format_version", int)
     if not 1 <= version <= FORMAT_VERSION:
         raise UserError(
             f"format_version {version}", f"1 to {FORMAT_VERSION}", "update dopepp to read this file"
         )
     input_size = _take(payload, "input_size", list)
-    if len(input_size) != 2 or not all(type(side) is int and side > 0 for side in input_size):
+    if len(input_size) != 2 or not all(
+        type(side) is int and 0 < side <= MAX_SIDE for side in input_size
+    ):
         raise UserError(
-            f"input_size {input_size!r:.100}", "[width, height] in pixels", "train again"
+            f"input_size {input_size!r:.100}",
+            f"[width, height] in pixels, at most {MAX_SIDE}",
+            "train again",
         )
     sigma = _take(payload, "sigma", float)
     if not (math.isfinite(sigma) and sigma > 0):
@@ -161,6 +174,53 @@ def _parse(content: Mapping[str, Any]) -> Checkpoint:
         metrics=_take_numbers(payload, "metrics"),
         format_version=version,
     )
+
+
+def _check_plain(payload: Mapping[Any, Any]) -> None:
+    """Refuse what is not plain, nested too deep, or too much.
+
+    A list that holds one other list many times, and so on, takes no memory until somebody prints or
+    walks it.
+    """
+    known: dict[int, int] = {}
+    for name, value in payload.items():
+        try:
+            _count(value, 0, known)
+        except ValueError as error:
+            raise UserError(
+                f"{name!s:.50} with {error}",
+                "mappings, lists, text, numbers, true/false and null",
+                "write the file with train.py",
+            ) from error
+
+
+def _count(value: object, depth: int, known: dict[int, int]) -> int:
+    """Return how many plain values there are in one, as often as they are there.
+
+    Args:
+        value: What a file holds.
+        depth: Containers around it.
+        known: Numbers of containers that were counted, by their identity.
+    """
+    if type(value) not in (dict, list, tuple):
+        if isinstance(value, int) and value.bit_length() > _MAX_BITS:
+            raise ValueError(f"a whole number of {value.bit_length()} bits")
+        if type(value) not in (str, int, float, bool, type(None)):
+            raise ValueError(f"a {type(value).__name__}")
+        return 1
+    if id(value) not in known:
+        if depth == _MAX_DEPTH:
+            raise ValueError(f"values nested more than {_MAX_DEPTH} deep")
+        items: Iterable[object] = value  # type: ignore[assignment]
+        if isinstance(value, dict):
+            odd = next((key for key in value if type(key) not in (str, int)), None)
+            if odd is not None:
+                raise ValueError(f"a key of type {type(odd).__name__}")
+            items = value.values()
+        known[id(value)] = 1 + sum(_count(item, depth + 1, known) for item in items)
+    if known[id(value)] > _MAX_VALUES:
+        raise ValueError(f"over {_MAX_VALUES} values")
+    return known[id(value)]
 
 
 def _take(payload: Mapping[str, Any], name: str, expected: type[T]) -> T:

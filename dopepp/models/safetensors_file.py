@@ -83,8 +83,9 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = path.read_bytes()
         metadata = _header(content)
         return dict(load(content)), metadata
     except OSError as error:
@@ -97,8 +98,6 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _header(content: bytes) -> dict[str, str]:
     """Check a file's header against its size and return the metadata."""
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"over {MAX_BYTES} bytes")
     length = int.from_bytes(content[:_LENGTH_BYTES], "little")
     start = _LENGTH_BYTES + length
     if len(content) < _LENGTH_BYTES or start > len(content):

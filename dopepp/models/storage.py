@@ -11,6 +11,12 @@ from typing import Any, Final
 import torch
 
 from dopepp.errors import UserError
+from dopepp.models import pickled
+from dopepp.models.pickled import claimed_storages
+
+_ZIP: Final = b"PK\x03\x04"
+_LEGACY: Final = b"\x80\x02"
+"""What a file begins with: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
 
 MAX_BYTES: Final = 4 * 2**30
 """The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
@@ -45,22 +51,37 @@ def write_atomic(payload: Mapping[str, Any], path: Path) -> None:
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
 
+    What the file's pickle asks for is looked at first (:mod:`dopepp.models.pickled`), so that
+    loading takes no more memory than the file has bytes.
+
     Args:
-        path: The file.
+        path: The file, also one of torch before 1.6.
         what: What it should be, for messages.
 
     Raises:
         UserError: The file is missing, damaged, holds something else or more than tensors and
-            plain values.
+            plain values, or unpacks to too much.
     """
-    if not Path(path).is_file():
+    path = Path(path)
+    if not path.is_file():
         raise UserError(f"{path}, which is no file", what, "correct the path")
     try:
+        with path.open("rb") as file:
+            begin = file.read(len(_LEGACY))
+        if begin == _LEGACY:
+            _check_legacy(path)
+        elif _ZIP.startswith(begin):
+            check_container(path, what)
+            _check_pickle(path)
+        else:
+            raise ValueError("neither a zip archive nor a pickle")
         content = torch.load(path, map_location="cpu", weights_only=True)
+    except UserError:
+        raise
     except Exception as error:  # a damaged or hostile file raises whatever its bytes lead to
-        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:200]
+        reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
         raise UserError(
-            f"{path}, which torch refuses to load ({reason})",
+            f"{path}, which torch refuses to load ({reason[:200]})",
             what,
             "get the file again; load none that you do not trust",
         ) from error
@@ -85,12 +106,17 @@ def check_container(path: Path, what: str) -> int:
     if not path.is_file():
         raise UserError(f"{path}, which is no file", what, "correct the path")
     try:
+        with path.open("rb") as file:
+            # Where a zip archive comes second, torch would read what comes first.
+            if file.read(len(_ZIP)) != _ZIP:
+                raise zipfile.BadZipFile("something else before the archive")
         with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
+            members = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise UserError(
             f"{path}, which is not a torch file or was cut short", what, "copy or write it again"
         ) from error
+    size = sum(member.file_size for member in members)
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
         raise UserError(
@@ -99,3 +125,37 @@ def check_container(path: Path, what: str) -> int:
             "load no file that you do not trust",
         )
     return size
+
+
+def _check_pickle(path: Path) -> None:
+    """Hold a zip archive of torch's to what it may contain.
+
+    Raises:
+        ValueError: It holds something else.
+    """
+    with zipfile.ZipFile(path) as archive:
+        sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
+        if len(sizes) < len(archive.infolist()):
+            raise ValueError("two members of one name")  # and torch may take the other one
+        pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
+        if len(pickles) != 1:
+            raise ValueError(f"{len(pickles)} members FOLDER/data.pkl")
+        with archive.open(pickles[0]) as member:
+            claimed = claimed_storages(member.read(pickled.MAX_BYTES + 1))
+    folder = pickles[0].removesuffix("data.pkl")
+    for key, size in claimed.items():
+        stored = sizes.get(f"{folder}data/{key}".casefold())
+        if stored != size:
+            raise ValueError(f"a storage of {size} bytes, of which {stored} are in the file")
+
+
+def _check_legacy(path: Path) -> None:
+    """Hold a file of torch before 1.6 to what it may contain.
+
+    Raises:
+        ValueError: It holds something else, or fewer numbers than it says.
+    """
+    with path.open("rb") as file:
+        claimed = claimed_storages(file.read(pickled.MAX_BYTES + 1), pickled.NUM_LEGACY)
+    if sum(claimed.values()) > path.stat().st_size:
+        raise ValueError(f"{sum(claimed.values())} bytes of numbers in {path.stat().st_size}")

@@ -30,6 +30,9 @@ ASSUMED_UNIT: Final = "mm"
 MAX_BYTES: Final = 250_000_000
 """Five million triangles: far beyond any use here, and a bound on memory."""
 
+MAX_POINTS_BYTES: Final = 20_000_000
+"""Of a ``points.xyz``: half a million points."""
+
 READERS: Final = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
 """The reader of each suffix."""
 
@@ -114,6 +117,8 @@ def ycb_part(root: str | Path, name: str) -> Part:
 def _read_points(path: Path) -> Float[np.ndarray, "points 3"]:
     allowed = "lines of three finite numbers"
     try:
+        if path.stat().st_size > MAX_POINTS_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes, over {MAX_POINTS_BYTES}")
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns of an empty file
             points = np.loadtxt(path, ndmin=2)

@@ -28,6 +28,9 @@ TYPES: Final = {
 ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 """Byte order of each format; text is turned into little-endian doubles before it is read."""
 
+_MAX_HEADER_BYTES: Final = 100_000
+"""Hundreds of properties, and comments; a longer header would take hours to be understood."""
+
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 """Names that programs give to a vertex's texture coordinates."""
 
@@ -70,6 +73,8 @@ def _split(data: bytes) -> tuple[bytes, bytes]:
     header, mark, rest = data.partition(b"end_header")
     if not mark or not data.startswith(b"ply"):
         raise ValueError("no PLY header")
+    if len(header) > _MAX_HEADER_BYTES:
+        raise ValueError(f"a header of {len(header)} bytes, over {_MAX_HEADER_BYTES}")
     line_end = b"\r\n" if rest.startswith(b"\r\n") else rest[:1]
     if line_end not in (b"\r\n", b"\n", b"\r"):
         raise ValueError("a header without an end")

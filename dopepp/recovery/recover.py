@@ -62,8 +62,8 @@ def recover_batch(
     Peaks are found and read on the maps' device; only they come to the host.
 
     Raises:
-        ValueError: The channels do not match the number of cuboids, maps differ in size, or there
-            are not as many cameras as images or names as objects.
+        ValueError: The channels do not match the number of cuboids, maps differ in size or have no
+            cells, or there are not as many cameras as images or names as objects.
         UserError: An option is out of range.
     """
     decoded = _decode(belief, field, cuboids, K, stride, names, options)
@@ -101,6 +101,8 @@ def _decode(
     labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
     if len(labels) != len(cuboids):
         raise ValueError(f"{len(cuboids)} objects need as many names, got {labels}")
+    if not labels:
+        return [[] for _ in K]
     geometry = MapGeometry(stride, chosen.sigma)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
     area = float(belief.shape[-2] * belief.shape[-1] * stride**2)
@@ -148,6 +150,11 @@ def _check_shapes(
     K: Float[np.ndarray, "batch 3 3"],
 ) -> None:
     expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
+    if belief.ndim != 4 or field.ndim != 4 or 0 in belief.shape[2:]:
+        raise ValueError(
+            f"maps are (batch, channels, height, width) with cells, got {tuple(belief.shape)} "
+            f"and {tuple(field.shape)}"
+        )
     got = (belief.shape[1], field.shape[1])
     if got != expected or belief.shape[2:] != field.shape[2:] or len(belief) != len(field):
         raise ValueError(

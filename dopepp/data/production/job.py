@@ -109,11 +109,11 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
         *groups, field = path.split(".")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             sign, value = "", error
         if not sign or not all((*groups, field)):
             raise UserError(
-                f"--set {change}", "FIELD.FIELD=VALUE, the value in YAML",
+                f"--set {change:.200}", "FIELD.FIELD=VALUE, the value in YAML",
                 "write it like lighting.num_lights=[1,3]",
             )  # fmt: skip
         node = tree

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from dopepp.errors import UserError
 from dopepp.experiment import record
 from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.methods import Cost
 from dopepp.experiment.report import Report
+from dopepp.experiment.yaml_file import read_yaml
 
 _HYDRA: Final = Path(".hydra")
 _TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
@@ -177,10 +176,10 @@ def _cost(folder: Path) -> Cost:
 def _overrides(folder: Path) -> list[str]:
     path = folder / _HYDRA / "overrides.yaml"
     try:
-        listed = yaml.safe_load(path.read_text()) if path.is_file() else []
-    except (OSError, ValueError, yaml.YAMLError):  # cut short where the disk was full
+        listed = read_yaml(path) if path.is_file() else []
+    except UserError:  # cut short where the disk was full
         listed = []
-    texts = [str(text).lstrip("+") for text in listed or []]
+    texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
     places = tuple(f"{name}=" for name in _ELSEWHERE)
     return [text for text in texts if not text.startswith(("hydra.", *places))]
 
@@ -188,7 +187,7 @@ def _overrides(folder: Path) -> list[str]:
 def _mapping(path: Path) -> dict[str, Any]:
     """Read a YAML mapping; empty where there is none."""
     try:
-        content = yaml.safe_load(path.read_text()) if path.is_file() else {}
-    except (OSError, ValueError, yaml.YAMLError):  # as above
+        content = read_yaml(path) if path.is_file() else {}
+    except UserError:  # as above
         content = {}
     return content if isinstance(content, dict) else {}

@@ -1,0 +1,158 @@
+"""The decoder on maps that no sound network makes: finite detections or a documented error."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dopepp.geometry.camera import camera_matrix
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.recovery import Detection, explain, recover
+
+QUICK: Final = 40
+THOROUGH: Final = 6000
+"""Maps: a few seconds, and some minutes."""
+
+VALUES: Final = (
+    0.0, 1.0, -1.0, 0.02, 0.05, 0.5, 1e-30, 1e-7, 1e30, 3e38, -3e38, float("nan"), float("inf"),
+    -float("inf"),
+)  # fmt: skip
+
+LENGTHS: Final = (0.05, 1e-3, 1.0, 0.0, 1e-12, 1e6, 1e-300, 1e150, float("nan"), float("inf"))
+"""Half-extents of a cuboid, metres."""
+
+FOCAL: Final = (60.0, 1.0, 1e-6, 1e6, 0.0, -60.0, 1e200, float("nan"), float("inf"))
+
+
+def make_maps(case: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    """Make belief and field maps: noise, a constant or peaks, with odd numbers in some cells."""
+    rng = np.random.default_rng(case["seed"])
+    rows, columns = case["cells"]
+    objects = case["objects"]
+    maps = []
+    for channels in (9 * objects, 16 * objects):
+        shape = (channels, rows, columns)
+        if case["kind"] == "constant":
+            values = np.full(shape, case["value"])
+        elif case["kind"] == "noise":
+            values = rng.normal(0, 1, shape) * case["value"]
+        else:
+            values = np.zeros(shape)
+            for channel in values:
+                row, column = rng.integers(rows), rng.integers(columns)
+                channel[row, column] = case["value"]
+                channel[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] += 0.3
+        odd = rng.uniform(size=shape) < case["share"]
+        values[odd] = case["odd"]
+        with np.errstate(over="ignore"):
+            maps.append(torch.from_numpy(values.astype(np.float32)))
+    return maps[0].to(case["dtype"]), maps[1].to(case["dtype"])
+
+
+CASES = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 2**32 - 1),
+        "cells": st.tuples(st.integers(1, 14), st.integers(1, 14)),
+        "objects": st.integers(0, 2),
+        "kind": st.sampled_from(["constant", "noise", "peaks"]),
+        "value": st.sampled_from(VALUES),
+        "odd": st.sampled_from(VALUES),
+        "share": st.sampled_from([0.0, 0.02, 0.5]),
+        "dtype": st.sampled_from([torch.float32, torch.float16, torch.bfloat16, torch.float64]),
+        "half": st.tuples(*[st.sampled_from(LENGTHS)] * 3),
+        "centre": st.sampled_from([0.0, 0.01, 1e3, 1e300]),
+        "focal": st.sampled_from(FOCAL),
+        "principal": st.sampled_from([50.0, 0.0, -1e6, 1e30, float("nan")]),
+    }
+)
+
+PLAIN: Final[dict[str, Any]] = {
+    "seed": 0, "cells": (12, 12), "objects": 1, "kind": "peaks", "value": 1.0, "odd": 0.0,
+    "share": 0.0, "dtype": torch.float32, "half": (0.05, 0.04, 0.03), "centre": 0.0, "focal": 60.0,
+    "principal": 50.0,
+}  # fmt: skip
+
+
+def decode(case: dict[str, Any]) -> list[Detection]:
+    """Decode a case; whatever the maps hold, there is an answer."""
+    belief, field = make_maps(case)
+    half = np.array(case["half"])
+    with np.errstate(invalid="ignore", over="ignore"):
+        cuboid = cuboid_keypoints(case["centre"] - half, case["centre"] + half)
+    cuboids = np.stack([cuboid] * case["objects"]) if case["objects"] else np.zeros((0, 9, 3))
+    K = camera_matrix(case["focal"], case["focal"], case["principal"], case["principal"])
+    found = recover(belief, field, cuboids, K)
+    reasons = explain(belief, field, cuboids, K)
+    assert all("\n" not in reason for reason in reasons)
+    return found
+
+
+def check(case: dict[str, Any]) -> None:
+    try:
+        found = decode(case)
+    except ValueError:  # documented; a UserError is one, too
+        if sound(case):
+            raise
+        return
+    for one in found:
+        assert np.isfinite(one.T_cam_obj).all()
+        assert np.isfinite(one.covariance).all()
+        assert np.isfinite(one.reprojection_error_px)
+        assert 0 <= one.score <= 1
+        assert 0 <= one.belief <= 1
+        np.testing.assert_allclose(
+            one.T_cam_obj[:3, :3] @ one.T_cam_obj[:3, :3].T, np.eye(3), atol=1e-6
+        )
+
+
+def sound(case: dict[str, Any]) -> bool:
+    """Tell whether camera and cuboid can be, whatever the maps are."""
+    fits = case["focal"] in (60.0, 1.0, 1e6) and case["principal"] in (50.0, 0.0)
+    return (
+        fits and all(length in (0.05, 1e-3, 1.0) for length in case["half"]) and case["centre"] <= 1
+    )
+
+
+@settings(max_examples=QUICK, deadline=None, derandomize=True, database=None)
+@given(CASES)
+@example(PLAIN)
+@example({**PLAIN, "objects": 0})  # found: a reshape of nothing
+@example({**PLAIN, "focal": 1e200})  # found: a determinant beyond all numbers
+def test_any_maps(case: dict[str, Any]) -> None:
+    check(case)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@settings(
+    max_examples=THOROUGH, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+)
+@given(CASES)
+def test_many_maps(case: dict[str, Any]) -> None:
+    check(case)
+
+
+WRONG: Final = {
+    "nine channels too few": ((9, 4, 4), (32, 4, 4), 2),
+    "maps of two sizes": ((9, 4, 4), (16, 4, 5), 1),
+    "no batch": ((4, 4), (16, 4, 4), 1),
+    "no maps": ((9, 0, 4), (16, 0, 4), 1),
+    "one dimension too many": ((1, 9, 4, 4), (1, 16, 4, 4), 1),
+    "no objects but channels": ((9, 4, 4), (16, 4, 4), 0),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_maps_of_other_shapes(name: str) -> None:
+    belief, field, objects = WRONG[name]
+    box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)
+    K = camera_matrix(60, 60, 50, 50)
+    cuboids = np.stack([box] * objects) if objects else np.zeros((0, 9, 3))
+    with pytest.raises(ValueError, match=r"channels|maps"):
+        recover(torch.zeros(belief), torch.zeros(field), cuboids, K)

@@ -1,0 +1,375 @@
+"""Every reader on damaged and twisted files: a result or one line for the user, nothing else.
+
+The same checks run twice: on few files with every test run, and, marked ``slow``, on as many as
+take about ten minutes together with ``test_fuzz_decoder.py``. What such runs find is kept as a case
+of its own, by the attack it would make.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+import torch
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
+from trimesh.exchange.stl import export_stl, export_stl_ascii
+
+from dopepp.data.archive import Limits, safe_extract
+from dopepp.data.bop import BopSource
+from dopepp.data.bop_images import decode_depth, decode_mask, decode_rgb, encode_png
+from dopepp.data.bop_masks import encode_runs
+from dopepp.data.bop_models import bop_parts
+from dopepp.data.bop_results import read_results
+from dopepp.data.checking.check import check_dataset
+from dopepp.data.ndds import NddsSource
+from dopepp.data.ndds_writer import NddsWriter
+from dopepp.data.sample import Instance, Sample
+from dopepp.data.webdataset import WebdatasetSource
+from dopepp.data.ycb_meta import read_meta
+from dopepp.drawing.pictures import read_image, read_picture, read_rgb
+from dopepp.errors import UserError
+from dopepp.experiment.yaml_file import read_yaml
+from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.models import safetensors_file
+from dopepp.models.checkpoint import load_network
+from dopepp.parts.mesh import read_mesh
+from dopepp.parts.part import Mesh, make_part
+
+QUICK: Final = 6
+THOROUGH: Final = 300
+"""Files of each kind: seconds in all, and about ten minutes."""
+
+MOST_CHARACTERS: Final = 3000
+"""Of the line for the user."""
+
+TOKENS: Final = (
+    b"nan", b"inf", b"-1", b"1e999", b"9" * 30, b"0", b"", b"null", b"[]", b"{}", b'"', b"\\",
+    b"\n", b"\x00", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80", b"true", b"1.5", b"/etc/passwd",
+    b"../", b"[[",
+)  # fmt: skip
+
+
+NAMES: Final = (
+    "a.ckpt", "a.safetensors", "a.yaml", "archive.gztar", "archive.tar", "archive.zip",
+    "binary.ply", "binary.stl", "bop/camera.json", "bop/models/models_info.json",
+    "bop/train_pbr/000000/scene_camera.json", "bop/train_pbr/000000/scene_gt.json",
+    "bop/train_pbr/000000/scene_gt_info.json", "box.obj", "colour.bmp", "colour.jpg",
+    "colour.png", "colour.tga", "colour.tiff", "colour.webp", "deep.png", "m_s-test.csv",
+    "meta.mat", "ndds/000000.json", "ndds/_camera_settings.json", "ndds/_object_settings.json",
+    "overrides.yaml", "palette.png", "print.jpg", "shards/camera.json",
+    "shards/models/models_info.json", "shards/train_pbr/shard-000000.tar", "text.ply", "text.stl",
+)  # fmt: skip
+"""What is spoilt: a file, or a file of a data set."""
+
+
+@st.composite
+def damage(draw: st.DrawFn) -> list[tuple[str, float, bytes | float]]:
+    """What is done to a file, at places that are shares of its length."""
+    share = st.floats(0, 1, exclude_max=True)
+    step = st.one_of(
+        st.tuples(st.just("put"), share, st.binary(min_size=1, max_size=4)),
+        st.tuples(st.just("insert"), share, st.sampled_from(TOKENS)),
+        st.tuples(st.just("word"), share, st.sampled_from(TOKENS)),
+        st.tuples(st.just("cut"), share, st.floats(0, 0.1)),
+        st.tuples(st.just("repeat"), share, st.floats(0, 0.1)),
+        st.tuples(st.just("end"), share, st.just(0.0)),
+    )
+    return draw(st.lists(step, min_size=1, max_size=4))
+
+
+def damaged(content: bytes, steps: list[tuple[str, float, Any]]) -> bytes:
+    """Return a file with its damage."""
+    for kind, share, what in steps:
+        start = int(share * len(content))
+        if kind == "put":
+            content = content[:start] + what + content[start + len(what) :]
+        elif kind == "insert":
+            content = content[:start] + what + content[start:]
+        elif kind == "word":  # a whole number, name or value of a text
+            stop = start
+            while stop < len(content) and content[stop : stop + 1] not in b' ,:\n"[]{}':
+                stop += 1
+            while start > 0 and content[start - 1 : start] not in b' ,:\n"[]{}':
+                start -= 1
+            content = content[:start] + what + content[stop:]
+        elif kind == "end":
+            content = content[:start]
+        else:
+            piece = content[start : start + int(what * len(content)) + 1]
+            rest = content[start + len(piece) :] if kind == "cut" else content[start:]
+            content = content[:start] + (b"" if kind == "cut" else piece) + rest
+    return content
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader and the good file that is spoilt for it.
+
+    Attributes:
+        folder: A good data set, or a folder with the file alone.
+        file: The file, in the folder.
+        reads: Ways to read it, given the folder.
+    """
+
+    folder: Path
+    file: str
+    reads: tuple[Callable[[Path], object], ...]
+
+
+def read_all(source: Any) -> None:
+    """Ask a data source for everything it knows."""
+    for index in range(len(source)):
+        sample = source.sample(index)
+        assert np.isfinite(sample.K).all()
+        assert all(np.isfinite(one.T_cam_obj).all() for one in sample.instances)
+    source.contains("obj_000001")
+    source.describe()
+
+
+def read_finite_mesh(path: Path) -> None:
+    mesh = read_mesh(path, "mm")
+    assert np.isfinite(mesh.vertices).all()
+    assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+
+
+def images(path: Path) -> tuple[Callable[[Path], object], ...]:
+    """The ways to read a picture."""
+
+    def picture(folder: Path) -> object:
+        try:
+            return read_picture(folder / path.name)
+        except ValueError as error:  # which its callers turn into one line
+            raise UserError(str(error), "", "") from error
+
+    def decoder(decode: Callable[..., object], *arguments: object) -> Callable[[Path], object]:
+        return lambda folder: decode((folder / path.name).read_bytes(), path.name, *arguments)
+
+    return (
+        picture,
+        lambda folder: read_image(folder / path.name),
+        lambda folder: read_rgb(folder / path.name),
+        decoder(decode_rgb),
+        decoder(decode_depth, 1.0, (24, 32)),
+        decoder(decode_mask, (24, 32)),
+    )
+
+
+@pytest.fixture(scope="session")
+def targets(
+    tmp_path_factory: pytest.TempPathFactory, content: dict[str, Any]
+) -> Mapping[str, Target]:
+    """Good files of every kind."""
+    root = tmp_path_factory.mktemp("good")
+    return {**_files(root, content), **_datasets(root)}
+
+
+def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
+    box = trimesh.creation.box((10.0, 20.0, 30.0))
+    picture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (24, 32, 3), np.uint8),
+                               (5, 5), 2)  # fmt: skip
+    files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object] | None]] = {}
+
+    def add(
+        name: str, write: Callable[[Path], object], read: Callable[[Path], object] | None
+    ) -> None:
+        files[name] = (write, read)
+
+    for name, data in {
+        "binary.stl": export_stl(box),
+        "text.stl": export_stl_ascii(box).encode(),
+        "box.obj": b"mtllib box.mtl\n" + export_obj(box).encode(),
+        "binary.ply": export_ply(box),
+        "text.ply": export_ply(box, encoding="ascii"),
+    }.items():
+        add(name, lambda path, data=data: path.write_bytes(data), read_finite_mesh)
+    for name, image in {
+        "colour.png": Image.fromarray(picture),
+        "palette.png": Image.fromarray(picture).convert("P"),
+        "deep.png": Image.fromarray(picture[..., 0].astype(np.uint16) * 200),
+        "colour.jpg": Image.fromarray(picture),
+        "print.jpg": Image.fromarray(picture).convert("CMYK"),
+        "colour.tiff": Image.fromarray(picture),
+        "colour.webp": Image.fromarray(picture),
+        "colour.bmp": Image.fromarray(picture),
+        "colour.tga": Image.fromarray(picture),
+    }.items():
+        add(name, image.save, None)
+    add("a.ckpt", lambda path: torch.save(content, path), load_network)
+    tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
+    add("a.safetensors", lambda path: safetensors_file.write(path, tensors, {"spec": "{}"}),
+        safetensors_file.read)  # fmt: skip
+    add("a.yaml", lambda path: path.write_text("a: {b: [1, 2.5, null]}\nc: 'x'\n"), read_yaml)
+    add("overrides.yaml", lambda path: path.write_text("- model=dopepp\n- 'data.parts=[a]'\n"),
+        read_yaml)  # fmt: skip
+    rows = "scene_id,im_id,obj_id,score,R,t,time\n" + "1,4,2,0.75,1 0 0 0 0 -1 0 1 0,-10 20 812,1\n"
+    add("m_s-test.csv", lambda path: path.write_text(rows), lambda path: read_results(path, {2}))
+    fields = {
+        "cls_indexes": np.array([[2.0]]),
+        "poses": np.eye(4)[:3, :, None]
+        + np.array([0, 0, 0, 1.0])[None, :, None] * [[[0]], [[0]], [[0.4]]],
+        "intrinsic_matrix": np.eye(3),
+        "factor_depth": 10000,
+    }
+    add("meta.mat", lambda path: scipy.io.savemat(path, fields, do_compression=True), read_meta)
+    for suffix in ("zip", "tar", "gztar"):
+        add(f"archive.{suffix}", lambda path, suffix=suffix: _pack(path, suffix), _extract)
+    made = {}
+    for name, (write, read) in files.items():
+        folder = root / name
+        folder.mkdir()
+        (folder / "box.mtl").write_text("newmtl m\n")
+        write(folder / name)
+        alone = (lambda folder, name=name, read=read: read(folder / name),)
+        made[name] = Target(folder, name, images(folder / name) if read is None else alone)
+    return made
+
+
+def _pack(path: Path, kind: str) -> None:
+    folder = path.parent / "packed"
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / "b.txt").write_text("hello\n" * 50)
+    made = shutil.make_archive(str(path.parent / "made"), kind, folder)
+    Path(made).replace(path)
+    shutil.rmtree(folder)
+
+
+def _extract(path: Path) -> None:
+    target = path.parent / "unpacked"
+    shutil.rmtree(target, ignore_errors=True)
+    safe_extract(path, target, Limits(num_members=100, total_bytes=10_000_000))
+
+
+def _datasets(root: Path) -> dict[str, Target]:
+    """Write two images in each layout, by hand: no renderer has to be compiled for it."""
+    box = trimesh.creation.box((40.0, 30.0, 20.0))
+    part = make_part("obj_000001", Mesh(box.vertices / 1000, box.faces.astype(np.int32)))
+    picture, depth = encode_png(np.full((24, 32, 3), 90, np.uint8)), np.full((24, 32), 300)
+    camera = {"cam_K": [40.0, 0, 15.5, 0, 40.0, 11.5, 0, 0, 1], "depth_scale": 1.0}
+    truth = [{"cam_R_m2c": list(np.eye(3).ravel()), "cam_t_m2c": [0, 0, 300.0], "obj_id": 1}]
+    info = [{"visib_fract": 0.9, "bbox_visib": [10, 8, 9, 7], "px_count_all": 63}]
+    mask = np.zeros((24, 32), np.uint8)
+    mask[8:15, 10:19] = 255
+    for name in ("bop", "shards"):
+        (root / name / "models").mkdir(parents=True)
+        (root / name / "models" / "obj_000001.ply").write_bytes(export_ply(box))
+        size = {f"size_{axis}": side for axis, side in zip("xyz", (40.0, 30, 20), strict=True)}
+        low = {f"min_{axis}": -side / 2 for axis, side in zip("xyz", (40.0, 30, 20), strict=True)}
+        models = {"1": {"diameter": float(np.linalg.norm([40, 30, 20])), **low, **size}}
+        (root / name / "models" / "models_info.json").write_text(json.dumps(models))
+        (root / name / "camera.json").write_text(
+            json.dumps({"width": 32, "height": 24, "fx": 40.0, "fy": 40.0, "cx": 15.5, "cy": 11.5,
+                        "depth_scale": 1.0})
+        )  # fmt: skip
+    scene = root / "bop" / "train_pbr" / "000000"
+    for folder, data in (
+        ("rgb/000000.png", picture), ("depth/000000.png", encode_png(depth.astype(np.uint16))),
+        ("mask/000000_000000.png", encode_png(mask)),
+        ("mask_visib/000000_000000.png", encode_png(mask)),
+        ("scene_camera.json", json.dumps({"0": camera}).encode()),
+        ("scene_gt.json", json.dumps({"0": truth}).encode()),
+        ("scene_gt_info.json", json.dumps({"0": info}).encode()),
+    ):  # fmt: skip
+        (scene / folder).parent.mkdir(parents=True, exist_ok=True)
+        (scene / folder).write_bytes(data)
+    members = {
+        "rgb.png": picture, "depth.png": encode_png(depth.astype(np.uint16)),
+        "camera.json": json.dumps(camera).encode(), "gt.json": json.dumps(truth).encode(),
+        "gt_info.json": json.dumps(info).encode(),
+        "mask_visib.json": json.dumps({"0": encode_runs(mask > 0)}).encode(),
+    }  # fmt: skip
+    (root / "shards" / "train_pbr").mkdir()
+    with tarfile.open(root / "shards" / "train_pbr" / "shard-000000.tar", "w") as archive:
+        for name, data in members.items():
+            entry = tarfile.TarInfo(f"000000_000000.{name}")
+            entry.size = len(data)
+            archive.addfile(entry, io.BytesIO(data))
+    T = np.eye(4)
+    T[2, 3] = 0.3
+    K = camera_matrix(40.0, 40.0, 15.5, 11.5)
+    instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 0.9, mask > 0)
+    writer = NddsWriter(root / "ndds", [part])
+    writer.prepare()
+    for index in range(2):
+        writer.write(index, Sample(np.full((24, 32, 3), 90, np.uint8), K, [instance], depth / 1000))
+    writer.seal(0, range(2))
+
+    readers: dict[str, Callable[[Path], object]] = {
+        "bop": lambda folder: read_all(BopSource(folder, bop_parts(folder), "train_pbr")),
+        "ndds": lambda folder: read_all(NddsSource(folder, [part])),
+        "shards": lambda folder: read_all(WebdatasetSource(folder, bop_parts(folder), "train_pbr")),
+    }
+    made = {}
+    for name, read in readers.items():
+        for file in sorted((root / name).rglob("*")):
+            if file.suffix in (".json", ".tar") and "000001.json" not in file.name:
+                relative = str(file.relative_to(root / name))
+                made[f"{name}/{relative}"] = Target(root / name, relative, (read, check_dataset))
+    return made
+
+
+def examine(target: Target, content: bytes, place: Path) -> int:
+    """Read a data set with one file replaced; return how many of its readers took it."""
+    folder = place / "spoilt"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(target.folder, folder)
+    (folder / target.file).write_bytes(content)
+    num_taken = 0
+    for read in target.reads:
+        line = ""
+        try:
+            read(folder)
+            num_taken += 1
+        except UserError as error:
+            line = str(error)
+        assert "\n" not in line
+        assert len(line) < MOST_CHARACTERS
+    return num_taken
+
+
+def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
+    """Damage a good file in many ways."""
+    good = (target.folder / target.file).read_bytes()
+    num_taken = examine(target, good, folder)
+    # Not every way to read a picture takes every format.
+    assert num_taken == len(target.reads) or (num_taken and len(target.reads) > 2)
+
+    @settings(
+        max_examples=num_files, deadline=None, derandomize=repeat, database=None,
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(damage())
+    def check(steps: list[tuple[str, float, Any]]) -> None:
+        examine(target, damaged(good, steps), folder)
+
+    check()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_files(name: str, targets: Mapping[str, Target], tmp_path: Path) -> None:
+    fuzz(targets[name], tmp_path, QUICK, repeat=True)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", NAMES)
+def test_many_damaged_files(name: str, targets: Mapping[str, Target], tmp_path: Path) -> None:
+    fuzz(targets[name], tmp_path, THOROUGH, repeat=False)
+
+
+def test_every_good_file_is_tried(targets: Mapping[str, Target]) -> None:
+    assert set(targets) == set(NAMES)

@@ -1,0 +1,320 @@
+"""Checkpoints whose archive lies, and checkpoints whose plain values ask for too much."""
+
+from __future__ import annotations
+
+import copy
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.geometry.camera import camera_matrix
+from dopepp.inference.estimator import PoseEstimator
+
+pytestmark = pytest.mark.timeout(60)
+
+Refused = Callable[..., Any]
+Edit = Callable[[dict[str, Any]], object]
+
+
+def members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def pack(path: Path, content: list[tuple[str, bytes]], method: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in content:
+            archive.writestr(name, data)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("again", ["good/data.pkl", "GOOD/DATA.PKL", "good/data/0"])
+def test_two_members_of_one_name(again: str, good: Path, tmp_path: Path, refused: Refused) -> None:
+    """One reader takes the first of them, another one the last."""
+    folder = next(iter(members(good))).split("/")[0]
+    content = [(name.replace(folder, "good"), data) for name, data in members(good).items()]
+    path = pack(tmp_path / "bad.ckpt", [*content, (again, b"\x80\x02N.")])
+    with refused("two members of one name"):
+        PoseEstimator.load(path)
+
+
+def test_two_pickles_in_two_folders(good: Path, tmp_path: Path, refused: Refused) -> None:
+    content = list(members(good).items())
+    path = pack(tmp_path / "bad.ckpt", [("other/data.pkl", b"\x80\x02N."), *content])
+    with refused("2 members FOLDER/data.pkl"):
+        PoseEstimator.load(path)
+
+
+def test_an_archive_behind_something_else(good: Path, tmp_path: Path, refused: Refused) -> None:
+    """torch would read what comes first, which nobody has looked at."""
+    path = tmp_path / "bad.ckpt"
+    for first in (b"\x80\x02}.", b"#!/bin/sh\n", bytes(512)):
+        path.write_bytes(first + good.read_bytes())
+        with refused("not a torch file"):
+            PoseEstimator.load(path)
+
+
+@pytest.mark.parametrize("name", ["../data.pkl", "/etc/data.pkl", "a/../../data.pkl"])
+def test_members_that_lead_out_of_the_archive(
+    name: str, good: Path, tmp_path: Path, refused: Refused
+) -> None:
+    content = [*members(good).items(), (name, b"\x80\x02N.")]
+    path = pack(tmp_path / "bad.ckpt", content)
+    with refused("bad.ckpt, which torch refuses to load"):
+        PoseEstimator.load(path)
+    assert not list(tmp_path.parent.glob("data.pkl"))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_bomb(method: int, tmp_path: Path, refused: Refused) -> None:
+    path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(50_000_000))], method)
+    assert path.stat().st_size < 100_000
+    with refused("which unpacks to 50000000 bytes"):
+        PoseEstimator.load(path)
+
+
+def test_a_declared_size_that_lies(tmp_path: Path, refused: Refused) -> None:
+    """The directory says 10 bytes, or 10 terabytes, of a member of a thousand."""
+    path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(1000))])
+    content = bytearray(path.read_bytes())
+    entry = content.rindex(b"PK\x01\x02")
+    for size in (10, 2**32 - 2):
+        content[entry + 24 : entry + 28] = struct.pack("<I", size)
+        path.write_bytes(content)
+        with refused(r"bad\.ckpt, which"):
+            PoseEstimator.load(path)
+
+
+def test_overlapping_members(tmp_path: Path, refused: Refused) -> None:
+    """A thousand entries of the directory that share one member's bytes."""
+    path = pack(tmp_path / "one.ckpt", [("a/data/0", bytes(100_000))])
+    content = path.read_bytes()
+    first, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
+    directory = content[first:end] * 1000
+    tail = bytearray(content[end:])
+    tail[8:12] = struct.pack("<HH", 1000, 1000)
+    tail[12:16] = struct.pack("<I", len(directory))
+    path.write_bytes(content[:first] + directory + tail)
+    with refused(r"one\.ckpt, which"):
+        PoseEstimator.load(path)
+
+
+def laughs(width: int = 10, depth: int = 12) -> list[Any]:
+    """A list that takes a kilobyte, and a terabyte where it is printed."""
+    value: list[Any] = ["ha"]
+    for _ in range(depth):
+        value = [value] * width
+    return value
+
+
+def nested(depth: int = 200) -> list[Any]:
+    value: list[Any] = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def endless() -> list[Any]:
+    value: list[Any] = []
+    value.append(value)
+    return value
+
+
+VALUES: dict[str, Callable[[], object]] = {
+    "a billion laughs": laughs,
+    "lists within lists": nested,
+    "a list that holds itself": endless,
+    "a number of a million digits": lambda: 10**1000,
+    "a huge mapping key": lambda: {(1, 2): 3},
+    "a tensor": lambda: torch.zeros(3),
+}
+FIELDS: dict[str, Callable[[dict[str, Any], object], object]] = {
+    "width": lambda c, bad: c["dopepp"]["spec"]["backbone"].update(width=bad),
+    "num_objects": lambda c, bad: c["dopepp"]["spec"].update(num_objects=bad),
+    "input_size": lambda c, bad: c["dopepp"].update(input_size=[bad, 64]),
+    "format_version": lambda c, bad: c["dopepp"].update(format_version=bad),
+    "name": lambda c, bad: c["dopepp"]["parts"][0].update(name=bad),
+    "points": lambda c, bad: c["dopepp"]["parts"][0].update(points=bad),
+    "data": lambda c, bad: c["dopepp"]["data"].update(config=bad),
+    "metrics": lambda c, bad: c["dopepp"].update(metrics={"a": bad}),
+}
+
+
+def saved(content: dict[str, Any], edit: Edit, path: Path) -> Path:
+    spoilt = copy.deepcopy(content)
+    edit(spoilt)
+    torch.save(spoilt, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [(field, "a billion laughs") for field in FIELDS] + [("data", value) for value in VALUES],
+)
+def test_values_that_explode(
+    field: str, value: str, content: dict[str, Any], tmp_path: Path, refused: Refused
+) -> None:
+    bad = VALUES[value]()
+    path = saved(content, lambda c: FIELDS[field](c, bad), tmp_path / "bad.ckpt")
+    with refused(r"bad\.ckpt"):
+        PoseEstimator.load(path)
+
+
+def test_a_payload_nested_very_deep(tmp_path: Path, refused: Refused) -> None:
+    deep = b"]" * 100_000 + b"a" * 99_999
+    pickled = b"\x80\x02}X\x06\x00\x00\x00dopepp}X\x04\x00\x00\x00data" + deep + b"ss."
+    torch.save({}, tmp_path / "empty.ckpt")
+    content = [
+        (name, pickled if name.endswith(".pkl") else data)
+        for name, data in members(tmp_path / "empty.ckpt").items()
+    ]
+    with refused(r"data with values nested more than 32 deep"):
+        PoseEstimator.load(pack(tmp_path / "bad.ckpt", content))
+
+
+TARGETS = (
+    "os.system",
+    "subprocess.Popen",
+    "builtins.exec",
+    "torch.load",
+    "torch.hub.load",
+    "torch.utils.collect_env.run",
+    "sympy.sympify",
+    "dopepp.models.backbones.os.system",
+    "dopepp.models.backbones.torch.load",
+    "dopepp.models.backbones.Backbone",
+    "dopepp.models.backbones.DSC.__init__",
+    "dopepp.models.backbones.__builtins__",
+    "dopepp.models.heads.MultiScale",
+    "dopepp.models.backbones.read_mapping",
+    " dopepp.models.backbones.DSC",
+    "dopepp.models.backbones.DSC\n",
+    "dopepp.models.backbones.DSC\x00",
+    "dopepp.models.backbones.DS\u0421",  # a Cyrillic С
+    "dopepp\u2024models.backbones.DSC",  # a dot that is none
+    "\uff44opepp.models.backbones.DSC",  # a wide d, which Python's own names fold
+    "DSC",
+    "",
+    None,
+    ["dopepp.models.backbones.DSC"],
+    {"_target_": "os.system"},
+    "x" * 1_000_000,
+)
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: repr(target)[:60])
+def test_a_target_outside_of_the_list(
+    target: object, content: dict[str, Any], tmp_path: Path, canary: str, refused: Refused
+) -> None:
+    node = {"_target_": target, "command": canary, "_args_": [canary], "width": 0.125}
+    path = saved(
+        content, lambda c: c["dopepp"]["spec"].update(backbone=node), tmp_path / "bad.ckpt"
+    )
+    with refused(r"backbone _target_ .*bad\.ckpt"):
+        PoseEstimator.load(path)
+
+
+def spec(part: str, **arguments: object) -> Edit:
+    return lambda c: c["dopepp"]["spec"][part].update(arguments)
+
+
+def payload(**fields: object) -> Edit:
+    return lambda c: c["dopepp"].update(fields)
+
+
+def part(**fields: object) -> Edit:
+    return lambda c: c["dopepp"]["parts"][0].update(fields)
+
+
+TOO_MUCH: dict[str, tuple[Edit, str]] = {
+    "a million channels": (spec("backbone", width=1e6), "width=1000000"),
+    "endless channels": (spec("backbone", width=float("inf")), "width=inf"),
+    "no width": (spec("head", width=float("nan")), "width=nan"),
+    "a billion stages": (spec("head", stages=10**9), "stages=1000000000"),
+    "a billion objects": (lambda c: c["dopepp"]["spec"].update(num_objects=10**9), "num_objects"),
+    "attention of nothing": (spec("attention", reduction=10**9), "reduction"),
+    "the widest network in a small file": (
+        lambda c: (spec("backbone", width=4.0)(c), spec("head", width=4.0, stages=12)(c)),
+        "do not fit the spec's network",
+    ),
+    "an argument that builds": (spec("head", stages={"_target_": "os.system"}), "_target_"),
+    "an argument of the builder": (spec("head", in_channels=10**9), "argument 'in_channels'"),
+    "private arguments": (spec("head", __class__="os.system"), "argument '__class__'"),
+    "inputs of terapixels": (payload(input_size=[10**7, 10**7]), r"input_size \[10000000"),
+    "inputs of one pixel too many": (payload(input_size=[8193, 64]), r"input_size \[8193"),
+    "a billion peaks": (payload(recovery={"max_peaks": 10**9}), "max_peaks=1000000000"),
+    "a threshold of nothing": (
+        payload(recovery={"peak_threshold": float("nan")}), "peak_threshold=nan",
+    ),
+    "peaks as wide as the sky": (payload(sigma=1e300), "sigma"),
+    "a million symmetries": (
+        part(symmetries_discrete=[np.eye(4).tolist()] * 2000), "symmetries_discrete of 2000",
+    ),
+    "a million points": (part(points=[[0.0, 0.0, 0.0]] * 100_001), "points of 100001"),
+    "points beyond the moon": (part(points=[[1e300, 0.0, 0.0]]), "no number of metres"),
+    "a cuboid inside out": (part(cuboid=[[0.0, 0.0, 0.0]] * 8 + [[1.0, 1, 1]]), "axis-aligned"),
+    "a name with a screen's commands": (part(name="\x1b[2J"), "part name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TOO_MUCH)
+def test_a_spec_or_a_table_that_asks_for_too_much(
+    name: str, content: dict[str, Any], tmp_path: Path, canary: str, refused: Refused
+) -> None:
+    edit, message = TOO_MUCH[name]
+    with refused(message):
+        PoseEstimator.load(saved(content, edit, tmp_path / "bad.ckpt"))
+
+
+def weight(make: Callable[[torch.Tensor], object]) -> Edit:
+    def edit(content: dict[str, Any]) -> None:
+        name = next(name for name in content["state_dict"] if name.endswith("weight"))
+        content["state_dict"][name] = make(content["state_dict"][name])
+
+    return edit
+
+
+WEIGHTS: dict[str, Callable[[torch.Tensor], object]] = {
+    "one number repeated to any size": lambda w: torch.zeros(()).expand(10**6, 10**6),
+    "overlapping rows": lambda w: torch.zeros(w.numel()).as_strided(
+        (w.numel() // 2, w.numel() // 2), (1, 1)
+    ),
+    "another shape": lambda w: w.flatten(),
+    "no dimensions": lambda w: w.flatten()[0],
+    "text": lambda w: "0.5",
+    "a list": lambda w: w.tolist(),
+    "whole numbers": lambda w: w.long(),
+    "true and false": lambda w: w > 0,
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_weights_that_are_not_what_they_seem(
+    name: str, content: dict[str, Any], tmp_path: Path, refused: Refused
+) -> None:
+    path = saved(content, weight(WEIGHTS[name]), tmp_path / "bad.ckpt")
+    with refused("weights that do not fit"):
+        PoseEstimator.load(path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
+def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(
+    value: float, content: dict[str, Any], tmp_path: Path, bounded: Callable[..., Any]
+) -> None:
+    def spoil(content: dict[str, Any]) -> None:
+        for tensor in content["state_dict"].values():
+            if tensor.is_floating_point():
+                tensor.fill_(value)
+
+    path = saved(content, spoil, tmp_path / "bad.ckpt")
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    with bounded():
+        found = PoseEstimator.load(path).predict(image, camera_matrix(80, 80, 32, 24))
+    assert all(np.isfinite(one.T_cam_obj).all() for one in found)

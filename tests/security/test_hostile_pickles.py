@@ -1,0 +1,279 @@
+"""Checkpoints whose pickle runs code, or asks torch for more than the file holds."""
+
+from __future__ import annotations
+
+import builtins
+import copy
+import importlib
+import operator
+import os
+import pickle
+import struct
+import subprocess
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.utils import collect_env
+
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.models.backbones import VGG19
+
+pytestmark = pytest.mark.timeout(60)
+
+Edit = Callable[[dict[str, Any], Any], None]
+Refused = Callable[..., Any]
+SIZE = 10**9
+"""Bytes that a bomb asks for: seen at once, and borne by the machine if it goes off."""
+
+
+def first_weight(content: dict[str, Any]) -> str:
+    return next(name for name in content["state_dict"] if name.endswith("weight"))
+
+
+PLACES: dict[str, Edit] = {
+    "state_dict itself": lambda c, bad: c.update(state_dict=bad),
+    "a weight": lambda c, bad: c["state_dict"].update({first_weight(c): bad}),
+    "another weight": lambda c, bad: c["state_dict"].update({"loss.weight": bad}),
+    "payload": lambda c, bad: c.update(dopepp=bad),
+    "spec": lambda c, bad: c["dopepp"]["spec"]["backbone"].update(width=bad),
+    "objects table": lambda c, bad: c["dopepp"]["parts"][0].update(name=bad),
+    "ADD points": lambda c, bad: c["dopepp"]["parts"][0].update(points=bad),
+    "data": lambda c, bad: c["dopepp"]["data"].update(root=bad),
+    "recovery": lambda c, bad: c["dopepp"]["recovery"].update(sigma=bad),
+    "optimizer state": lambda c, bad: c.update(optimizer_states=[{"state": {0: bad}}]),
+    "callback state": lambda c, bad: c.update(callbacks={"ModelCheckpoint": bad}),
+    "a key": lambda c, bad: c.update({"x": {"y": [bad]}}),
+}
+
+
+@pytest.fixture
+def write(content: dict[str, Any], tmp_path: Path) -> Callable[..., Path]:
+    """Write a checkpoint with something bad at a place."""
+
+    def make(place: str, bad: object) -> Path:
+        spoilt = copy.deepcopy(content)
+        PLACES[place](spoilt, bad)
+        torch.save(spoilt, tmp_path / "bad.ckpt")
+        return tmp_path / "bad.ckpt"
+
+    return make
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_os_system_anywhere(
+    place: str, write: Callable[..., Path], Call: type, canary: str, refused: Refused
+) -> None:
+    path = write(place, Call(os.system, canary))
+    with refused(r"bad\.ckpt, which torch refuses to load .*the name 'posix\.system'"):
+        PoseEstimator.load(path)
+
+
+CALLS: dict[str, Callable[[Any, str], object]] = {
+    "exec": lambda call, command: call(builtins.exec, f"import os; os.system({command!r})"),
+    "eval": lambda call, command: call(builtins.eval, f"__import__('os').system({command!r})"),
+    "Popen": lambda call, command: call(subprocess.Popen, command.split()),
+    "collect_env, which got through Hydra's gate": lambda call, command: call(
+        collect_env.run, command
+    ),
+    "import_module": lambda call, _: call(importlib.import_module, "antigravity"),
+    "an attribute by its name": lambda call, _: call(operator.attrgetter, "system"),
+    "setting the environment": lambda call, _: call(os.putenv, "DOPEPP_CANARY", "1"),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_other_ways_to_run_code(
+    name: str, write: Callable[..., Path], Call: type, canary: str, refused: Refused
+) -> None:
+    path = write("data", CALLS[name](Call, canary))
+    with refused("which torch refuses to load .*the name '"):
+        PoseEstimator.load(path)
+
+
+def test_torch_load_inside_of_a_checkpoint(
+    write: Callable[..., Path], Call: type, canary: str, refused: Refused, tmp_path: Path
+) -> None:
+    (tmp_path / "second.pkl").write_bytes(pickle.dumps(Call(os.system, canary)))
+    path = write("data", Call(torch.load, str(tmp_path / "second.pkl")))
+    with refused(r"the name 'torch\.serialization\.load'"):
+        PoseEstimator.load(path)
+
+
+class Subclass(torch.Tensor):
+    """A tensor of somebody's own class."""
+
+
+def test_a_tensor_of_another_class(write: Callable[..., Path], refused: Refused) -> None:
+    path = write("another weight", torch.ones(3).as_subclass(Subclass))
+    with refused("which torch refuses to load"):
+        PoseEstimator.load(path)
+
+
+def test_methods_set_on_a_tensor(
+    write: Callable[..., Path], Call: type, content: dict[str, Any], refused: Refused
+) -> None:
+    """``_rebuild_from_type_v2`` sets any attribute, as one that a check would ask for."""
+    weight = content["state_dict"][first_weight(content)]
+    parts = weight.__reduce_ex__(2)
+    path = write(
+        "a weight",
+        Call(
+            torch._tensor._rebuild_from_type_v2, *parts[:1], torch.Tensor, parts[1], {"layout": 0}
+        ),
+    )
+    with refused("_rebuild_from_type_v2"):
+        PoseEstimator.load(path)
+
+
+BOMBS: dict[str, Callable[[Any], object]] = {
+    "bytearray": lambda call: call(bytearray, SIZE),
+    "bytes": lambda call: call(bytes, SIZE),
+    "storage": lambda call: call(torch.UntypedStorage, SIZE),
+    "old tensor": lambda call: call(torch.FloatTensor, SIZE // 4),
+    "tensor larger than its storage": lambda call: call(
+        torch._utils._rebuild_tensor_v2, torch.zeros(1).untyped_storage(), 0, (SIZE // 4,), (1,),
+        False, OrderedDict(),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BOMBS)
+@pytest.mark.parametrize("place", ["data", "optimizer state"])
+def test_a_call_that_fills_the_memory(
+    name: str, place: str, write: Callable[..., Path], Call: type, refused: Refused
+) -> None:
+    """torch's own list of harmless calls has some that allocate what their argument says."""
+    try:
+        path = write(place, BOMBS[name](Call))
+    except NotImplementedError:  # torch cannot write a bare storage
+        pytest.skip("cannot be written")
+    assert path.stat().st_size < 1_000_000
+    with refused("which torch refuses to load"):
+        PoseEstimator.load(path)
+
+
+def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) -> Path:
+    """Copy a torch file, its members changed."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, edit(name, old.read(name)))
+    return target
+
+
+def test_a_storage_that_reaches_beyond_its_bytes(tmp_path: Path, refused: Refused) -> None:
+    """Some versions of torch would read on in memory."""
+    torch.save({"dopepp": torch.arange(200.0)}, tmp_path / "good.ckpt")
+
+    def enlarge(name: str, content: bytes) -> bytes:
+        # BININT1 200 becomes BININT2 65535, in the storage and in the tensor.
+        return content.replace(b"K\xc8", b"M\xff\xff") if name.endswith(".pkl") else content
+
+    path = repacked(tmp_path / "good.ckpt", tmp_path / "bad.ckpt", enlarge)
+    with refused("a storage of 262140 bytes, of which 800 are in the file"):
+        PoseEstimator.load(path)
+
+
+def pickled(body: bytes) -> bytes:
+    """Make a pickle of protocol 2 from its operations."""
+    return b"\x80\x02" + body + b"."
+
+
+OPERATIONS = {
+    "a memo index of gigabytes": b"Nr\xff\xff\xff\x7f",
+    "text that claims gigabytes": b"X\xff\xff\xff\xff",
+    "a number that claims gigabytes": b"\x8b\xff\xff\xff\x7f",
+    "bytes that claim terabytes": b"\x8e\xff\xff\xff\xff\xff\xff\x00\x00",
+    "a name from the stack": b"X\x02\x00\x00\x00osX\x06\x00\x00\x00system\x93",
+    "an instance by its class": b"(ios\nsystem\n",
+    "an object by its class": b"(cos\nsystem\no",
+    "an extension": b"\x82\x01",
+    "a million sets": b"\x8f" * 1_000_000,
+    "a memo that was never made": b"h\x07",
+    "nothing on the stack": b"R",
+    "no end": b"}" + b"(" * 100_000,
+    "a persistent name": b"Pos.system\n",
+    "a reference that is no storage": b"X\x06\x00\x00\x00moduleX\x01\x00\x00\x00a\x86Q",
+    "another protocol": b"\x80\x05}",
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_that_no_checkpoint_needs(
+    name: str, good: Path, tmp_path: Path, refused: Refused
+) -> None:
+    path = repacked(
+        good, tmp_path / "bad.ckpt",
+        lambda member, old: pickled(OPERATIONS[name]) if member.endswith(".pkl") else old,
+    )  # fmt: skip
+    with refused(r"bad\.ckpt(, which torch refuses to load \(a pickle with| with a NoneType)"):
+        PoseEstimator.load(path)
+
+
+def storage_reference(count: int) -> bytes:
+    """The operations that refer to a storage of so many float32 numbers."""
+    number = b"\x8a\x08" + struct.pack("<q", count)
+    storage = b"X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000"
+    return b"(" + storage + b"X\x03\x00\x00\x00cpu" + number + b"NtQ"
+
+
+def legacy(content: bytes) -> bytes:
+    """Make a file of torch before 1.6: five pickles, then the numbers."""
+    magic = pickle.dumps(0x1950A86A20F9469CFC6C, 2)
+    machine = pickle.dumps({"protocol_version": 1001, "little_endian": True, "type_sizes": {}}, 2)
+    return magic + pickle.dumps(1001, 2) + machine + content + pickle.dumps(["0"], 2) + bytes(8)
+
+
+def test_a_legacy_file_is_no_checkpoint(
+    tmp_path: Path, Call: type, canary: str, refused: Refused
+) -> None:
+    path = tmp_path / "old.ckpt"
+    torch.save({"dopepp": {}}, path, _use_new_zipfile_serialization=False)
+    with refused("not a torch file"):
+        PoseEstimator.load(path)
+    path.write_bytes(pickle.dumps(Call(os.system, canary), 2))
+    with refused("not a torch file"):
+        PoseEstimator.load(path)
+
+
+LEGACY: dict[str, Callable[[Any, str], bytes]] = {
+    "code in its content": lambda call, command: legacy(pickle.dumps(call(os.system, command), 2)),
+    "code in place of its magic number": lambda call, command: pickle.dumps(
+        call(os.system, command), 2
+    ),
+    "a storage of terabytes": lambda *_: legacy(pickled(storage_reference(10**12))),
+    "a storage of a negative size": lambda *_: legacy(pickled(storage_reference(-1))),
+    "a call that fills the memory": lambda call, _: legacy(pickle.dumps(call(bytearray, SIZE), 2)),
+}
+
+
+@pytest.mark.parametrize("name", LEGACY)
+def test_hostile_pretrained_weights(
+    name: str, tmp_path: Path, Call: type, canary: str, refused: Refused
+) -> None:
+    """Pretrained backbones come from anywhere, and torchvision's own is of the old format."""
+    path = tmp_path / "vgg19.pth"
+    path.write_bytes(LEGACY[name](Call, canary))
+    with refused(r"vgg19\.pth, which torch refuses to load"):
+        VGG19(weights_path=str(path))
+
+
+def test_legacy_weights_without_malice_are_read(tmp_path: Path) -> None:
+    network = VGG19()
+    layers = [layer for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)]
+    weights, position = OrderedDict(), 0
+    steps = iter(layers)
+    for step in network.plan:
+        if not isinstance(step, str):
+            layer = next(steps)
+            weights[f"features.{position}.weight"] = layer.weight.data
+            weights[f"features.{position}.bias"] = layer.bias.data
+            position += 1
+        position += 1
+    torch.save(weights, tmp_path / "vgg19.pth", _use_new_zipfile_serialization=False)
+    again = VGG19(weights_path=str(tmp_path / "vgg19.pth"))
+    assert torch.equal(next(again.parameters()), next(network.parameters()))

@@ -1,0 +1,218 @@
+"""Run folders from somebody else: what resuming, evaluating and comparing them may do."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import json
+import os
+import pickle
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.experiment.resume import read_overrides
+from dopepp.experiment.yaml_file import read_yaml
+
+pytestmark = pytest.mark.timeout(120)
+
+ROOT = Path(__file__).parents[2]
+Refused = Callable[..., Any]
+Told = Callable[..., str]
+
+
+@pytest.fixture
+def told(bounded: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Told:
+    """Run ``train.py`` or ``evaluate.py`` and return the one line that it ends in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+
+    def run(script: str, *arguments: str) -> str:
+        out, err = io.StringIO(), io.StringIO()
+        monkeypatch.setattr(sys, "argv", [str(ROOT / script), *arguments])
+        with (
+            bounded(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err),
+            pytest.raises(SystemExit) as end,
+        ):  # fmt: skip
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        assert end.value.code == 2, err.getvalue()[-3000:]
+        assert "Traceback" not in err.getvalue()
+        line = err.getvalue().rstrip("\n").rpartition("\n")[2]
+        assert line.startswith("got ")
+        return line
+
+    return run
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path, good: Path) -> Callable[[str], Path]:
+    """Make a run folder to resume, with the text of its overrides."""
+
+    def make(overrides: str) -> Path:
+        run = tmp_path / "run"
+        (run / ".hydra").mkdir(parents=True)
+        (run / "checkpoints").mkdir()
+        (run / "checkpoints" / "last.ckpt").write_bytes(good.read_bytes())
+        (run / ".hydra" / "overrides.yaml").write_text(overrides)
+        return run
+
+    return make
+
+
+COMMANDS = {
+    "a callback of Hydra's": [
+        "+hydra.callbacks.x._target_=torch.utils.collect_env.run",
+        "+hydra.callbacks.x.command={command}",
+    ],
+    "a logging handler": [
+        "hydra/job_logging=default", "hydra.job_logging.handlers.console.class=os.system",
+    ],
+    "a launcher": ["hydra.launcher._target_=os.system"],
+    "a package of Hydra's": ["+logger@hydra.callbacks.evil=tensorboard"],
+    "a search path": ["hydra.searchpath=[file:///tmp]"],
+    "the environment": ["+hydra.job.env_set.DOPEPP_CANARY=1"],
+    "a removed setting": ["~hydra.callbacks.compare"],
+    "an option of the command line": ["--config-dir=/tmp"],
+    "a multirun": ["-m"],
+    "a pickle to run again": ["--experimental-rerun={pickle}"],
+    "a blank before it": [" hydra.launcher._target_=os.system"],
+    "a line end before it": ["\nhydra.launcher._target_=os.system"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_overrides_that_are_no_options_of_ours(
+    name: str,
+    run_folder: Callable[[str], Path],
+    told: Told,
+    canary: str,
+    tmp_path: Path,
+    Call: type,
+) -> None:
+    hostile = tmp_path / "job.pickle"
+    hostile.write_bytes(pickle.dumps(Call(os.system, canary)))
+    overrides = [text.format(command=f"'{canary}'", pickle=hostile) for text in COMMANDS[name]]
+    run = run_folder(json.dumps(["seed=1", *overrides]))
+    # Hydra's own settings are left out, with a warning; what is no override at all ends the run.
+    assert str(run) in told("train.py", f"resume={run}")
+
+
+def laughs() -> str:
+    lines = ["a0: &a0 [ha, ha]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
+    return "\n".join(lines)
+
+
+TEXTS = {
+    "a Python call": "- !!python/object/apply:os.system ['touch canary']",
+    "a Python name": "- !!python/name:os.system",
+    "a tag of one's own": "- !evil x",
+    "a billion laughs": laughs(),
+    "laughs in a list": "- &a [x]\n- [*a, *a]",
+    "a merge": "x: &a {b: 1}\ny: {<<: *a}",
+    "nested brackets": "[" * 100_000,
+    "nested blocks": "\n".join(" " * n + "a:" for n in range(1000)),
+    "an endless anchor": "&a [*a]",
+    "a mapping": "seed: 1",
+    "a number": "1",
+    "nothing": "",
+    "a list in the list": "- [seed=1]",
+    "a whole number": "- 1",
+    "a huge whole number": "- " + "9" * 100_000,
+    "two documents": "- seed=1\n---\n- seed=2",
+    "no YAML": "- 'seed=1\n- {",
+    "megabytes": "- seed=1\n" * 300_000,
+    "no text": "- \x00",
+    "a surrogate": '- "\\ud800"',
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_overrides_that_are_no_list_of_text(name: str, tmp_path: Path, refused: Refused) -> None:
+    path = tmp_path / ".hydra" / "overrides.yaml"
+    path.parent.mkdir()
+    path.write_text(TEXTS[name])
+    with refused(r"overrides\.yaml"):
+        read_overrides(tmp_path)
+
+
+def test_the_files_that_hydra_writes_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "overrides.yaml"
+    path.write_text(
+        "- model=dopepp\n- data.parts=[a, b]\n- '++virtual.scene.x={a: 1}'\n- ~logger\n"
+    )
+    assert read_overrides(tmp_path) == [
+        "model=dopepp", "data.parts=[a, b]", "++virtual.scene.x={a: 1}", "~logger",
+    ]  # fmt: skip
+    path.write_text("a: {b: [1, 2.5, null, true]}\nc: 'x'\n")
+    assert read_yaml(path) == {"a": {"b": [1, 2.5, None, True]}, "c": "x"}
+
+
+def test_a_run_folder_that_is_no_file_of_text(
+    run_folder: Callable[[str], Path], told: Told
+) -> None:
+    run = run_folder("")
+    (run / ".hydra" / "overrides.yaml").write_bytes(b"\xff\xfe\x00")
+    assert "overrides.yaml" in told("train.py", f"resume={run}")
+
+
+STORED: dict[str, object] = {
+    "nothing": None,
+    "text": "os.system",
+    "an empty mapping": {},
+    "a format that is none": {"name": "x", "format": "os.system", "root": "/"},
+    "a folder that is none": {"name": "x", "format": "bop", "root": "/proc/self/mem"},
+    "numbers for text": {"name": 1, "format": 2, "root": 3},
+    "only its name": {"name": "virtual"},
+}
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_a_checkpoint_whose_data_are_none(
+    name: str, content: dict[str, Any], told: Told, tmp_path: Path
+) -> None:
+    """``evaluate.py`` takes the data from the checkpoint: what is wrong there is one line, too."""
+    spoilt = copy.deepcopy(content)
+    spoilt["dopepp"]["data"] = {"name": "x", "seed": 0, "config": STORED[name]}
+    torch.save(spoilt, tmp_path / "bad.ckpt")
+    line = told("evaluate.py", f"ckpt_path={tmp_path / 'bad.ckpt'}", f"output_dir={tmp_path / 'o'}")
+    assert "got " in line
+
+
+RECORDS = {
+    "no JSON": "{",
+    "a list": "[]",
+    "nested brackets": "[" * 100_000,
+    "not a number": '{"name": NaN}',
+    "a key twice": '{"name": "a", "name": "b"}',
+    "nothing in it": "{}",
+    "objects of another kind": '{"name": "a", "num_images": 1, "objects": [], "references": {}}',
+    "a row of other columns": json.dumps(
+        {"name": "a", "num_images": 1, "objects": {"mean": {"x": 1}}, "references": {}, "add": {},
+         "cost": {}}
+    ),
+    "a cost of code": json.dumps(
+        {"name": "a", "num_images": 1, "objects": {}, "references": {}, "add": {},
+         "cost": {"_target_": "os.system"}}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_metrics_of_somebody_else(name: str, tmp_path: Path, bounded: Callable[..., Any]) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "metrics.json").write_text(RECORDS[name])
+    with bounded():
+        done = CliRunner().invoke(app, ["compare", str(run), "--out", str(tmp_path / "compare")])
+    # One line for the user, or a row that says what is wrong with this run.
+    assert done.exit_code in (0, 1, 2)
+    assert done.exception is None or isinstance(done.exception, SystemExit)
