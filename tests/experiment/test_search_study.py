@@ -46,31 +46,31 @@ def test_the_best_trial_is_found_and_named(call_fast: Call, tmp_path: Path) -> N
 
 
 def test_the_same_command_goes_on_with_what_is_missing(call_fast: Call, tmp_path: Path) -> None:
-    assert call_fast(*FAST, "search.num_trials=3")[0] == 0
-    assert call_fast(*FAST, "search.num_trials=5")[0] == 0
-    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 2, 3, 4]
-    assert call_fast(*FAST, "search.num_trials=5")[0] == 0
-    assert len(started(tmp_path)) == 5
+    assert call_fast(*FAST, "search.num_trials=2")[0] == 0
+    assert call_fast(*FAST, "search.num_trials=4")[0] == 0
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 2, 3]
+    assert call_fast(*FAST, "search.num_trials=4")[0] == 0
+    assert len(started(tmp_path)) == 4
     drawn = {trial.params["optimizer.lr"] for trial in trials(tmp_path)}
-    assert len(drawn) == 5  # the second command did not draw the first one's again
+    assert len(drawn) == 4  # the second command did not draw the first one's again
 
 
 def test_interrupted_trials_run_again_under_their_numbers(
     call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for number in (1, 3):
+    for number in (0, 1):
         monkeypatch.setenv(f"END_{number}", "interrupt")
-    assert call_fast(*FAST, "search.num_trials=5")[0] == 130
-    assert trials(tmp_path)[1].state == TrialState.RUNNING
-    drawn = trials(tmp_path)[1].params
-    code, out, _ = call_fast(*FAST, "search.num_trials=5")
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 130
+    assert trials(tmp_path)[0].state == TrialState.RUNNING
+    drawn = trials(tmp_path)[0].params
+    code, out, _ = call_fast(*FAST, "search.num_trials=3")
     assert code == 130
-    assert "goes on with trials 1" in out
-    assert call_fast(*FAST, "search.num_trials=5")[0] == 0
+    assert "goes on with trials 0" in out
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 0
     found = trials(tmp_path)
-    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 5
-    assert found[1].params == drawn
-    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 1, 2, 3, 3, 4]
+    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 3
+    assert found[0].params == drawn
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
 
 
 def test_a_result_that_was_not_told_is_not_computed_again(call_fast: Call, tmp_path: Path) -> None:
@@ -88,16 +88,16 @@ def test_a_failing_trial_does_not_stop_the_study(
     call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("END_0", "raise")
-    code, out, _ = call_fast(*FAST, "search.num_trials=3")
+    code, out, _ = call_fast(*FAST, "search.num_trials=2")
     assert code == 0
-    assert "2 complete, 1 fail" in out
+    assert "1 complete, 1 fail" in out
     assert trials(tmp_path)[0].state == TrialState.FAIL
     failed = json.loads((tmp_path / "search" / "s" / "0" / "failed.json").read_text())
     assert failed["reason"] == "as the test asked"
 
 
 def test_trials_below_the_median_are_pruned(call_fast: Call, tmp_path: Path) -> None:
-    rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=7")
+    rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=6")
     assert call_fast(*SEARCH, LR, *rule)[0] == 0
     found = trials(tmp_path)
     pruned = [trial for trial in found if trial.state == TrialState.PRUNED]
