@@ -24,7 +24,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
+from dopepp.experiment.launch import remote
+from dopepp.experiment.report import Report
 from dopepp.experiment.resume import read_overrides
+from dopepp.training.trial import PrunedError
 
 _log = logging.getLogger(__name__)
 
@@ -36,10 +39,14 @@ USERS_MISTAKE: Final = 2
 INTERRUPTED: Final = 130
 
 
-def run_job(config: DictConfig, job: Job) -> None:
+def run_job(config: DictConfig, job: Job) -> float | None:
     """Resolve the config once and run a job in Hydra's run folder.
 
-    In a multirun a failing job leaves ``failed.json`` and lets the others run.
+    In a multirun a failing job leaves ``failed.json``, one that a search has stopped
+    ``pruned.json``, and the others run.
+
+    Returns:
+        A multirun's training: the objective, for Hydra's sweepers; None where there is none.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
@@ -52,17 +59,36 @@ def run_job(config: DictConfig, job: Job) -> None:
             _exit(str(error), FAILED)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
-        return
+        return None
+    if not remote.is_remote(str(hydra.launcher._target_)):
+        return _run_one_of_many(config, job, run_dir)
+    remote.configure_logging()
+    with remote.own_output(run_dir / remote.LOG_FILE):
+        return _run_one_of_many(config, job, run_dir)
+
+
+def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
+    """Run a job of a multirun, whose end stands in its folder."""
+    for name in (record.FAILURE_FILE, record.PRUNED_FILE):  # of an attempt before this one
+        (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)
         _refuse_parallel_multirun(plain)
-        job(plain, run_dir)
+        if remote.goes_on(plain, run_dir):
+            plain["resume"] = str(run_dir)
+        result = job(plain, run_dir)
+        return result.details.get(record.OBJECTIVE) if isinstance(result, Report) else None
+    except PrunedError as end:
+        display.console.print(f"pruned {end}")
+        record.write_json(run_dir / record.PRUNED_FILE, {"reason": str(end)})
     except Exception as error:
         reason = " ".join(str(error).split()) or repr(error)
         expected = isinstance(error, (UserError, RunError))
-        _log.error("job %s failed: %s", hydra.job.num, reason, exc_info=not expected)
+        number = HydraConfig.get().job.num
+        _log.error("job %s failed: %s", number, reason, exc_info=not expected)
         run_dir.mkdir(parents=True, exist_ok=True)
         record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
+    return None
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
@@ -86,7 +112,7 @@ def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
         )
 
 
-def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
+def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
     """Run an entry point and exit with its code; a user's mistake is printed as one line.
 
     Args:
@@ -96,10 +122,7 @@ def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
     """
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    # Lightning's own lines say again, and less exactly, what this package says.
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    remote.configure_logging()
     try:
         arguments = _resumed([_opened(text, open_nodes) for text in sys.argv[1:]])
         sys.argv = [sys.argv[0], *arguments]
@@ -111,6 +134,8 @@ def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)
+    except UserError as error:  # of a sweeper or launcher; jobs deal with their own
+        _exit(str(error), USERS_MISTAKE)
 
 
 def _exit(line: str, code: int) -> None:

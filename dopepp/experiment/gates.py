@@ -45,6 +45,7 @@ CALLBACKS: Gate[Callback] = Gate(
         "dopepp.training.overlays.Overlays",
         "dopepp.training.pose_metrics.PoseMetricsCallback",
         "dopepp.training.throughput.Throughput",
+        "dopepp.training.trial.TrialReport",
         "lightning.pytorch.callbacks.EarlyStopping",
         "lightning.pytorch.callbacks.LearningRateMonitor",
         "lightning.pytorch.callbacks.ModelCheckpoint",

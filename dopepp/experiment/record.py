@@ -27,6 +27,9 @@ CONFIG_FILE: Final = "config.yaml"
 VERSIONS_FILE: Final = "versions.json"
 METRICS_FILE: Final = "metrics.json"
 FAILURE_FILE: Final = "failed.json"
+PRUNED_FILE: Final = "pruned.json"
+OBJECTIVE: Final = "objective"
+"""Key of ``metrics.json``: the validation value that the best checkpoint was chosen by."""
 BEST_CHECKPOINT: Final = Path("checkpoints", "best.ckpt")
 LAST_CHECKPOINT: Final = Path("checkpoints", "last.ckpt")
 

@@ -29,6 +29,7 @@ from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_flag, check_integer
 from dopepp.training.processes import ProcessDiedError
 from dopepp.training.system import PoseSystem
+from dopepp.training.trial import raise_if_pruned
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +46,7 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
 
     Raises:
         UserError: A choice, a file or an option is wrong.
+        PrunedError: A search stopped this training.
     """
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     seed_everything(seed, verbose=False)
@@ -89,6 +91,7 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         kept = (run_dir / record.LAST_CHECKPOINT).is_file()
         advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
+    raise_if_pruned(trainer)
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
     return _measure_run(config, run_dir, trainer, protocols)
@@ -140,6 +143,9 @@ def _measure_run(
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
     details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
+    score = checkpoints[0].best_model_score if checkpoints else None
+    if score is not None and score.isfinite():
+        details[record.OBJECTIVE] = float(score)
     if config["model"]["width"] != 1.0:
         cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
         details[FULL_SIZE_COST] = vars(cost)

@@ -36,5 +36,5 @@ class CompareJobs(Callback):
             table: Any = OmegaConf.to_container(config.table, resolve=True)
             write_paper_table(PaperTable.of(table), entries, folder)
         display.console.print(f"comparison in {folder}")
-        if any(entry.failure for entry in entries):
+        if any(entry.failure and not entry.pruned for entry in entries):
             raise SystemExit(1)

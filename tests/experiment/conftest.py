@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import contextlib
+import io
+import runpy
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -44,3 +48,92 @@ def composed() -> Iterator[Composer]:
 def tiny(composed: Composer) -> Composer:
     """The same with a network and data that take no time."""
     return lambda *overrides: composed(*TINY, *overrides)
+
+
+FAST_TRAINING = '''
+"""train.py with a training that takes no time: its objective is best at a learning rate of 1e-3."""
+import math, os, signal
+from pathlib import Path
+from types import SimpleNamespace
+import hydra, torch
+from dopepp.experiment import record
+from dopepp.experiment.command_line import entry, run_job
+from dopepp.experiment.gates import CALLBACKS
+from dopepp.training.trial import raise_if_pruned
+
+EPOCHS = 4
+
+def train(config, run_dir):
+    lr, number = config["optimizer"]["lr"], run_dir.name
+    with (run_dir.parent / "started.txt").open("a") as stream:
+        stream.write(f"{number} {lr}\\n")
+    print(f"printed by job {number}", flush=True)
+    if lr <= 0:
+        raise ValueError(f"lr={lr}")
+    value = 1 - abs(math.log10(lr) + 3) / 4
+    if "trial" in config["callbacks"]:
+        report = CALLBACKS.build(config["callbacks"]["trial"])
+        trainer = SimpleNamespace(max_epochs=EPOCHS, should_stop=False, callbacks=[report])
+        report.setup(trainer, None, "fit")
+        for trainer.current_epoch in range(EPOCHS):
+            now = torch.tensor(value * (trainer.current_epoch + 1) / EPOCHS)
+            trainer.callback_metrics = {"val/selection": now}
+            report.on_validation_end(trainer, None)
+            end(run_dir, os.environ.get(f"END_{number}"))
+            if trainer.should_stop:
+                break
+        raise_if_pruned(trainer)
+    else:
+        end(run_dir, os.environ.get(f"END_{number}"))
+    record.write_json(run_dir / record.METRICS_FILE, {"objective": value})
+
+def end(run_dir, how):
+    """Fail, die or be interrupted as the test asks, the first time."""
+    if how is None or (run_dir / "ended_once").exists():
+        return
+    (run_dir / "ended_once").touch()
+    if how == "raise":
+        raise RuntimeError("as the test asked")
+    if how == "interrupt":
+        raise KeyboardInterrupt
+    os.kill(os.getpid(), signal.SIGKILL)
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="train")
+def main(config):
+    return run_job(config, train)
+
+if __name__ == "__main__":
+    entry(main)
+'''
+
+
+@pytest.fixture
+def fast_training(tmp_path: Path) -> Path:
+    """An entry point like ``train.py`` whose jobs take no time; END_<job>=how ends one early."""
+    path = tmp_path / "fast_training.py"
+    path.write_text(FAST_TRAINING)
+    (tmp_path / "conf").symlink_to(CONF)
+    return path
+
+
+Called = tuple[int, str, str]
+
+
+@pytest.fixture
+def call_fast(fast_training: Path, tmp_path: Path) -> Callable[..., Called]:
+    """Run it inside this process; returns exit code, output and error output."""
+
+    def call(*arguments: str) -> Called:
+        out, err, code = io.StringIO(), io.StringIO(), 0
+        places = [f"output_dir={tmp_path}", "~hydra.callbacks.compare"]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", [str(fast_training), *places, *arguments])
+            patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
+            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                try:
+                    runpy.run_path(str(fast_training), run_name="__main__")
+                except SystemExit as end:
+                    code = int(end.code or 0)
+        return code, out.getvalue(), err.getvalue()
+
+    return call

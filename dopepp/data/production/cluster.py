@@ -105,18 +105,29 @@ class ClusterPool:
         return self._limit
 
 
-def connect(address: str | None, num_workers: int) -> Any:
+def connect(
+    address: str | None,
+    num_workers: int,
+    asked_by: str = "--engine ray",
+    option: str = "--ray-address",
+) -> Any:
     """Import Ray and connect to a cluster, or start a local one.
 
     A local one binds to this machine only and reports to nobody.
+
+    Args:
+        address: See :class:`ClusterPool`.
+        num_workers: See :class:`ClusterPool`.
+        asked_by: The choice that needs Ray, for messages.
+        option: The option that holds the address, for messages.
 
     Raises:
         UserError: See :class:`ClusterPool`.
     """
     if find_spec("ray") is None:
         raise UserError(
-            "--engine ray without the package ray", "an installation with the extra ray",
-            "pip install 'dopepp[ray]', or use --shard with any scheduler",
+            f"{asked_by} without the package ray", "an installation with the extra ray",
+            f"pip install 'dopepp[ray]', or leave {asked_by} out",
         )  # fmt: skip
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray starts, so it comes first
     import ray
@@ -131,27 +142,27 @@ def connect(address: str | None, num_workers: int) -> Any:
             "_node_ip_address": "127.0.0.1",
         }
     else:
-        _check_reachable(address)
+        _check_reachable(address, option)
         options["address"] = address
     try:
         ray.init(**options)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise _no_cluster(address, error) from error
+        raise _no_cluster(address, option, error) from error
     return ray
 
 
-def _check_reachable(address: str) -> None:
+def _check_reachable(address: str, option: str) -> None:
     """Knock at the address first: Ray itself tries for many minutes."""
     host, _, port = address.rpartition(":")
     try:
         socket.create_connection((host, int(port)), timeout=_KNOCK_S).close()
     except (OSError, ValueError, OverflowError) as error:
-        raise _no_cluster(address, error) from error
+        raise _no_cluster(address, option, error) from error
 
 
-def _no_cluster(address: str | None, error: Exception) -> UserError:
+def _no_cluster(address: str | None, option: str, error: Exception) -> UserError:
     return UserError(
-        f"--ray-address {address}: {error}",
+        f"{option} {address}: {error}",
         "host:port of a running Ray cluster that this machine belongs to",
         "start one with `ray start --head`, or leave the address out",
     )

@@ -27,6 +27,7 @@ class Entry:
         reports: Its results on one test set, one per seed; empty where there is none.
         seeds: The trainings' seeds, as many; None where unknown.
         failure: Why there is no result, in one line; empty where only the cost was asked for.
+        pruned: Whether the reason is that a search stopped it, which is no failure.
         runs: The run folders; empty where reports do not come from any.
     """
 
@@ -34,6 +35,7 @@ class Entry:
     reports: list[Report] = field(default_factory=list)
     seeds: list[int | None] = field(default_factory=list)
     failure: str = ""
+    pruned: bool = False
     runs: list[Run] = field(default_factory=list)
 
     @property

@@ -23,7 +23,7 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     for run in runs:
         entry = next((one for one in entries if _belongs(run, one)), None)
         if entry is None:
-            entry = Entry("", failure=run.failure)
+            entry = Entry("", failure=run.failure, pruned=run.pruned)
             entries.append(entry)
         entry.runs.append(run)
         if run.report is not None:

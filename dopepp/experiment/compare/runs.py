@@ -43,6 +43,7 @@ class Run:
         recipe: Everything but the seed that decides about the result, as one text; empty where
             unknown.
         cost: What its network costs; None where unknown.
+        pruned: Whether it has no result because a search stopped it.
     """
 
     folder: Path
@@ -55,6 +56,7 @@ class Run:
     checkpoint: Path | None = None
     recipe: str = ""
     cost: Cost | None = None
+    pruned: bool = False
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
@@ -83,12 +85,12 @@ def _folders(path: Path) -> Iterator[Path]:
 
 def read_run(folder: Path) -> Run:
     """Read one run folder; whatever is missing or damaged in it becomes its failure."""
-    cost, failure, report = None, "", None
+    cost, failure, report, pruned = None, "", None, False
     try:
         report = _result(folder)
         cost = _cost(folder) if report is None else report.cost
     except _FailedError as error:
-        failure = str(error)
+        failure, pruned = str(error), isinstance(error, _PrunedError)
     config = _mapping(folder / record.CONFIG_FILE)
     checkpoint = folder / record.BEST_CHECKPOINT
     if report is not None and "checkpoint" in report.details:
@@ -113,6 +115,7 @@ def read_run(folder: Path) -> Run:
         checkpoint,
         _recipe(configs),
         cost,
+        pruned,
     )
 
 
@@ -140,6 +143,10 @@ class _FailedError(Exception):
     """Why a run has no result, in one line."""
 
 
+class _PrunedError(_FailedError):
+    """When a search stopped it, and why."""
+
+
 def _result(folder: Path) -> Report | None:
     """Return a run's result; None of a job that was to measure its network's cost alone.
 
@@ -150,6 +157,9 @@ def _result(folder: Path) -> Report | None:
     try:
         if failed.is_file():
             raise _FailedError(record.read_json(failed).get("reason", "without a reason"))
+        if (folder / record.PRUNED_FILE).is_file():
+            reason = record.read_json(folder / record.PRUNED_FILE).get("reason", "")
+            raise _PrunedError(reason)
         if metrics.is_file():
             return Report.from_record(record.read_json(metrics))
     except UserError as error:

@@ -54,7 +54,8 @@ def lines(entries: Sequence[Entry]) -> list[Line]:
     found = []
     for entry in entries:
         if entry.failure:
-            found.append(Line(entry.name, f"failed: {entry.failure}"))
+            state = "pruned" if entry.pruned else "failed"
+            found.append(Line(entry.name, f"{state}: {entry.failure}"))
             continue
         if baseline is None or not entry.reports:
             found.append(Line(entry.name, "cost only", entry))

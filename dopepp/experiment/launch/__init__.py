@@ -1,0 +1,1 @@
+"""Jobs of a multirun in other processes and on other machines: ``hydra/launcher=…``."""

@@ -1,0 +1,1 @@
+"""``search=optuna``: jobs of a multirun whose options a study chooses."""

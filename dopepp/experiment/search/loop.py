@@ -1,0 +1,170 @@
+"""Searching: trials are asked from a study, run by Hydra's launcher, and told to it.
+
+A trial's number is its job's. Whatever ends a command in the middle, its trials stay ``RUNNING`` in
+the study: the next command runs those first, each under its number and in its folder, where a
+training goes on from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.utils import JobReturn
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, OmegaConf
+from optuna.trial import FrozenTrial, TrialState
+
+from dopepp.errors import UserError
+from dopepp.experiment import display
+from dopepp.experiment.search.space import Space, chosen, examples, overrides, read_space
+from dopepp.experiment.search.study import alone, facts_of, open_study, outcome
+from dopepp.models.gate import check_integer
+from dopepp.training.trial import MOST
+
+_MAX_PARALLEL = 10_000
+
+
+def search(
+    config: DictConfig,
+    loader: ConfigLoader,
+    launcher: Launcher,
+    arguments: Sequence[str],
+    swept: Sequence[str],
+) -> list[JobReturn]:
+    """Run trials until the study has as many finished ones as ``search.num_trials``.
+
+    Args:
+        config: Hydra's config of the multirun.
+        loader: Composes a trial's config.
+        launcher: Runs jobs.
+        arguments: The command line's overrides.
+        swept: Options that the experiment sweeps over by itself; there must be none.
+
+    Raises:
+        UserError: An option of the search is wrong, or the study does not belong to this command.
+    """
+    if swept:
+        raise UserError(
+            f"search=optuna with an experiment that sweeps over {', '.join(swept)} itself",
+            "an experiment of one training, such as experiment=quickstart",
+            "leave one of the two out",
+        )
+    options = _plain(config.search, resolve=True)
+    wanted = check_integer("search.num_trials", options["num_trials"], 1, MOST)
+    at_a_time = check_integer("search.num_parallel", options["num_parallel"], 1, _MAX_PARALLEL)
+    space = read_space(loader, options["space"], arguments)
+    for example in examples(space):
+        loader.load_sweep_config(config, example)
+    folder = Path(str(config.hydra.sweep.dir))
+    facts = facts_of(_plain(config, resolve=False), space.texts)
+    with alone(folder, str(options["study"])):
+        study = open_study(options, facts, int(config.seed))
+        _check_folder(folder, study)
+        OmegaConf.save(config, folder / "multirun.yaml")
+        returns = _run_trials(study, space, launcher, folder, wanted, at_a_time)
+        _report(study, options)
+    return returns
+
+
+def _plain(node: DictConfig, resolve: bool) -> dict[str, Any]:
+    plain = OmegaConf.to_container(node, resolve=resolve)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def _check_folder(folder: Path, study: optuna.Study) -> None:
+    """A trial must not go on in the folder of another study's."""
+    known = {trial.number for trial in study.get_trials(deepcopy=False)}
+    foreign = [p.name for p in folder.iterdir() if p.name.isdigit() and int(p.name) not in known]
+    if foreign:
+        raise UserError(
+            f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
+            f"a folder of the study {study.study_name} alone",
+            "choose another search.study=NAME, or move the folder away",
+        )
+
+
+def _run_trials(
+    study: optuna.Study,
+    space: Space,
+    launcher: Launcher,
+    folder: Path,
+    wanted: int,
+    at_a_time: int,
+) -> list[JobReturn]:
+    """Finish what an earlier command has left, then run new trials."""
+    returns: list[JobReturn] = []
+    _tell(study, folder, _running(study))
+    left = _running(study)
+    if left:
+        numbers = ", ".join(str(trial.number) for trial in left)
+        display.console.print(f"study {study.study_name} goes on with trials {numbers}")
+    for trials in _consecutive(left, at_a_time):
+        returns += _launch(study, space, launcher, folder, trials)
+    while (missing := wanted - _num_finished(study)) > 0:
+        asked = [study.ask(space.varied) for _ in range(min(missing, at_a_time))]
+        numbers_asked = {trial.number for trial in asked}
+        trials = [trial for trial in _running(study) if trial.number in numbers_asked]
+        returns += _launch(study, space, launcher, folder, trials)
+    return returns
+
+
+def _launch(
+    study: optuna.Study,
+    space: Space,
+    launcher: Launcher,
+    folder: Path,
+    trials: Sequence[FrozenTrial],
+) -> list[JobReturn]:
+    """Run trials of consecutive numbers and tell the study how they ended."""
+    jobs = [overrides(space, trial.params) for trial in trials]
+    returns = launcher.launch(jobs, initial_job_idx=trials[0].number)
+    _tell(study, folder, trials)
+    for trial in _running(study):
+        if trial.number in {one.number for one in trials}:  # its process died without a word
+            study.tell(trial.number, state=TrialState.FAIL)
+    return list(returns)
+
+
+def _tell(study: optuna.Study, folder: Path, trials: Sequence[FrozenTrial]) -> None:
+    """Tell the study about those trials whose jobs have ended."""
+    for trial in trials:
+        state, value = outcome(folder / str(trial.number))
+        if state != TrialState.RUNNING:
+            study.tell(trial.number, value, state=state)
+
+
+def _running(study: optuna.Study) -> list[FrozenTrial]:
+    return study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+
+
+def _num_finished(study: optuna.Study) -> int:
+    return sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
+
+
+def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[list[FrozenTrial]]:
+    """Yield runs of consecutive numbers: a launcher counts up from the first one's."""
+    batch: list[FrozenTrial] = []
+    for trial in sorted(trials, key=lambda one: one.number):
+        if batch and (trial.number != batch[-1].number + 1 or len(batch) == at_most):
+            yield batch
+            batch = []
+        batch.append(trial)
+    if batch:
+        yield batch
+
+
+def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
+    """Print how the trials ended, and the best one as overrides."""
+    states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
+    counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+    display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
+    if states[TrialState.COMPLETE.name.lower()]:
+        best = study.best_trial
+        options_of = " ".join(chosen(best.params))
+        display.console.print(f"best trial {best.number}, objective {best.value:.4f}: {options_of}")

@@ -1,0 +1,48 @@
+"""``search=optuna``: a sweeper whose jobs are the trials of a study."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+
+class OptunaSweeper(Sweeper):
+    """Hands a search to :func:`dopepp.experiment.search.loop.search`.
+
+    Args:
+        params: What an experiment wants to sweep over; a search takes nothing but ``search.space``.
+    """
+
+    def __init__(self, params: DictConfig | None = None) -> None:
+        self.params = params
+        self.config: DictConfig | None = None
+        self.launcher: Launcher | None = None
+        self.hydra_context: HydraContext | None = None
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """Take what Hydra hands to every sweeper, and prepare the chosen launcher."""
+        from hydra.core.plugins import Plugins
+
+        self.hydra_context, self.config = hydra_context, config
+        self.launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def sweep(self, arguments: list[str]) -> Any:
+        """Search until the study has its trials."""
+        from dopepp.experiment.extras import require
+
+        require("optuna", "search=optuna", "search")
+        from dopepp.experiment.search.loop import search
+
+        assert self.config is not None
+        assert self.launcher is not None
+        assert self.hydra_context is not None
+        loader = self.hydra_context.config_loader
+        return search(self.config, loader, self.launcher, arguments, list(self.params or ()))
