@@ -1,15 +1,17 @@
 """The two entry points' shell: from the command line to a plain config, from errors to one line.
 
-Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted.
+Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted, 143 asked to stop (SIGTERM).
 """
 
 from __future__ import annotations
 
 import difflib
+import errno
 import inspect
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,11 +22,15 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dopepp.data.production.stopping import NO_SPACE, Interruption, interruptible
 from dopepp.errors import UserError
-from dopepp.experiment import display, record
+from dopepp.experiment import display, record, slurm
+from dopepp.experiment.sweep import compare_jobs
+from dopepp.training.saving import SavingFailedError
 
 _log = logging.getLogger(__name__)
 
@@ -33,7 +39,10 @@ Job = Callable[[dict[str, Any], Path], object]
 DONE: Final = 0
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
-INTERRUPTED: Final = 130
+
+_START_AGAIN: Final = "start the command again"
+_REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
+"""What a disk may answer to any program; another ``OSError`` is one of this program."""
 
 
 def run_job(config: DictConfig, job: Job) -> None:
@@ -45,22 +54,41 @@ def run_job(config: DictConfig, job: Job) -> None:
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
         try:
+            _remember(run_dir)
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
             _exit(str(error), USERS_MISTAKE)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
+        except SavingFailedError as error:
+            _exit(f"{error}; then go on with resume={run_dir}", FAILED)
+        except OSError as error:
+            if error.errno not in _REFUSALS:
+                raise
+            where = error.filename or run_dir
+            _exit(f"cannot write {where}: {error.strerror}; free or repair it", FAILED)
         return
     try:
         plain = _plain(config)
         _refuse_parallel_multirun(plain)
         job(plain, run_dir)
+    except KeyboardInterrupt:
+        compare_jobs(Path(hydra.sweep.dir))  # what is finished; Hydra ends without its hook
+        raise
     except Exception as error:
         reason = " ".join(str(error).split()) or repr(error)
         expected = isinstance(error, UserError)
         _log.error("job %s failed: %s", hydra.job.num, reason, exc_info=not expected)
         run_dir.mkdir(parents=True, exist_ok=True)
         record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
+
+
+def _remember(run_dir: Path) -> None:
+    """Write down how this run was started: Hydra's own file may be cut in the middle."""
+    overrides = [str(text) for text in HydraConfig.get().overrides.task]
+    record.write_json(run_dir / record.OVERRIDES_FILE, {"overrides": overrides})
+    if not any(text.startswith("resume=") for text in overrides):
+        slurm.remember_run(sys.argv[1:], run_dir)
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
@@ -95,10 +123,29 @@ def entry(main: Callable[[], None], open_nodes: Sequence[str] = ()) -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     sys.argv = [sys.argv[0], *_resumed([_opened(text, open_nodes) for text in sys.argv[1:]])]
+    arguments = [_opened(text, open_nodes) for text in sys.argv[1:]]
+    begun = slurm.begun_run(arguments)
+    if begun is not None:
+        arguments.append(f"resume={begun}")
+    sys.argv = [sys.argv[0], *_resumed(arguments)]
     try:
-        main()
-    except KeyboardInterrupt as interrupt:
-        _exit(": ".join(["interrupted", *map(str, interrupt.args)]), INTERRUPTED)
+        with interruptible(_START_AGAIN):
+            main()
+    except Interruption as interruption:
+        line = str(interruption)
+        first = not getattr(rank_zero_only, "rank", 0)
+        if interruption.number == signal.SIGTERM and slurm.job_id() is not None and first:
+            line = f"{line}; {slurm.requeue()}"
+        _exit(line, interruption.exit_code)
+    except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
+        if error.errno not in _REFUSALS:
+            raise
+        mistake = UserError(
+            f"output folder {error.filename}: {error.strerror}",
+            "a folder that can be written",
+            "set output_dir=…, or make it writable",
+        )
+        _exit(str(mistake), USERS_MISTAKE)
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)
@@ -122,12 +169,27 @@ def _resumed(arguments: list[str]) -> list[str]:
     if not runs or runs[-1] in ("", "null"):
         return arguments
     run = Path(runs[-1])
-    stored = run / ".hydra" / "overrides.yaml"
-    if not stored.is_file():
+    overrides = _stored_overrides(run)
+    if overrides is None:
         return arguments  # the run itself says what is wrong with the folder
-    overrides = [str(text) for text in yaml.safe_load(stored.read_text())]
     kept = [text for text in overrides if not text.startswith(("resume=", "hydra.run.dir="))]
     return [*kept, *arguments, f"hydra.run.dir={run}"]
+
+
+def _stored_overrides(run: Path) -> list[str] | None:
+    """Return what a run was started with; None where it is not known, or not as a whole."""
+    if (run / record.OVERRIDES_FILE).is_file():
+        stored = record.read_json(run / record.OVERRIDES_FILE).get("overrides", [])
+        return [str(text) for text in stored]
+    # Killed before it wrote its own file, or of an older version. Hydra writes the overrides last
+    # and once more in another file: a file that was cut in the middle does not agree with it.
+    try:
+        texts = (run / ".hydra" / name for name in ("overrides.yaml", "hydra.yaml"))
+        overrides, hydra = (yaml.safe_load(path.read_text()) for path in texts)
+        agree = overrides == hydra["hydra"]["overrides"]["task"]
+    except (OSError, yaml.YAMLError, TypeError, KeyError):
+        return None
+    return [str(text) for text in overrides] if agree else None
 
 
 def _explain(error: Exception, config_dir: Path | None) -> str:

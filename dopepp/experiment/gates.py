@@ -41,6 +41,7 @@ CALLBACKS: Gate[Callback] = Gate(
     Callback,
     (
         "dopepp.training.auc_curves.AUCCurves",
+        "dopepp.training.last_checkpoint.LastCheckpoint",
         "dopepp.training.overlays.Overlays",
         "dopepp.training.pose_metrics.PoseMetricsCallback",
         "dopepp.training.throughput.Throughput",

@@ -17,13 +17,15 @@ import yaml
 import dopepp
 from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
+from dopepp.training.checkpoints import BEST, FOLDER, LAST
 
 CONFIG_FILE: Final = "config.yaml"
 VERSIONS_FILE: Final = "versions.json"
 METRICS_FILE: Final = "metrics.json"
 FAILURE_FILE: Final = "failed.json"
-BEST_CHECKPOINT: Final = Path("checkpoints", "best.ckpt")
-LAST_CHECKPOINT: Final = Path("checkpoints", "last.ckpt")
+OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
+LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
 _PACKAGES: Final = (
     "torch", "lightning", "torchmetrics", "hydra-core", "omegaconf", "numpy", "scipy", "numba",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.production.stopping import Interruption
 from dopepp.errors import UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.build import build_system, build_trainer
@@ -21,8 +23,8 @@ from dopepp.experiment.objects import build_parts
 from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
 from dopepp.experiment.sources import build_datamodule
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_integer
+from dopepp.training.checkpoints import check_room, newest_checkpoint, saved_step
 from dopepp.training.system import PoseSystem
 
 _log = logging.getLogger(__name__)
@@ -40,7 +42,17 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
 
     Raises:
         UserError: A choice, a file or an option is wrong.
+        SavingFailedError: What was trained cannot be written.
+        Interruption: A signal ended it; the message names the last checkpoint.
     """
+    try:
+        return _train(config, run_dir)
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signal.SIGINT)
+        raise Interruption(number, _advice(run_dir)) from interrupt
+
+
+def _train(config: dict[str, Any], run_dir: Path) -> Report:
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     seed_everything(seed, verbose=False)
     keep_freed_memory()
@@ -52,6 +64,8 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     system = build_system(config, parts, fingerprint)
     resume_from = _resume_path(config["resume"], system)
     trainer = build_trainer(config, run_dir)  # whatever it refuses, nothing is written yet
+    weights = system.network.state_dict().values()
+    check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config)
     record.write_config(run_dir, config)
     environment = record.environment(seed, fingerprint)
@@ -62,7 +76,7 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
     except SystemExit as end:
         if isinstance(end.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt(f"go on with resume={run_dir}") from end
+            raise end.__context__ from end
         raise
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
@@ -88,20 +102,32 @@ def _resume_path(resume: str | None, system: PoseSystem) -> Path | None:
     """Return the interrupted run's checkpoint after checking that this run continues it."""
     if resume is None:
         return None
-    path = Path(resume) / record.LAST_CHECKPOINT
-    if not path.is_file():
+    run_dir = Path(resume)
+    found = newest_checkpoint(run_dir)
+    if found is None and not (run_dir / record.OVERRIDES_FILE).is_file():
         raise UserError(
             f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
         )
-    if read(path).spec != system.payload["spec"]:
+    if found is None:
+        display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")
+        return None
+    path, checkpoint = found
+    if checkpoint.spec != system.payload["spec"]:
         raise UserError(
             f"resume={resume}, whose network differs from the chosen one",
             "the model and the number of objects of that run",
             "leave the model as it was, or start anew with init_from",
         )
     return path
+
+
+def _advice(run_dir: Path) -> str:
+    """Say what an interrupted run has saved and how it goes on."""
+    step = saved_step(run_dir / record.LAST_CHECKPOINT)
+    saved = f"saved up to step {step} in {record.LAST_CHECKPOINT}" if step else "nothing saved yet"
+    return f"{saved}; go on with resume={run_dir}"
 
 
 def _measure_run(config: Mapping[str, Any], run_dir: Path, trainer: Trainer) -> Report:

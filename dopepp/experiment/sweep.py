@@ -29,14 +29,18 @@ class CompareJobs(Callback):
         Raises:
             SystemExit: With code 1 if a job failed.
         """
-        folder = Path(str(config.hydra.sweep.dir))
-        jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
-        results = [read_job(job) for job in jobs]
-        if results:
-            compare(results, folder, _width_note(jobs))
-            display.console.print(f"comparison in {folder}")
-        if any(isinstance(result, Failure) for result in results):
+        if not compare_jobs(Path(str(config.hydra.sweep.dir))):
             raise SystemExit(1)
+
+
+def compare_jobs(folder: Path) -> bool:
+    """Compare the jobs that a sweep's folder holds; return whether all of them are finished."""
+    jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
+    results = [read_job(job) for job in jobs]
+    if results:
+        compare(results, folder, _width_note(jobs))
+        display.console.print(f"comparison in {folder}")
+    return not any(isinstance(result, Failure) for result in results)
 
 
 def read_job(job: Path) -> Report | Failure:
