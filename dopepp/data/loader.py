@@ -5,12 +5,14 @@ The sampler hands out (epoch, index) pairs, so persistent workers cannot go stal
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
@@ -117,6 +119,9 @@ class PoseLoader(DataLoader[Any]):
             # Forked workers inherit the render cache's shared memory and the compiled kernels.
             multiprocessing_context="fork" if options.get("num_workers") else None,
             persistent_workers=bool(options.get("num_workers")),
+            # Starting a pass draws a seed for the workers, which none uses: not from the generator
+            # that training draws from, or a pass that is resumed would leave it elsewhere.
+            generator=torch.Generator(),
             **options,
         )
         self._epoch_sampler = sampler
@@ -159,3 +164,7 @@ def _collate(items: list[Sample | UserError], object_index: dict[str, int]) -> B
 def _start_worker(worker: int) -> None:
     # One process per core is the parallelism; OpenCV's own pool would compete and dislikes forks.
     cv2.setNumThreads(0)
+    # Both may be sent to the whole group. The main process decides when to stop, and a worker whose
+    # main process has gone ends by itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -135,7 +135,8 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     options["precision"], reason = choose_precision(options["precision"], accelerator)
     display.console.print(f"precision {options['precision']}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
-    loggers: list[Logger] = [MetricsTable(run_dir / "metrics.csv")]
+    table = MetricsTable(run_dir / "metrics.csv")
+    loggers: list[Logger] = [table]
     for node in config.get("logger", {}).values():
         LOGGERS.resolve(node.get(TARGET))  # a wrong name is a mistake, not a logger's failure
         loggers.append(GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir))))
@@ -145,7 +146,8 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
             default_root_dir=run_dir,
             logger=loggers,
             callbacks=[*callbacks, TQDMProgressBar(refresh_rate=5)],
-            plugins=[AtomicCheckpointIO()],
+            # A checkpoint is never newer than the table.
+            plugins=[AtomicCheckpointIO(prepare=table.write)],
             enable_model_summary=False,
             num_sanity_val_steps=0,
             # The DataModule's own sampler knows rank and epoch.

@@ -1,15 +1,17 @@
 """The two entry points' shell: from the command line to a plain config, from errors to one line.
 
-Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted.
+Exit codes: 0 done, 1 failed, 2 a user's mistake, 130 interrupted, 143 asked to stop (SIGTERM).
 """
 
 from __future__ import annotations
 
 import difflib
+import errno
 import inspect
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,14 +21,17 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dopepp.data.production.stopping import NO_SPACE, Interruption, interruptible
 from dopepp.errors import RunError, UserError
-from dopepp.experiment import display, record
+from dopepp.experiment import display, record, slurm
 from dopepp.experiment.launch import remote
 from dopepp.experiment.report import Report
-from dopepp.experiment.resume import read_overrides
+from dopepp.experiment.resume import read_overrides, remember_overrides
+from dopepp.experiment.sweep import compare_jobs
 from dopepp.training.trial import PrunedError
 
 _log = logging.getLogger(__name__)
@@ -36,7 +41,10 @@ Job = Callable[[dict[str, Any], Path], object]
 DONE: Final = 0
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
-INTERRUPTED: Final = 130
+
+_START_AGAIN: Final = "start the command again"
+_REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
+"""What a disk may answer to any program; another ``OSError`` is one of this program."""
 
 
 def run_job(config: DictConfig, job: Job) -> float | None:
@@ -52,6 +60,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
         try:
+            _remember(run_dir)
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
             _exit(str(error), USERS_MISTAKE)
@@ -59,6 +68,11 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             _exit(str(error), FAILED)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
+        except OSError as error:
+            if error.errno not in _REFUSALS:
+                raise
+            where = error.filename or run_dir
+            _exit(f"cannot write {where}: {error.strerror}; free or repair it", FAILED)
         return None
     if not remote.is_remote(str(hydra.launcher._target_)):
         return _run_one_of_many(config, job, run_dir)
@@ -78,6 +92,11 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
             plain["resume"] = str(run_dir)
         result = job(plain, run_dir)
         return result.details.get(record.OBJECTIVE) if isinstance(result, Report) else None
+    except KeyboardInterrupt:
+        if not remote.is_remote(str(HydraConfig.get().launcher._target_)):
+            # What is finished: Hydra ends without its hook.
+            compare_jobs(Path(HydraConfig.get().sweep.dir), _plain(config)["table"])
+        raise
     except PrunedError as end:
         display.console.print(f"pruned {end}")
         record.write_json(run_dir / record.PRUNED_FILE, {"reason": str(end)})
@@ -89,6 +108,14 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         run_dir.mkdir(parents=True, exist_ok=True)
         record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
     return None
+
+
+def _remember(run_dir: Path) -> None:
+    """Write down how this run was started: Hydra's own file may be cut in the middle."""
+    overrides = [str(text) for text in HydraConfig.get().overrides.task]
+    if not any(text.startswith("resume=") for text in overrides):  # else once it is accepted
+        remember_overrides(run_dir)
+        slurm.remember_run(sys.argv[1:], run_dir)
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
@@ -124,13 +151,28 @@ def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     remote.configure_logging()
     try:
-        arguments = _resumed([_opened(text, open_nodes) for text in sys.argv[1:]])
-        sys.argv = [sys.argv[0], *arguments]
-        main()
-    except KeyboardInterrupt as interrupt:
-        _exit(": ".join(["interrupted", *map(str, interrupt.args)]), INTERRUPTED)
-    except UserError as error:
-        _exit(str(error), USERS_MISTAKE)
+        arguments = [_opened(text, open_nodes) for text in sys.argv[1:]]
+        begun = slurm.begun_run(arguments)
+        if begun is not None:
+            arguments.append(f"resume={begun}")
+        sys.argv = [sys.argv[0], *_resumed(arguments)]
+        with interruptible(_START_AGAIN):
+            main()
+    except Interruption as interruption:
+        line = str(interruption)
+        first = not getattr(rank_zero_only, "rank", 0)
+        if interruption.number == signal.SIGTERM and slurm.job_id() is not None and first:
+            line = f"{line}; {slurm.requeue()}"
+        _exit(line, interruption.exit_code)
+    except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
+        if error.errno not in _REFUSALS:
+            raise
+        mistake = UserError(
+            f"output folder {error.filename}: {error.strerror}",
+            "a folder that can be written",
+            "set output_dir=…, or make it writable",
+        )
+        _exit(str(mistake), USERS_MISTAKE)
     except (HydraException, OmegaConfBaseException) as error:
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
         _exit(_explain(error, config_dir), USERS_MISTAKE)

@@ -42,6 +42,7 @@ CALLBACKS: Gate[Callback] = Gate(
     (
         "dopepp.training.auc_curves.AUCCurves",
         "dopepp.training.finite.FiniteSteps",
+        "dopepp.training.last_checkpoint.LastCheckpoint",
         "dopepp.training.overlays.Overlays",
         "dopepp.training.pose_metrics.PoseMetricsCallback",
         "dopepp.training.throughput.Throughput",

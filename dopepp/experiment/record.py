@@ -21,6 +21,7 @@ import dopepp
 from dopepp.data.json_file import read_json as read_strict_json
 from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
+from dopepp.training.checkpoints import BEST, FOLDER, LAST
 from dopepp.virtual.version import code_hash
 
 CONFIG_FILE: Final = "config.yaml"
@@ -30,8 +31,9 @@ FAILURE_FILE: Final = "failed.json"
 PRUNED_FILE: Final = "pruned.json"
 OBJECTIVE: Final = "objective"
 """Key of ``metrics.json``: the validation value that the best checkpoint was chosen by."""
-BEST_CHECKPOINT: Final = Path("checkpoints", "best.ckpt")
-LAST_CHECKPOINT: Final = Path("checkpoints", "last.ckpt")
+OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
+LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
 _MAX_DIFF_BYTES: Final = 10_000_000
 """Of a larger difference to the last commit only the hash is kept."""

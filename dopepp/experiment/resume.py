@@ -28,6 +28,7 @@ from dopepp.models.checkpoint import Checkpoint
 _log = logging.getLogger(__name__)
 
 OVERRIDES: Final = Path(".hydra", "overrides.yaml")
+_HYDRA: Final = Path(".hydra", "hydra.yaml")
 
 LEARNT_FROM: Final = (
     "seed", "data", "virtual", "maps", "symmetry", "model.loss",
@@ -161,20 +162,40 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
 
 def read_overrides(run: Path) -> list[str] | None:
-    """Return the overrides that a run was started with; None where its folder has none.
+    """Return the overrides that a run was started with; None where they are not known as a whole.
 
     Raises:
         UserError: The file holds something else.
     """
-    path = run / OVERRIDES
-    return trusted_overrides(read_yaml(path), path) if path.is_file() else None
+    own, overrides, hydra = (run / path for path in (record.OVERRIDES_FILE, OVERRIDES, _HYDRA))
+    if own.is_file():
+        return trusted_overrides(record.read_json(own).get("overrides"), own)
+    # Killed before it wrote its own file, or of an older version. Hydra writes the overrides last
+    # and once more in another file: a file that was cut in the middle does not agree with it.
+    if not overrides.is_file():
+        return None
+    stored = read_yaml(overrides)
+    if hydra.is_file() and stored != _task(read_yaml(hydra)):
+        return None
+    return trusted_overrides(stored, overrides)
 
 
 def remember_overrides(run: Path) -> None:
-    """Write down how an accepted run was started; a refused one leaves the file as it was."""
-    if HydraConfig.initialized() and (run / OVERRIDES).parent.is_dir():
-        overrides = [str(text) for text in HydraConfig.get().overrides.task]
-        write_whole(run / OVERRIDES, yaml.safe_dump(overrides).encode())
+    """Write down how a run was started: Hydra's own file may be cut in the middle.
+
+    A resumed run calls it once it is accepted, so that a refused one leaves the folder as it was.
+    """
+    if not HydraConfig.initialized():
+        return
+    overrides = [str(text) for text in HydraConfig.get().overrides.task]
+    record.write_json(run / record.OVERRIDES_FILE, {"overrides": overrides})
+    write_whole(run / OVERRIDES, yaml.safe_dump(overrides).encode())
+
+
+def _task(hydra: object) -> object:
+    for key in ("hydra", "overrides", "task"):
+        hydra = hydra.get(key) if isinstance(hydra, dict) else None
+    return hydra
 
 
 def _read_config(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.production.stopping import Interruption
 from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, record
 from dopepp.experiment.build import build_system, build_trainer
@@ -25,8 +27,8 @@ from dopepp.experiment.resume import Difference, check_resume, remember_override
 from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint import read
 from dopepp.models.gate import check_flag, check_integer
+from dopepp.training.checkpoints import check_room, newest_checkpoint, saved_step
 from dopepp.training.processes import ProcessDiedError
 from dopepp.training.system import PoseSystem
 from dopepp.training.trial import raise_if_pruned
@@ -47,7 +49,17 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     Raises:
         UserError: A choice, a file or an option is wrong.
         PrunedError: A search stopped this training.
+        SavingFailedError: What was trained cannot be written.
+        Interruption: A signal ended it; the message names the last checkpoint.
     """
+    try:
+        return _train(config, run_dir)
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signal.SIGINT)
+        raise Interruption(number, _advice(run_dir)) from interrupt
+
+
+def _train(config: dict[str, Any], run_dir: Path) -> Report:
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     seed_everything(seed, verbose=False)
     keep_freed_memory()
@@ -67,6 +79,8 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     system = build_system(config, parts, fingerprint, images)
     resume_from, changes = _resume_path(config, system)
     trainer = build_trainer(config, run_dir)  # whatever it refuses, nothing is written yet
+    weights = system.network.state_dict().values()
+    check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config)
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
@@ -81,7 +95,7 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
     except SystemExit as end:
         if isinstance(end.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt(f"go on with resume={run_dir}") from end
+            raise end.__context__ from end
         raise
     except RunError as error:
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
@@ -121,14 +135,26 @@ def _resume_path(
         if anyway:
             raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
         return None, []
-    path = Path(resume) / record.LAST_CHECKPOINT
-    if not path.is_file():
+    run_dir = Path(resume)
+    found = newest_checkpoint(run_dir)
+    if found is None and not (run_dir / record.OVERRIDES_FILE).is_file():
         raise UserError(
             f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
         )
-    return path, check_resume(Path(resume), config, read(path), system.payload)
+    if found is None:
+        display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")
+        return None, []
+    path, checkpoint = found
+    return path, check_resume(run_dir, config, checkpoint, system.payload)
+
+
+def _advice(run_dir: Path) -> str:
+    """Say what an interrupted run has saved and how it goes on."""
+    step = saved_step(run_dir / record.LAST_CHECKPOINT)
+    saved = f"saved up to step {step} in {record.LAST_CHECKPOINT}" if step else "nothing saved yet"
+    return f"{saved}; go on with resume={run_dir}"
 
 
 def _measure_run(

@@ -27,14 +27,26 @@ class CompareJobs(Callback):
         Raises:
             SystemExit: With code 1 if a job failed.
         """
-        folder = Path(str(config.hydra.sweep.dir))
-        jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
-        if not jobs:
-            return
-        entries = compare_runs([read_run(job) for job in jobs], folder)
-        if config.get("table") is not None:
-            table: Any = OmegaConf.to_container(config.table, resolve=True)
-            write_paper_table(PaperTable.of(table), entries, folder)
-        display.console.print(f"comparison in {folder}")
-        if any(entry.failure and not entry.pruned for entry in entries):
+        table = config.get("table")
+        if not compare_jobs(
+            Path(str(config.hydra.sweep.dir)),
+            None if table is None else OmegaConf.to_container(table, resolve=True),
+        ):
             raise SystemExit(1)
+
+
+def compare_jobs(folder: Path, table: Any = None) -> bool:
+    """Compare the jobs that a sweep's folder holds; return whether none has failed.
+
+    Args:
+        folder: The sweep's folder.
+        table: The config's ``table``, plain values; None for none.
+    """
+    jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
+    if not jobs:
+        return True
+    entries = compare_runs([read_run(job) for job in jobs], folder)
+    if table is not None:
+        write_paper_table(PaperTable.of(table), entries, folder)
+    display.console.print(f"comparison in {folder}")
+    return not any(entry.failure and not entry.pruned for entry in entries)

@@ -6,10 +6,11 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import torch
 
+from dopepp.drawing.png import partial_path
 from dopepp.errors import UserError
 from dopepp.models import pickled
 from dopepp.models.pickled import claimed_storages
@@ -22,23 +23,30 @@ MAX_BYTES: Final = 4 * 2**30
 """The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
 
 
-def write_atomic(payload: Mapping[str, Any], path: Path) -> None:
+def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
     """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
+
+    Args:
+        payload: What to write.
+        path: The file.
+        previous: Where the file that was there is kept; it is gone if None.
 
     Raises:
         OSError: The folder cannot be written; the old file is intact and nothing else is left.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    partial = partial_path(path)
     try:
-        with temporary.open("wb") as stream:
-            torch.save(dict(payload), stream)
+        with partial.open("wb") as stream:
+            _serialise(payload, stream)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)  # noqa: PTH105 -- documented as atomic under this name
+        if previous is not None and path.is_file():
+            path.replace(previous)
+        partial.replace(path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         raise
     if os.name == "posix":  # the rename is durable once its folder is; Windows cannot open folders
         folder = os.open(path.parent, os.O_RDONLY)
@@ -46,6 +54,17 @@ def write_atomic(payload: Mapping[str, Any], path: Path) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def _serialise(payload: Mapping[str, Any], stream: IO[bytes]) -> None:
+    try:
+        torch.save(dict(payload), stream)
+    except RuntimeError as error:
+        # What ends the writing (no space, Ctrl-C) is hidden by torch's complaint about the file
+        # that was not completed.
+        if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
+            raise error.__context__ from None
+        raise
 
 
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:

@@ -8,7 +8,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.png import figure_image
-from dopepp.training.pictures import log_picture
+from dopepp.training.pictures import dispensable, log_picture
 from dopepp.training.pose_metrics import PoseMetricsCallback
 
 
@@ -30,5 +30,6 @@ class AUCCurves(Callback):
             return
         title = f"validation, epoch {trainer.current_epoch}"
         folder = Path(trainer.default_root_dir)
-        figure = save_accuracy_curves(folder / "val_auc", curves, title=title)
-        log_picture(trainer, "val/auc", figure_image(figure))
+        with dispensable(f"{folder}/val_auc"):
+            figure = save_accuracy_curves(folder / "val_auc", curves, title=title)
+            log_picture(trainer, "val/auc", figure_image(figure))

@@ -22,7 +22,8 @@ class MetricsTable(Logger):
     """Writes everything that is logged into one CSV: a row per step, a column per metric.
 
     The file is rewritten whole, so it is never cut in the middle, and its columns may grow. An
-    existing file is continued. Of several processes only the first one writes.
+    existing file is continued. Of several processes only the first one writes. While it cannot be
+    written, its rows are kept, and the training goes on.
 
     Args:
         path: The CSV file.
@@ -32,6 +33,7 @@ class MetricsTable(Logger):
         super().__init__()
         self.path = path
         self._rows: dict[int, dict[str, float]] = {}
+        self._failing = False
         if path.is_file():
             self._rows = {int(row.pop("step")): row for row in _read(path)}
 
@@ -59,7 +61,24 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def save(self) -> None:
-        """Write the file."""
+        """Write the file, or say that it could not be written."""
+        try:
+            self.write()
+        except OSError as error:
+            if not self._failing:
+                reason = error.strerror or error
+                _log.warning("cannot write %s: %s; its rows are kept", self.path, reason)
+            self._failing = True
+        else:
+            self._failing = False
+
+    @rank_zero_only
+    def write(self) -> None:
+        """Write the file.
+
+        Raises:
+            OSError: It cannot be written.
+        """
         if not self._rows:
             return
         columns = sorted({name for row in self._rows.values() for name in row})

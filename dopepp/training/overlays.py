@@ -10,7 +10,7 @@ from dopepp.data.batch import Batch
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.png import write_png
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.training.pictures import log_picture
+from dopepp.training.pictures import dispensable, log_picture
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 
@@ -54,5 +54,7 @@ class Overlays(Callback):
         if not self._tiles:
             return
         sheet = contact_sheet(self._tiles)
-        write_png(Path(trainer.default_root_dir) / "val_overlay.png", sheet)
+        path = Path(trainer.default_root_dir) / "val_overlay.png"
+        with dispensable(str(path)):
+            write_png(path, sheet)
         log_picture(trainer, "val/overlay", sheet)

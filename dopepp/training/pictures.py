@@ -1,7 +1,10 @@
-"""Pictures to whichever logger can take them."""
+"""Pictures to whichever logger can take them, and to files that a run can do without."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -10,6 +13,8 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from dopepp.training.loggers import GuardedLogger
+
+_log = logging.getLogger(__name__)
 
 
 def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
@@ -24,3 +29,12 @@ def _send(logger: Logger, name: str, image: UInt8[np.ndarray, "height width 3"],
         logger.experiment.add_image(name, image, step, dataformats="HWC")
     elif isinstance(logger, WandbLogger):
         logger.log_image(name, [image], step=step)
+
+
+@contextmanager
+def dispensable(what: str) -> Iterator[None]:
+    """Report it in a line where a file cannot be written, and go on."""
+    try:
+        yield
+    except OSError as error:
+        _log.warning("cannot write %s: %s", what, error.strerror or error)

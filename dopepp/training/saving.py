@@ -1,27 +1,98 @@
-"""Checkpoints that are whole or absent: written beside their place, synced, then renamed."""
+"""Checkpoints that are whole or absent, and what becomes of one that could not be written."""
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from torch import Tensor
 
-from dopepp.models.checkpoint import write_atomic
+from dopepp.errors import RunError
+from dopepp.models.storage import write_atomic
+
+_log = logging.getLogger(__name__)
+
+_ADVICE: Final = {
+    errno.ENOSPC: "free some space there",
+    errno.EDQUOT: "free some of your share of it",
+    errno.EROFS: "make it writable",
+    errno.EACCES: "make it writable",
+}
+
+
+class SavingFailedError(RunError):
+    """What a run must leave could not be written, said in one line."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's checkpoint files, saved atomically and loaded without running code."""
+    """Lightning's checkpoint files, saved atomically and loaded without running code.
+
+    A checkpoint that cannot be written (disk full, server away) is kept in memory and written
+    before the next one, so files on disk never refer to one that is not there; a newer version of
+    the same file takes its place. Training goes on meanwhile; :meth:`finish` fails if something is
+    still not written.
+
+    Args:
+        prepare: Called before each writing; if it raises ``OSError``, nothing is written.
+    """
+
+    def __init__(self, prepare: Callable[[], None] | None = None) -> None:
+        super().__init__()
+        self._prepare = prepare
+        self._waiting: dict[Path, tuple[dict[str, Any], Path | None]] = {}
+
+    @property
+    def waiting(self) -> list[Path]:
+        """The files that could not be written so far, oldest first."""
+        return list(self._waiting)
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write the file so that a crash leaves either the old or the new one."""
+        """Write the file so that a crash leaves either the old or the new one.
+
+        Args:
+            checkpoint: What to write.
+            path: The file.
+            storage_options: None, or ``{"previous": PATH}`` to keep the old file there.
+        """
         target = Path(os.fspath(path))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(checkpoint, target)
+        self._waiting.pop(target, None)
+        self._waiting[target] = (checkpoint, (storage_options or {}).get("previous"))
+        error = self._write_waiting()
+        if error is not None:
+            _log.warning("%s; trying again at the next saving", _failure(self.waiting[0], error))
+
+    def finish(self) -> None:
+        """Write what is still waiting.
+
+        Raises:
+            SavingFailedError: It still cannot be written.
+        """
+        error = self._write_waiting()
+        if error is not None:
+            raise SavingFailedError(_failure(self.waiting[0], error)) from error
+
+    def _write_waiting(self) -> OSError | None:
+        """Write in order; stop at the first file that cannot be written and keep the rest."""
+        for path, (checkpoint, previous) in list(self._waiting.items()):
+            try:
+                if self._prepare is not None:
+                    self._prepare()
+                write_atomic(checkpoint, path, previous)
+            except OSError as error:
+                # Training goes on to change the tensors that the newest one refers to.
+                self._waiting = {
+                    name: (_copy(one), old) for name, (one, old) in self._waiting.items()
+                }
+                return error
+            del self._waiting[path]
+        return None
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
@@ -31,3 +102,17 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             path, map_location=map_location, weights_only=True
         )
         return dict(loaded)
+
+
+def _copy(value: Any) -> Any:
+    """Return a checkpoint whose tensors are its own, on the CPU."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, Mapping):
+        return {key: _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+def _failure(path: Path, error: OSError) -> str:
+    advice = _ADVICE.get(error.errno or 0, "see to it")
+    return f"cannot save {path.name} in {path.parent}: {error.strerror or error}; {advice}"

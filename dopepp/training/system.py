@@ -99,6 +99,7 @@ class PoseSystem(LightningModule):
         self.symmetry = SymmetryHandling(parts, symmetry or SymmetryOptions())
         self.make_optimizer, self.make_scheduler = make_optimizer, make_scheduler
         self.payload = dict(payload or {})
+        self._resumed_schedules: list[dict[str, Any]] | None = None
         # In place, so that parameter names stay those of the plain network.
         if compile_network:
             self.network.compile()
@@ -193,9 +194,11 @@ class PoseSystem(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep only how far the schedule was: a run resumed for longer has a longer schedule."""
+        states = checkpoint["lr_schedulers"]
+        self._resumed_schedules = [_without_progress(state) for state in states]
         checkpoint["lr_schedulers"] = [
             {name: value for name, value in state.items() if name in _SCHEDULE_PROGRESS}
-            for state in checkpoint["lr_schedulers"]
+            for state in states
         ]
 
     def on_train_start(self) -> None:
@@ -204,7 +207,11 @@ class PoseSystem(LightningModule):
             if isinstance(logger, MetricsTable):
                 logger.forget_after(self.global_step - 1)
         self._apply_settings()
-        for config in self.trainer.lr_scheduler_configs:
+        configs = self.trainer.lr_scheduler_configs
+        present = [_without_progress(config.scheduler.state_dict()) for config in configs]
+        if present == self._resumed_schedules:
+            return  # the optimiser's rates are this schedule's, to the last bit
+        for config in configs:
             # Schedules that multiply the last rate would stay at zero where a shorter one ended.
             closed_form = getattr(config.scheduler, "_get_closed_form_lr", None)
             if closed_form is not None:
@@ -233,3 +240,8 @@ class PoseSystem(LightningModule):
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
+
+
+def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what describes a schedule itself, of its state."""
+    return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}

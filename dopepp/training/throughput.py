@@ -24,6 +24,25 @@ class Throughput(Callback):
     per epoch, with what helps where the loader is too slow.
     """
 
+    def __init__(self) -> None:
+        self._images, self._waited = 0, 0.0
+        self._started = self._step_ended = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what has been counted of this epoch."""
+        elapsed = self._step_ended - self._started
+        return {"images": self._images, "waited_s": self._waited, "elapsed_s": elapsed}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on counting an epoch that was cut off."""
+        self._images, self._waited = state_dict["images"], state_dict["waited_s"]
+        self._started, self._step_ended = -float(state_dict["elapsed_s"]), 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave out the time between a cut-off epoch and its continuation."""
+        pause = time.perf_counter() - self._step_ended
+        self._started, self._step_ended = self._started + pause, self._step_ended + pause
+
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clocks."""
         self._images, self._waited = 0, 0.0

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import torch
 
+from dopepp.experiment.command_line import _stored_overrides
+from dopepp.training.checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
 Runner = Callable[..., Any]
@@ -81,7 +83,10 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
     assert done.code == 130, done.err
     assert "Traceback" not in done.err
     run = find_run(tmp_path / "cut")
-    assert done.err.rstrip("\n").rpartition("\n")[2] == f"interrupted: go on with resume={run}"
+    # After the first epoch there was a new best one, and a checkpoint to go on from.
+    saved = "saved up to step 2 in checkpoints/last.ckpt"
+    line = done.err.rstrip("\n").rpartition("\n")[2]
+    assert line == f"interrupted; {saved}; go on with resume={run}"
     assert not (run / "metrics.json").exists()
 
     done = call("train.py", f"resume={run}")
@@ -131,8 +136,65 @@ def test_mistakes_in_the_three_words(
         # Nothing but Hydra's own folder was begun.
         assert not list((tmp_path / "new").glob("**/versions.json"))
 
-    before = (run / "checkpoints" / "last.ckpt").read_bytes()
     done = call("train.py", f"resume={run}", "model/attention=se")
     assert "whose network differs from the chosen one" in done.line
-    (run / "checkpoints" / "last.ckpt").write_bytes(before[: len(before) // 2])
-    assert "cut short" in call("train.py", f"resume={run}").line
+
+
+def damage(path: Path, how: str) -> None:
+    content = bytearray(path.read_bytes())
+    if how == "cut":
+        content = content[: len(content) // 2]
+    elif how == "empty":
+        content = bytearray()
+    else:  # a single bit, inside the weights
+        content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("how", ["cut", "empty", "bit"])
+def test_resume_takes_the_newest_whole_checkpoint(
+    how: str, run: Path, call: Runner, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = last(run)["state_dict"]
+    folder = run / "checkpoints"
+    (folder / "previous.ckpt").write_bytes((folder / "last.ckpt").read_bytes())
+    damage(folder / "last.ckpt", how)
+    found = newest_checkpoint(run)
+    assert found is not None
+    assert found[0] == folder / "previous.ckpt"
+    damage(folder / "previous.ckpt", how)
+    done = call("train.py", f"resume={run}", "trainer.max_epochs=2")  # from best.ckpt
+    assert done.code == 0, done.err
+    assert f"left out: {folder}/last.ckpt" in caplog.text
+    assert f"left out: {folder}/previous.ckpt" in caplog.text
+    assert "going on from best.ckpt, step 2" in caplog.text
+    assert steps(run) == [0, 1, 2, 3]
+    assert last(run)["global_step"] == 4
+    assert not torch.equal(next(iter(last(run)["state_dict"].values())), next(iter(whole.values())))
+
+    for path in folder.glob("*.ckpt"):
+        damage(path, how)
+    expected = "whose checkpoints are all damaged (last.ckpt, previous.ckpt, best.ckpt)"
+    assert expected in call("train.py", f"resume={run}").line
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(
+    run: Path, call: Runner, find_run: FindRun
+) -> None:
+    before = rows(run)
+    for path in (run / "checkpoints").iterdir():
+        path.unlink()
+    done = call("train.py", f"resume={run}")
+    assert done.code == 0, done.err
+    assert f"no checkpoint yet in {run}: the run starts from its beginning" in done.out
+    names = [name for name in before[0] if not name.startswith("throughput/")]
+    assert [[row[name] for name in names] for row in rows(run)] == [
+        [row[name] for name in names] for row in before
+    ]
+    assert find_run(run.parents[1]) == run
+
+    # Hydra's own note of the options, cut in the middle by a kill: not half of them are believed.
+    (run / ".hydra" / "resume.json").unlink()
+    assert _stored_overrides(run) is not None
+    (run / ".hydra" / "overrides.yaml").write_text("- data=virtual\n")
+    assert _stored_overrides(run) is None

@@ -1,13 +1,20 @@
 from __future__ import annotations
 
+import errno
 import os
+import random
+import subprocess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from dopepp.training.saving import AtomicCheckpointIO
+from dopepp.drawing.png import partial_path
+from dopepp.training.checkpoints import sweep
+from dopepp.training.random_state import capture, restore
+from dopepp.training.saving import AtomicCheckpointIO, SavingFailedError
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -57,3 +64,62 @@ def test_loading_runs_no_code_whoever_asks(weights_only: bool | None, tmp_path: 
     with pytest.raises(Exception, match=r"[Ww]eights"):
         AtomicCheckpointIO().load_checkpoint(path, weights_only=weights_only)
     assert not trace.exists()
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_what_cannot_be_written_is_written_later_in_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    refuse = [True]
+    io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
+    weights = torch.zeros(2)
+    io.save_checkpoint({"step": 1, "weights": weights}, tmp_path / "best.ckpt")
+    weights += 1  # training goes on
+    io.save_checkpoint({"step": 1}, tmp_path / "last.ckpt")
+    io.save_checkpoint({"step": 2}, tmp_path / "last.ckpt")
+    assert io.waiting == [tmp_path / "best.ckpt", tmp_path / "last.ckpt"]
+    assert f"cannot save best.ckpt in {tmp_path}: No space left on device" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SavingFailedError, match=r"cannot save best.ckpt in .*: No space left"):
+        io.finish()
+    refuse[0] = False
+    io.finish()
+    assert io.waiting == []
+    best = io.load_checkpoint(tmp_path / "best.ckpt")
+    assert best["step"] == 1
+    assert best["weights"].tolist() == [0.0, 0.0]
+    assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
+
+
+def test_the_previous_file_is_kept(tmp_path: Path) -> None:
+    io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
+    for step in range(3):
+        io.save_checkpoint({"step": step}, tmp_path / "last.ckpt", storage_options=options)
+    assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
+    assert io.load_checkpoint(tmp_path / "previous.ckpt") == {"step": 1}
+
+
+def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path: Path) -> None:
+    with subprocess.Popen(["true"]) as process:
+        process.wait()
+    (tmp_path / "checkpoints").mkdir()
+    mine = partial_path(tmp_path / "checkpoints" / "last.ckpt")
+    gone = mine.with_name(mine.name.replace(str(os.getpid()), str(process.pid)))
+    mine.touch()
+    gone.touch()
+    sweep(tmp_path)
+    assert list((tmp_path / "checkpoints").iterdir()) == [mine]
+
+
+def test_random_states_come_back_through_a_file(tmp_path: Path) -> None:
+    def draw() -> list[float]:
+        return [random.gauss(0, 1), np.random.randn(), float(torch.randn(()))]  # noqa: NPY002
+
+    draw()
+    AtomicCheckpointIO().save_checkpoint({"random": capture()}, tmp_path / "a.ckpt")
+    expected = [draw() for _ in range(3)]
+    restore(torch.load(tmp_path / "a.ckpt", weights_only=True)["random"])
+    assert [draw() for _ in range(3)] == expected

@@ -33,26 +33,35 @@ def stopped(error: OSError, root: Path) -> StoppedError:
 class Interruption(KeyboardInterrupt):
     """Ctrl-C, or a scheduler's SIGTERM.
 
+    Args:
+        number: The signal.
+        advice: What to do next.
+
     Attributes:
-        exit_code: 128 plus the signal's number, as shells count.
+        number: The signal.
+        exit_code: 128 plus its number, as shells count.
     """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(f"interrupted; {_RESUME}")
-        self.exit_code = 128 + number
+    def __init__(self, number: int, advice: str = _RESUME) -> None:
+        super().__init__(f"interrupted; {advice}")
+        self.number, self.exit_code = int(number), 128 + number
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only)."""
+def interruptible(advice: str = _RESUME) -> Iterator[None]:
+    """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only).
+
+    Args:
+        advice: What the interruption tells to do next.
+    """
+
+    def interrupt(number: int, _: FrameType | None) -> NoReturn:
+        raise Interruption(number, advice)
+
     numbers = (signal.SIGINT, signal.SIGTERM)
-    kept = {number: signal.signal(number, _interrupt) for number in numbers}
+    kept = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield
     finally:
         for number, handler in kept.items():
             signal.signal(number, handler)
-
-
-def _interrupt(number: int, _: FrameType | None) -> NoReturn:
-    raise Interruption(number)

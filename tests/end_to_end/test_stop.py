@@ -1,0 +1,242 @@
+"""Signals, full disks and folders that cannot be written, in runs inside this process."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dopepp.training.system import PoseSystem
+
+Runner = Callable[..., Any]
+FindRun = Callable[[Path], Path]
+
+
+def last_step(run: Path) -> int:
+    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    return int(content["global_step"])
+
+
+def steps(run: Path) -> list[str]:
+    with (run / "metrics.csv").open(newline="") as stream:
+        return [row["step"] for row in csv.DictReader(stream)]
+
+
+def last_line(done: Any) -> str:
+    return str(done.err.rstrip("\n").rpartition("\n")[2])
+
+
+def at_step(patch: pytest.MonkeyPatch, step: int, act: Callable[[], object]) -> None:
+    """Do something in the middle of a step."""
+    forward = PoseSystem.training_step
+
+    def training_step(system: PoseSystem, *arguments: Any) -> Any:
+        if system.global_step == step:
+            act()
+        return forward(system, *arguments)
+
+    patch.setattr(PoseSystem, "training_step", training_step)
+
+
+def send(*numbers: int) -> Callable[[], None]:
+    def act() -> None:
+        for number in numbers:
+            os.kill(os.getpid(), number)
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_saves_the_step_and_names_the_checkpoint(
+    number: int, code: int, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        at_step(patch, 0, send(number))
+        done = call("train.py", *tiny, f"output_dir={tmp_path}")
+    assert done.code == code, done.err
+    run = find_run(tmp_path)
+    assert last_line(done) == (
+        f"interrupted; saved up to step 1 in checkpoints/last.ckpt; go on with resume={run}"
+    )
+    assert "Traceback" not in done.err
+    assert last_step(run) == 1
+    assert call("train.py", f"resume={run}").code == 0
+    assert steps(run) == ["0", "1"]
+
+
+def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
+    call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    save = torch.save
+
+    def interrupted_save(content: dict[str, Any], stream: Any) -> None:
+        stream.write(b"half of a file")
+        if content["global_step"] == 2:
+            send(signal.SIGINT)()
+        stream.seek(0)
+        save(content, stream)
+
+    each = ("callbacks.last.every_s=0", "callbacks.last.max_share=1")
+    with pytest.MonkeyPatch.context() as patch:
+        at_step(patch, 1, send(signal.SIGINT))
+        patch.setattr(torch, "save", interrupted_save)
+        done = call("train.py", *tiny, *each, f"output_dir={tmp_path}")
+    assert done.code == 130, done.err
+    run = find_run(tmp_path)
+    assert "saved up to step 1" in last_line(done)
+    assert last_step(run) == 1
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.ckpt"]
+
+
+def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
+    call: Runner,
+    find_run: FindRun,
+    tiny: tuple[str, ...],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    scontrol = tmp_path / "bin" / "scontrol"
+    scontrol.parent.mkdir()
+    scontrol.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/asked\n')
+    scontrol.chmod(0o755)
+    command = ("train.py", *tiny, f"output_dir={tmp_path / 'outputs'}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", f"{scontrol.parent}:{os.environ['PATH']}")
+        patch.setenv("SLURM_JOB_ID", "77")
+        with pytest.MonkeyPatch.context() as once:
+            at_step(once, 0, send(signal.SIGTERM, signal.SIGTERM))
+            done = call(*command)
+        assert done.code == 143, done.err
+        assert last_line(done).endswith("; SLURM requeues job 77")
+        assert (tmp_path / "asked").read_text() == "requeue 77\n"
+        patch.setenv("SLURM_RESTART_COUNT", "1")
+        done = call(*command)
+    assert done.code == 0, done.err
+    assert "job 77 was requeued: going on in" in caplog.text
+    assert steps(find_run(tmp_path / "outputs")) == ["0", "1"]
+
+
+def test_an_interrupted_sweep_keeps_what_is_finished(
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    seeds: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+
+        def second_job() -> None:
+            seeds.append(torch.initial_seed())
+            if len(set(seeds)) == 2:
+                send(signal.SIGTERM)()
+
+        at_step(patch, 0, second_job)
+        done = call("train.py", "-m", *tiny, "seed=1,2,3", f"output_dir={tmp_path}")
+    assert done.code == 143, done.err
+    (sweep,) = (tmp_path / "compare").iterdir()
+    with (sweep / "compare.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert rows[0]["instances"] == "3"
+    assert rows[1]["object"].startswith("failed: unfinished")
+    assert not (sweep / "2").exists()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of twelve megabytes."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("only root may mount a small file system")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+EVERY_STEP = ("callbacks.last.every_s=0", "callbacks.last.max_share=1", "data.samples_per_epoch=16")
+
+
+def fill(disk: Path) -> None:
+    with (disk / "filler").open("wb", buffering=0) as stream:
+        try:
+            while True:
+                stream.write(bytes(4096))
+        except OSError:
+            return
+
+
+def test_a_disk_that_is_full_for_a_while_costs_nothing(
+    small_disk: Path,
+    call: Runner,
+    find_run: FindRun,
+    tiny: tuple[str, ...],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        at_step(patch, 1, lambda: fill(small_disk))
+        at_step(patch, 3, lambda: (small_disk / "filler").unlink())
+        done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
+    assert done.code == 0, done.err
+    run = find_run(small_disk)
+    assert f"cannot save last.ckpt in {run}/checkpoints: No space left on device" in caplog.text
+    assert "trying again at the next saving" in caplog.text
+    assert last_step(run) == 4
+    assert steps(run) == ["0", "1", "2", "3"]
+
+
+def test_a_disk_that_stays_full_fails_the_run_and_keeps_the_last_good_checkpoint(
+    small_disk: Path, call: Runner, find_run: FindRun, tiny: tuple[str, ...]
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        at_step(patch, 2, lambda: fill(small_disk))
+        done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
+    assert done.code == 1, done.err
+    run = find_run(small_disk)
+    assert last_line(done).startswith("cannot save ")
+    assert f"in {run}/checkpoints: No space left on device; free some space" in last_line(done)
+    assert last_line(done).endswith(f"go on with resume={run}")
+    assert "Traceback" not in done.err
+    assert last_step(run) == 2
+    (small_disk / "filler").unlink()
+    done = call("train.py", f"resume={run}")
+    assert done.code == 0, done.err
+    assert last_step(run) == 4
+    assert steps(run) == ["0", "1", "2", "3"]
+
+
+def test_a_disk_that_is_too_small_is_refused_before_training(
+    small_disk: Path, call: Runner, tiny: tuple[str, ...]
+) -> None:
+    fill(small_disk)
+    with (small_disk / "filler").open("r+b") as stream:
+        stream.truncate((small_disk / "filler").stat().st_size - 2**20)
+    done = call("train.py", *tiny, f"output_dir={small_disk}")
+    assert f"MB free in {small_disk}" in done.line
+    assert "for 4 checkpoints" in done.line
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_a_folder_that_cannot_be_written_is_named_at_once(
+    script: str, call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    output = f"output_dir={tmp_path / 'file' / 'outputs'}"
+    done = call(script, *(tiny if script == "train.py" else ()), output)
+    assert f"output folder {tmp_path}/file" in done.line
+
+
+def test_a_read_only_folder_is_named_at_once(
+    small_disk: Path, call: Runner, tiny: tuple[str, ...]
+) -> None:
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    done = call("train.py", *tiny, f"output_dir={small_disk}")
+    assert f"output folder {small_disk}" in done.line
+    assert "Read-only file system" in done.line
