@@ -57,7 +57,12 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         UserError: The file is missing or no JSON object.
     """
-    record = read_strict_json(path)
+    try:
+        record = read_strict_json(path)
+    except UserError as error:
+        raise UserError(
+            f"{error.got}, unreadable", "a file written by a run", "check the run folder"
+        ) from error
     if not isinstance(record, dict):
         raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", "check the file")
     return record

@@ -13,8 +13,8 @@ import yaml
 
 from dopepp.errors import UserError
 
-MAX_BYTES: Final = 2_000_000
-"""A hundred times the largest config of a run."""
+MAX_BYTES: Final = 1_000_000
+"""Fifty times the largest config of a run."""
 
 MAX_DEPTH: Final = 32
 
@@ -27,17 +27,17 @@ def read_yaml(path: Path) -> object:
             has an anchor, an alias or a tag in it, none of which a run writes.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise ValueError(f"over {MAX_BYTES / 1e6:g} MB")
-        text = content.decode()
+        if path.stat().st_size > MAX_BYTES:
+            raise _bad(path, f"of {path.stat().st_size} bytes")
+        text = path.read_text(encoding="utf-8")
         _check_events(text)
         return yaml.safe_load(text)
     except OSError as error:
-        raise _bad(path, str(error.strerror)) from error
+        raise _bad(path, f"unreadable: {error.strerror}") from error
+    except UserError:
+        raise
     except (ValueError, yaml.YAMLError) as error:
-        raise _bad(path, f"{error!s:.200}") from error
+        raise _bad(path, f"unreadable: {error!s:.200}") from error
 
 
 def _check_events(text: str) -> None:
@@ -51,7 +51,7 @@ def _check_events(text: str) -> None:
         if depth > MAX_DEPTH:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         if isinstance(event, yaml.NodeEvent) and event.anchor is not None:
-            raise ValueError(f"the anchor or alias {event.anchor!r:.50}")
+            raise ValueError(f"with YAML aliases ({event.anchor!r:.50})")
         has_tag = (yaml.ScalarEvent, yaml.CollectionStartEvent)
         if isinstance(event, has_tag) and event.tag not in (None, "!"):  # "!": quoted text
             raise ValueError(f"the tag {event.tag!r:.80}")
@@ -59,7 +59,7 @@ def _check_events(text: str) -> None:
 
 def _bad(path: Path, got: str) -> UserError:
     return UserError(
-        f"{path}: {got}",
+        f"{path}, {got}",
         f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags",
         "use a run folder that you trust, or restore the file",
     )

@@ -304,7 +304,7 @@ def test_archives_that_reach_out_or_explode(name: str, tmp_path: Path, refused: 
     assert not list(tmp_path.rglob("*canary*"))
 
 
-@pytest.mark.parametrize("name", ARCHIVES.keys() - {"a file and a folder"})
+@pytest.mark.parametrize("name", [name for name in ARCHIVES if name != "a file and a folder"])
 def test_shards_that_reach_out_or_explode(name: str, tmp_path: Path, bounded: Any) -> None:
     """A shard is never unpacked; what is in it may be refused or passed over."""
     path = tmp_path / "shard-000000.tar"
@@ -454,7 +454,6 @@ ARGUMENTS: dict[str, tuple[str, dict[str, bytes]]] = {
         "predict good.ckpt b.png --K 60 60 8 8 --refine depth --depth a.png",
         {"a.png": PICTURES["a PNG of terapixels"], "b.png": encoded("PNG", SMALL)},
     ),
-    "compare: a folder of nothing": ("compare run", {"run/metrics.json": b"[" * 100_000}),
 }
 
 

@@ -145,7 +145,8 @@ def test_overrides_that_are_no_list_of_text(name: str, tmp_path: Path, refused: 
 
 
 def test_the_files_that_hydra_writes_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "overrides.yaml"
+    path = tmp_path / ".hydra" / "overrides.yaml"
+    path.parent.mkdir()
     path.write_text(
         "- model=dopepp\n- data.parts=[a, b]\n- '++virtual.scene.x={a: 1}'\n- ~logger\n"
     )
