@@ -164,6 +164,9 @@ def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
         if interruption.number == signal.SIGTERM and slurm.job_id() is not None and first:
             line = f"{line}; {slurm.requeue()}"
         _exit(line, interruption.exit_code)
+    except (HydraException, OmegaConfBaseException) as error:  # one of Hydra's is an OSError, too
+        config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
+        _exit(_explain(error, config_dir), USERS_MISTAKE)
     except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
         if error.errno not in _REFUSALS:
             raise
@@ -173,9 +176,6 @@ def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
             "set output_dir=…, or make it writable",
         )
         _exit(str(mistake), USERS_MISTAKE)
-    except (HydraException, OmegaConfBaseException) as error:
-        config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
-        _exit(_explain(error, config_dir), USERS_MISTAKE)
     except UserError as error:  # of a sweeper or launcher; jobs deal with their own
         _exit(str(error), USERS_MISTAKE)
 
