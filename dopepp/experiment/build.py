@@ -147,7 +147,7 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
             logger=loggers,
             callbacks=[*callbacks, TQDMProgressBar(refresh_rate=5)],
             # A checkpoint is never newer than the table.
-            plugins=[AtomicCheckpointIO(prepare=table.write)],
+            plugins=[AtomicCheckpointIO(prepare=table.write, folder=run_dir)],
             enable_model_summary=False,
             num_sanity_val_steps=0,
             # The DataModule's own sampler knows rank and epoch.

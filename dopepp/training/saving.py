@@ -39,11 +39,14 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     Args:
         prepare: Called before each writing; if it raises ``OSError``, nothing is written.
+        folder: The run's folder, outside of which nothing is removed; None for no limit.
     """
 
-    def __init__(self, prepare: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self, prepare: Callable[[], None] | None = None, folder: Path | None = None
+    ) -> None:
         super().__init__()
-        self._prepare = prepare
+        self._prepare, self._folder = prepare, folder
         self._waiting: dict[Path, tuple[dict[str, Any], Path | None]] = {}
 
     @property
@@ -93,6 +96,19 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 return error
             del self._waiting[path]
         return None
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a file of the run.
+
+        Which one is named by the state of a callback, so by a checkpoint: it may be anybody's.
+        """
+        target = Path(os.fspath(path))
+        folder = target.parent.resolve()
+        if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
+            _log.warning("%s is not of this run and stays", target)
+            return
+        if target.is_file():
+            target.unlink()
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None

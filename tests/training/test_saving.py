@@ -94,6 +94,23 @@ def test_what_cannot_be_written_is_written_later_in_order(
     assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
 
 
+def test_nothing_outside_of_the_run_is_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run, other = tmp_path / "run", tmp_path / "other.ckpt"
+    io = AtomicCheckpointIO(folder=run)
+    io.save_checkpoint({"step": 1}, run / "checkpoints" / "old.ckpt")
+    other.write_bytes(b"mine")
+    (run / "link").symlink_to(tmp_path)
+    for path in (run / "checkpoints" / ".." / ".." / "other.ckpt", other, run / "link/other.ckpt"):
+        io.remove_checkpoint(path)
+    assert other.read_bytes() == b"mine"
+    assert caplog.text.count("is not of this run and stays") == 3
+    io.remove_checkpoint(run / "checkpoints")  # a folder is no checkpoint
+    io.remove_checkpoint(run / "checkpoints" / "old.ckpt")
+    assert list((run / "checkpoints").iterdir()) == []
+
+
 def test_the_previous_file_is_kept(tmp_path: Path) -> None:
     io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
     for step in range(3):
