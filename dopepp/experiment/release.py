@@ -57,7 +57,7 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
 
 def _card(name: str, trained: Checkpoint, report: Report) -> str:
     rows = [
-        {"object": row.object, "": row.method, **_measures(row)}
+        {"object": row.object, "method": row.method, **_measures(row)}
         for rows in [report.rows, *report.references.values()]
         for row in rows.values()
         if row.object != "mean" or len(rows) > 2
