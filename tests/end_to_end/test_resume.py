@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import signal
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,13 +51,15 @@ def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: Fi
     for old, new in zip(before, rows(run)[:2], strict=True):
         assert {name: new[name] for name in old} == old
     assert last(run)["global_step"] == 4
-    assert last(run)["epoch"] == 1
+    assert last(run)["epoch"] == 2  # so many are done
     assert json.loads((run / "metrics.json").read_text())["num_images"] == 3
 
     # A finished run has nothing to continue: it is measured again, nothing else.
+    options = _stored_overrides(run)
     done = call("train.py", f"resume={run}")
     assert done.code == 0, done.err
     assert steps(run) == [0, 1, 2, 3]
+    assert _stored_overrides(run) == options  # none is added to at every resume
 
 
 def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
@@ -146,12 +149,15 @@ def damage(path: Path, how: str) -> None:
         content = content[: len(content) // 2]
     elif how == "empty":
         content = bytearray()
-    else:  # a single bit, inside the weights
-        content[len(content) // 3] ^= 1
+    else:  # a single byte, inside the largest tensor
+        with zipfile.ZipFile(path) as archive:
+            largest = max(archive.infolist(), key=lambda member: member.file_size)
+        place = largest.header_offset + largest.file_size
+        content[place] = (content[place] + 1) % 256
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["cut", "empty", "bit"])
+@pytest.mark.parametrize("how", ["cut", "empty", "byte"])
 def test_resume_takes_the_newest_whole_checkpoint(
     how: str, run: Path, call: Runner, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -168,6 +174,7 @@ def test_resume_takes_the_newest_whole_checkpoint(
     assert f"left out: {folder}/last.ckpt" in caplog.text
     assert f"left out: {folder}/previous.ckpt" in caplog.text
     assert "going on from best.ckpt, step 2" in caplog.text
+    assert (folder / "last.ckpt.damaged").exists()
     assert steps(run) == [0, 1, 2, 3]
     assert last(run)["global_step"] == 4
     assert not torch.equal(next(iter(last(run)["state_dict"].values())), next(iter(whole.values())))
