@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.command_line import _stored_overrides
+from dopepp.experiment.resume import read_overrides
 from dopepp.training.checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
@@ -55,11 +55,11 @@ def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: Fi
     assert json.loads((run / "metrics.json").read_text())["num_images"] == 3
 
     # A finished run has nothing to continue: it is measured again, nothing else.
-    options = _stored_overrides(run)
+    options = read_overrides(run)
     done = call("train.py", f"resume={run}")
     assert done.code == 0, done.err
     assert steps(run) == [0, 1, 2, 3]
-    assert _stored_overrides(run) == options  # none is added to at every resume
+    assert read_overrides(run) == options  # none is added to at every resume
 
 
 def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
@@ -200,8 +200,11 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(
     ]
     assert find_run(run.parents[1]) == run
 
-    # Hydra's own note of the options, cut in the middle by a kill: not half of them are believed.
-    (run / ".hydra" / "resume.json").unlink()
-    assert _stored_overrides(run) is not None
-    (run / ".hydra" / "overrides.yaml").write_text("- data=virtual\n")
-    assert _stored_overrides(run) is None
+
+def test_hydras_note_of_the_options_is_believed_as_a_whole_or_not_at_all(run: Path) -> None:
+    options = read_overrides(run)
+    (run / ".hydra" / "resume.json").unlink()  # killed before it was written
+    assert read_overrides(run) == options
+    note = run / ".hydra" / "overrides.yaml"
+    note.write_text("".join(note.read_text().splitlines(keepends=True)[:3]))
+    assert read_overrides(run) is None
