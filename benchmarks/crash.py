@@ -104,9 +104,14 @@ def table(run: Path) -> list[dict[str, str]]:
     return [{k: str(bool(v)) if k in TIMES else v for k, v in row.items()} for row in rows]
 
 
-def phase(run: Path, begun: bool) -> str:
+def is_saving(run: Path, pid: int) -> bool:
+    """Tell whether a process is writing a checkpoint; killed ones have left their halves."""
+    return any((run / "checkpoints").glob(f".*-{pid}.partial"))
+
+
+def phase(run: Path, pid: int, begun: bool) -> str:
     """Tell from the files what a stopped process was doing."""
-    if list((run / "checkpoints").glob(".*.partial")):
+    if is_saving(run, pid):
         return "saving"
     if not begun:
         return "start-up"
@@ -144,12 +149,16 @@ def live(run: Path, arguments: list[str], rng: random.Random, tally: Tally, log:
 
     while process.is_alive() and not begun() and time.monotonic() < deadline:
         time.sleep(0.01)
+    assert process.pid is not None
     if begun():
         time.sleep(rng.uniform(0, 2))
+        # Writing takes a hundredth of the time, so a random moment would hardly ever meet it.
+        deadline = time.monotonic() + (5 if rng.random() < 0.4 else 0)
+        while time.monotonic() < deadline and not is_saving(run, process.pid):
+            time.sleep(0.001)
     if process.is_alive():
-        assert process.pid is not None
         os.kill(process.pid, signal.SIGSTOP)
-        tally.phases[phase(run, begun())] += 1
+        tally.phases[phase(run, process.pid, begun())] += 1
         process.kill()
         process.join()
         return False

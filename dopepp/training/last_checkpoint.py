@@ -86,6 +86,7 @@ class LastCheckpoint(Checkpoint):
         _find_place(trainer)
         if trainer.is_global_zero:
             sweep(Path(trainer.default_root_dir))
+            _set_aside_damaged(trainer)
         _forget_later_best(trainer)
         self._saved, self._saved_at = _state(trainer), time.monotonic()
         self._stop = StopRequest()
@@ -166,6 +167,13 @@ class LastCheckpoint(Checkpoint):
         self._saved_at = time.monotonic()
         self._duration_s = self._saved_at - start
         self._saved = _state(trainer)
+
+
+def _set_aside_damaged(trainer: Trainer) -> None:
+    """Keep a damaged file from taking the place of the whole one that is resumed from."""
+    last = Path(trainer.default_root_dir) / FOLDER / LAST
+    if trainer.ckpt_path is not None and Path(trainer.ckpt_path).name != LAST and last.exists():
+        last.replace(last.with_name(f"{LAST}.damaged"))
 
 
 def _find_place(trainer: Trainer) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import signal
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.command_line import _stored_overrides
+from dopepp.experiment.resume import read_overrides
 from dopepp.training.checkpoints import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
@@ -50,13 +51,15 @@ def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: Fi
     for old, new in zip(before, rows(run)[:2], strict=True):
         assert {name: new[name] for name in old} == old
     assert last(run)["global_step"] == 4
-    assert last(run)["epoch"] == 1
+    assert last(run)["epoch"] == 2  # so many are done
     assert json.loads((run / "metrics.json").read_text())["num_images"] == 3
 
     # A finished run has nothing to continue: it is measured again, nothing else.
+    options = read_overrides(run)
     done = call("train.py", f"resume={run}")
     assert done.code == 0, done.err
     assert steps(run) == [0, 1, 2, 3]
+    assert read_overrides(run) == options  # none is added to at every resume
 
 
 def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
@@ -146,12 +149,15 @@ def damage(path: Path, how: str) -> None:
         content = content[: len(content) // 2]
     elif how == "empty":
         content = bytearray()
-    else:  # a single bit, inside the weights
-        content[len(content) // 3] ^= 1
+    else:  # a single byte, inside the largest tensor
+        with zipfile.ZipFile(path) as archive:
+            largest = max(archive.infolist(), key=lambda member: member.file_size)
+        place = largest.header_offset + largest.file_size
+        content[place] = (content[place] + 1) % 256
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["cut", "empty", "bit"])
+@pytest.mark.parametrize("how", ["cut", "empty", "byte"])
 def test_resume_takes_the_newest_whole_checkpoint(
     how: str, run: Path, call: Runner, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -168,6 +174,7 @@ def test_resume_takes_the_newest_whole_checkpoint(
     assert f"left out: {folder}/last.ckpt" in caplog.text
     assert f"left out: {folder}/previous.ckpt" in caplog.text
     assert "going on from best.ckpt, step 2" in caplog.text
+    assert (folder / "last.ckpt.damaged").exists()
     assert steps(run) == [0, 1, 2, 3]
     assert last(run)["global_step"] == 4
     assert not torch.equal(next(iter(last(run)["state_dict"].values())), next(iter(whole.values())))
@@ -193,8 +200,11 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(
     ]
     assert find_run(run.parents[1]) == run
 
-    # Hydra's own note of the options, cut in the middle by a kill: not half of them are believed.
-    (run / ".hydra" / "resume.json").unlink()
-    assert _stored_overrides(run) is not None
-    (run / ".hydra" / "overrides.yaml").write_text("- data=virtual\n")
-    assert _stored_overrides(run) is None
+
+def test_hydras_note_of_the_options_is_believed_as_a_whole_or_not_at_all(run: Path) -> None:
+    options = read_overrides(run)
+    (run / ".hydra" / "resume.json").unlink()  # killed before it was written
+    assert read_overrides(run) == options
+    note = run / ".hydra" / "overrides.yaml"
+    note.write_text("".join(note.read_text().splitlines(keepends=True)[:3]))
+    assert read_overrides(run) is None

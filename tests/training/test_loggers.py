@@ -32,8 +32,8 @@ def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path: Path) -> None:
     assert [path.name for path in table.path.parent.iterdir()] == ["metrics.csv"]
 
 
-def test_a_failing_write_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_failing_write_keeps_the_old_file_and_the_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     table = MetricsTable(tmp_path / "metrics.csv")
     table.log_metrics({"loss": 2.0}, step=0)
@@ -46,11 +46,17 @@ def test_a_failing_write_keeps_the_old_file(
             stream.write(content[:5])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="no space"):
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(OSError, match="no space"):
+            table.write()
+        table.save()
         table.save()
     assert table.path.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+    assert caplog.text.count("no space left on device; its rows are kept") == 1
+    table.save()
+    assert [row["step"] for row in rows(table.path)] == ["0", "1"]
 
 
 def test_an_existing_file_is_continued(tmp_path: Path) -> None:
