@@ -84,7 +84,10 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
     total = next(name for name in _TOTAL_STEPS if name in parameters)
 
     def make(optimizer: Optimizer, num_steps: int) -> LRScheduler:
-        return SCHEDULERS.build(node, optimizer=optimizer, **{total: max(1, num_steps)})
+        try:
+            return SCHEDULERS.build(node, optimizer=optimizer, **{total: max(1, num_steps)})
+        except ZeroDivisionError:  # OneCycleLR whose warm-up is exactly one step long
+            return SCHEDULERS.build(node, optimizer=optimizer, **{total: num_steps + 1})
 
     return make
 

@@ -113,6 +113,19 @@ def test_a_constant_rate_has_no_schedule() -> None:
     assert scheduler_factory({"_target_": None}) is None
 
 
+@pytest.mark.parametrize("num_steps", [0, 1, 2, 9, 10, 11, 20])
+def test_a_cycle_may_be_as_short_as_it_likes(num_steps: int) -> None:
+    node = {"_target_": "torch.optim.lr_scheduler.OneCycleLR", "max_lr": 0.1, "pct_start": 0.1}
+    factory = scheduler_factory(node)
+    assert factory is not None
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.1)
+    schedule = factory(optimizer, num_steps)
+    for _ in range(num_steps):
+        assert 0 <= optimizer.param_groups[0]["lr"] <= 0.1
+        optimizer.step()
+        schedule.step()
+
+
 @pytest.mark.parametrize("gate", [OPTIMIZERS, SCHEDULERS, CALLBACKS, LOGGERS])
 def test_what_a_gate_lists_it_resolves(gate: Any) -> None:
     for target in gate.targets:
