@@ -37,16 +37,22 @@ def map_panel(
     for k, channel in enumerate(np.nan_to_num(np.asarray(belief, np.float32))):
         name = "centroid" if k == CENTROID else f"corner {k}"
         caption = f"{name}, max {channel.max():.2f}"
-        tiles.append(Tile(_heat(image, channel, stride), caption))
+        tiles.append(Tile(heat_picture(image, channel, stride), caption))
     return contact_sheet(tiles, columns=3, tile_width=tile_width)
 
 
-def _heat(
+def heat_picture(
     image: UInt8[np.ndarray, "height width 3"],
     channel: Float[np.ndarray, "map_height map_width"],
-    stride: int,
+    stride: int = 8,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Blend one map in, the more opaque the stronger the belief."""
+    """Blend one map into the dimmed image, the more opaque the stronger the belief.
+
+    Args:
+        image: RGB, at the network's input scale.
+        channel: A map that covers it; values are clipped to [0, 1].
+        stride: Pixels of the image per cell.
+    """
     # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
     large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)
     share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)

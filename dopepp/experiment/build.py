@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 
 from dopepp.errors import UserError
@@ -29,8 +28,11 @@ from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.gate import TARGET, check_integer, check_number
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
+from dopepp.training.averaging import AveragedWeights
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 from dopepp.training.processes import WatchedDDP
+from dopepp.training.profiling import make_profiler
+from dopepp.training.progress import RunProgress
 from dopepp.training.saving import AtomicCheckpointIO
 from dopepp.training.symmetry import SymmetryOptions
 from dopepp.training.system import PoseSystem
@@ -117,8 +119,16 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
         ) from error
 
 
-def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks and loggers."""
+def build_trainer(
+    config: Mapping[str, Any], run_dir: Path, further: Sequence[Callback] = ()
+) -> Trainer:
+    """Build Lightning's trainer with the config's callbacks and loggers.
+
+    Args:
+        config: The whole config.
+        run_dir: Folder that everything is written to.
+        further: Callbacks besides the config's.
+    """
     options = dict(config["trainer"])
     check_integer("trainer.max_epochs", options["max_epochs"], 1, _MAX_EPOCHS)
     check_integer("trainer.max_steps", options["max_steps"], -1, _MAX_EPOCHS)
@@ -135,6 +145,9 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
     options["precision"], reason = choose_precision(options["precision"], accelerator)
     display.console.print(f"precision {options['precision']}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config["callbacks"].values()]
+    if config["ema"] is not None:
+        callbacks.append(AveragedWeights(config["ema"]))
+    options["profiler"] = make_profiler(options["profiler"], run_dir)
     table = MetricsTable(run_dir / "metrics.csv")
     loggers: list[Logger] = [table]
     for node in config.get("logger", {}).values():
@@ -145,7 +158,7 @@ def build_trainer(config: Mapping[str, Any], run_dir: Path) -> Trainer:
             **{**options, "accelerator": accelerator},
             default_root_dir=run_dir,
             logger=loggers,
-            callbacks=[*callbacks, TQDMProgressBar(refresh_rate=5)],
+            callbacks=[*callbacks, *further, RunProgress()],
             # A checkpoint is never newer than the table.
             plugins=[AtomicCheckpointIO(prepare=table.write, folder=run_dir)],
             enable_model_summary=False,

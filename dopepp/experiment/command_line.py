@@ -155,6 +155,7 @@ def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
         begun = slurm.begun_run(arguments)
         if begun is not None:
             arguments.append(f"resume={begun}")
+        _refuse_used_folder(arguments)
         sys.argv = [sys.argv[0], *_resumed(arguments)]
         with interruptible(_START_AGAIN):
             main()
@@ -190,6 +191,23 @@ def _opened(argument: str, open_nodes: Sequence[str]) -> str:
     """Let an override add a key where that is allowed."""
     inside = argument.startswith(tuple(f"{node}." for node in open_nodes))
     return f"++{argument}" if inside else argument
+
+
+def _refuse_used_folder(arguments: Sequence[str]) -> None:
+    """Refuse to begin a run where another one is, before Hydra writes there.
+
+    The further processes of a run get its folder from the first one.
+    """
+    words = dict(text.partition("=")[::2] for text in arguments)
+    folder = words.get("hydra.run.dir", "")
+    if not folder or words.get("resume", "null") not in ("", "null"):
+        return
+    if Path(folder, record.VERSIONS_FILE).is_file() and not getattr(rank_zero_only, "rank", 0):
+        raise UserError(
+            f"hydra.run.dir={folder}, which holds a run",
+            "a folder without one",
+            f"choose another folder, or go on with resume={folder}",
+        )
 
 
 def _resumed(arguments: list[str]) -> list[str]:

@@ -25,6 +25,7 @@ from dopepp.drawing.png import figure_image, write_png, write_whole
 from dopepp.experiment import display, record
 from dopepp.experiment.build import network_spec
 from dopepp.experiment.objects import build_parts
+from dopepp.experiment.readme import write_job_readme
 from dopepp.models.cost import network_cost
 from dopepp.models.gate import check_integer
 from dopepp.models.network import PoseNetwork
@@ -115,6 +116,7 @@ def measure_cost(config: Mapping[str, Any], run_dir: Path) -> NetworkCost:
     record.write_json(run_dir / record.VERSIONS_FILE, record.environment(int(config["seed"]), ""))
     write_whole(run_dir / FRAMES_FILE, _frames(seconds).encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: seconds})
+    write_job_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
         f"{cost.name}, {size[0]}×{size[1]} pixels, untrained, on {cost.device}",
         [{"measure": measure, "": text} for measure, text in cost.texts().items()],

@@ -30,6 +30,7 @@ from dopepp.experiment.objects import build_parts, check_data
 from dopepp.experiment.other_images import warn_of_other_images
 from dopepp.experiment.pass_rates import reported_rates
 from dopepp.experiment.protocols import Protocols
+from dopepp.experiment.readme import write_job_readme
 from dopepp.experiment.report import Report, measure
 from dopepp.experiment.shading import check_masks, check_methods, measure_shading
 from dopepp.experiment.shading_report import record_shading
@@ -199,7 +200,7 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
         _tune(config, loaded, data, seed, run_dir)
         return []
     names = _names(loaded, [] if file is None else [_method_name(config)])
-    return measure_and_record(
+    reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         data,
         seed,
@@ -210,6 +211,8 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
         all_measures=check_flag("all_measures", config["all_measures"]),
         protocols=protocols,
     )
+    write_job_readme(run_dir, f"Evaluation of {measured}", reports[-1])
+    return reports
 
 
 def _tune(

@@ -41,6 +41,9 @@ CALLBACKS: Gate[Callback] = Gate(
     Callback,
     (
         "dopepp.training.auc_curves.AUCCurves",
+        "dopepp.training.belief_maps.BeliefMaps",
+        "dopepp.training.early_stopping.EarlyStop",
+        "dopepp.training.empty_maps.EmptyMaps",
         "dopepp.training.finite.FiniteSteps",
         "dopepp.training.last_checkpoint.LastCheckpoint",
         "dopepp.training.overlays.Overlays",

@@ -1,4 +1,4 @@
-"""What ``train.py`` can do with a config: ``job=train``, or ``job=cost``.
+"""What ``train.py`` can do with a config: ``job=train``, ``job=cost`` or ``job=lr_finder``.
 
 To add a job, write a function of config and run folder and give it a line in :data:`JOBS`.
 """
@@ -11,12 +11,14 @@ from typing import Any, Final
 
 from dopepp.errors import UserError
 from dopepp.experiment.cost import measure_cost
+from dopepp.experiment.lr_finder import find_learning_rate
 from dopepp.experiment.paper_table import PaperTable
 from dopepp.experiment.run import train
 
 JOBS: Final[Mapping[str, Callable[[dict[str, Any], Path], object]]] = {
     "train": train,
     "cost": measure_cost,
+    "lr_finder": find_learning_rate,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import signal
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.production.stopping import Interruption
 from dopepp.errors import RunError, UserError
-from dopepp.experiment import display, record
+from dopepp.experiment import display, readme, record
 from dopepp.experiment.build import build_system, build_trainer
 from dopepp.experiment.evaluation import measure_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
@@ -28,10 +29,13 @@ from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag, check_integer
-from dopepp.training.checkpoints import check_room, newest_checkpoint, saved_step
+from dopepp.training.checkpoints import FOLDER, check_room, newest_checkpoint, saved_step
+from dopepp.training.early_stopping import EarlyStop
 from dopepp.training.processes import ProcessDiedError
+from dopepp.training.profiling import FOLDER as PROFILE
+from dopepp.training.profiling import profile_rows
 from dopepp.training.system import PoseSystem
-from dopepp.training.trial import raise_if_pruned
+from dopepp.training.trial import PrunedError, raise_if_pruned
 
 _log = logging.getLogger(__name__)
 
@@ -52,15 +56,27 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
         SavingFailedError: What was trained cannot be written.
         Interruption: A signal ended it; the message names the last checkpoint.
     """
+    explanation = readme.RunReadme(config, run_dir)
     try:
-        return _train(config, run_dir)
+        report = _train(config, run_dir, explanation)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
-        raise Interruption(number, _advice(run_dir)) from interrupt
+        advice = _advice(run_dir)
+        explanation.end(readme.INTERRUPTED, advice)
+        raise Interruption(number, advice) from interrupt
+    except PrunedError as pruned:
+        explanation.end(readme.PRUNED, str(pruned))
+        raise
+    except Exception as error:
+        explanation.end(readme.FAILED, " ".join(str(error).split()) or repr(error))
+        raise
+    explanation.end(readme.FINISHED, report=report)
+    return report
 
 
-def _train(config: dict[str, Any], run_dir: Path) -> Report:
+def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme) -> Report:
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
+    _check_kept(config)
     seed_everything(seed, verbose=False)
     keep_freed_memory()
     display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
@@ -89,6 +105,7 @@ def _train(config: dict[str, Any], run_dir: Path) -> Report:
         record.write_environment(run_dir, seed, fingerprint, [str(one) for one in changes])
         if config["resume"] is not None:
             remember_overrides(run_dir)
+        explanation.begin()
     display.show_sources(datamodule.summary())
     _announce_duration(config, system, datamodule, trainer)
     try:
@@ -108,7 +125,36 @@ def _train(config: dict[str, Any], run_dir: Path) -> Report:
     raise_if_pruned(trainer)
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
-    return _measure_run(config, run_dir, trainer, protocols)
+    _say_how_it_ended(trainer, run_dir)
+    report = _measure_run(config, run_dir, trainer, protocols)
+    if not config["keep_checkpoints"]:
+        shutil.rmtree(run_dir / FOLDER)
+        display.console.print("everything has run; the checkpoints are removed")
+    return report
+
+
+def _check_kept(config: Mapping[str, Any]) -> None:
+    """Refuse to remove the checkpoints of a run that was begun before."""
+    kept = check_flag("keep_checkpoints", config["keep_checkpoints"])
+    if not kept and config["resume"] is not None:
+        raise UserError(
+            f"resume={config['resume']} with keep_checkpoints=false",
+            "a run whose checkpoints are kept",
+            "set keep_checkpoints=true, or start anew without resume",
+        )
+
+
+def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
+    """Say where training stopped early, and where its time went."""
+    for stopping in trainer.early_stopping_callbacks:
+        if isinstance(stopping, EarlyStop) and stopping.impatient:
+            display.console.print(
+                f"stopped early after epoch {stopping.stopped_epoch}: {stopping.monitor} has not "
+                f"improved in {stopping.wait_count} validations, best {stopping.best_score:.4g}"
+            )
+    rows = profile_rows(trainer.profiler)  # type: ignore[attr-defined]
+    if rows:
+        display.show_table(f"where the time went; all of it in {run_dir / PROFILE}", rows)
 
 
 def _announce_duration(

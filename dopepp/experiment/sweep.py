@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from dopepp.experiment import display
+from dopepp.experiment import display, record
 from dopepp.experiment.compare.compare import compare_runs
 from dopepp.experiment.compare.runs import read_run
+from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.paper_table import PaperTable, write_paper_table
+from dopepp.experiment.readme import write_sweep_readme
 
 
 class CompareJobs(Callback):
@@ -20,6 +23,10 @@ class CompareJobs(Callback):
     Hydra skips the hook when a job raises, so a failing job writes ``failed.json`` and returns;
     the sweep then ends non-zero here, after the table.
     """
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Say in the sweep's folder what runs there."""
+        write_sweep_readme(Path(str(config.hydra.sweep.dir)), _command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Compare all jobs of the sweep folder.
@@ -48,5 +55,20 @@ def compare_jobs(folder: Path, table: Any = None) -> bool:
     entries = compare_runs([read_run(job) for job in jobs], folder)
     if table is not None:
         write_paper_table(PaperTable.of(table), entries, folder)
+    write_sweep_readme(folder, _command(), {job.name: _state(job) for job in jobs})
     display.console.print(f"comparison in {folder}")
     return not any(entry.failure and not entry.pruned for entry in entries)
+
+
+def _command() -> list[str]:
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]
+
+
+def _state(job: Path) -> str:
+    """Say how a job stands, by what is in its folder."""
+    ends = {record.FAILURE_FILE: "failed", record.PRUNED_FILE: "stopped by the search"}
+    for name, word in ends.items():
+        if (job / name).is_file():
+            return f"{word}: {record.read_json(job / name).get('reason', '')}"
+    done = any((job / name).is_file() for name in (record.METRICS_FILE, COST_FILE))
+    return "finished" if done else "unfinished"

@@ -29,6 +29,7 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
+from dopepp.training.averaging import go_on_with_trained
 from dopepp.training.finite import check_state
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
@@ -194,6 +195,7 @@ class PoseSystem(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep only how far the schedule was: a run resumed for longer has a longer schedule."""
+        go_on_with_trained(checkpoint)
         states = checkpoint["lr_schedulers"]
         self._resumed_schedules = [_without_progress(state) for state in states]
         checkpoint["lr_schedulers"] = [

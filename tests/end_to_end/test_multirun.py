@@ -45,6 +45,11 @@ def test_two_models_end_in_one_table_dope_first(
         assert cv2.imread(str(sweep / f"{name}.png")) is not None, name
     assert "dopepp" in (sweep / "compare_auc.csv").read_text().splitlines()[0]
     assert "comparison" in done.out
+    readme = (sweep / "README.md").read_text()
+    assert readme.startswith("# Multirun: finished\n")
+    assert "python train.py -m data=virtual" in readme
+    assert "| [1](1/) | finished |" in readme
+    assert (sweep / "1" / "README.md").read_text().startswith("# dope on virtual: finished")
     # Both saw the same data.
     prints = [
         json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "01"
@@ -65,6 +70,7 @@ def test_a_failing_job_is_a_row_and_the_others_run(
         "dopepp optimizer.lr=0.001",
     ]  # fmt: skip
     assert rows[0]["object"].startswith("failed: got torch.optim.AdamW")
+    assert "| [0](0/) | failed: got torch.optim.AdamW" in (sweep / "README.md").read_text()
     assert "learning rate" in rows[0]["object"]
     # The other two differ in their seed only, and were measured on the same images.
     assert (rows[2]["instances"], rows[2]["seeds"]) == ("3", "1, 2")

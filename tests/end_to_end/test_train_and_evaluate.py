@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,11 +33,21 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_a_run_folder_holds_everything(trained: tuple[Path, Any], tiny: tuple[str, ...]) -> None:
     run, _ = trained
-    for name in ("auc.png", "overlay.png", "val_auc.png", "val_overlay.png"):
+    for name in ("auc.png", "overlay.png", "val_auc.png", "val_overlay.png", "val_belief.png"):
         image = cv2.imread(str(run / name))
         assert image is not None, name
         assert image.std() > 0, name
     assert rows(run / "auc.csv")[0].keys() == {"threshold_m", "pivconnector"}
+
+    readme = (run / "README.md").read_text()
+    assert readme.startswith("# dopepp on virtual: finished\n")
+    for text in (
+        "python train.py data=virtual", "| pivconnector | dopepp |", "](overlay.png)",
+        "python evaluate.py ckpt_path=", f"resume={run}", "- `metrics.csv`: ",
+    ):  # fmt: skip
+        assert text in readme, text
+    for name in re.findall(r"\]\(([^)]+)\)", readme):
+        assert (run / name).is_file(), name
 
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["num_images"] == 3
@@ -105,7 +116,7 @@ def test_evaluation_needs_the_checkpoint_alone(
     assert ours["objects"] == theirs["objects"]
     assert ours["add"] == theirs["add"]
     assert {path.name for path in folder.iterdir()} >= {
-        "auc.png", "auc.csv", "overlay.png", "config.yaml", "versions.json",
+        "auc.png", "auc.csv", "overlay.png", "config.yaml", "versions.json", "README.md",
     }  # fmt: skip
 
 
@@ -170,16 +181,30 @@ def test_other_data_must_show_the_checkpoints_objects(
     assert "pivconnector: 1 test images" in done.out
 
 
-def test_tensorboard_gets_figures_and_pictures(
+def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
     call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:
-    done = call("train.py", *tiny, "logger=tensorboard", f"output_dir={tmp_path}")
+    done = call(
+        "train.py", *tiny, "logger=tensorboard", "ema=0.5", "callbacks=early_stopping",
+        "callbacks.early_stopping.patience=1", "callbacks.early_stopping.min_delta=1",
+        "trainer.max_epochs=4", "trainer.profiler=simple", f"output_dir={tmp_path}",
+    )  # fmt: skip
     assert done.code == 0, done.err
     run = find_run(tmp_path)
+    assert "stopped early after epoch 1: val/selection has not improved" in done.out
+    assert "run_training_epoch" in done.out  # what took the time
+    (report,) = (run / "profile").iterdir()
+    assert "[Callback]AveragedWeights" in report.read_text()
+    best = torch.load(run / "checkpoints" / "best.ckpt", weights_only=True)
+    trained = best["trained_state"]
+    network = PoseEstimator.load(run / "checkpoints" / "best.ckpt").checkpoint.state_dict
+    averaged = {name: best["state_dict"][f"network.{name}"] for name in network}
+    assert all(torch.equal(network[name], averaged[name]) for name in network)
+    assert any(not torch.equal(averaged[name], trained[f"network.{name}"]) for name in network)
     events = EventAccumulator(str(run / "tensorboard"))
     events.Reload()
     assert "train/loss" in events.Tags()["scalars"]
-    assert {"val/auc", "val/overlay"} <= set(events.Tags()["images"])
+    assert {"val/auc", "val/overlay", "val/belief"} <= set(events.Tags()["images"])
     assert rows(run / "metrics.csv")
 
 
@@ -191,7 +216,7 @@ def test_weights_and_biases_stays_offline(
     run = find_run(tmp_path)
     assert list(run.glob("wandb/offline-run-*/*.wandb"))
     assert {path.name.split("_")[0] for path in run.glob("wandb/*/files/media/images/val/*")} == {
-        "auc", "overlay",
+        "auc", "overlay", "belief",
     }  # fmt: skip
     assert rows(run / "metrics.csv")
 

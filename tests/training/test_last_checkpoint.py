@@ -5,21 +5,24 @@ from __future__ import annotations
 import csv
 import logging
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.errors import UserError
 from dopepp.parts.part import Part
+from dopepp.training.averaging import TRAINED, AveragedWeights
 from dopepp.training.checkpoints import newest_checkpoint
+from dopepp.training.early_stopping import EarlyStop
 from dopepp.training.last_checkpoint import LastCheckpoint
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.saving import AtomicCheckpointIO
@@ -97,7 +100,12 @@ class Runs:
         self.make_system, self.part = make_system, part
 
     def __call__(
-        self, folder: Path, cut: Cut, last: LastCheckpoint | None = None, **options: Any
+        self,
+        folder: Path,
+        cut: Cut,
+        last: LastCheckpoint | None = None,
+        more: Sequence[Callback] = (),
+        **options: Any,
     ) -> PoseSystem:
         for seed in (random.seed, np.random.seed, torch.manual_seed):
             seed(3)
@@ -109,11 +117,12 @@ class Runs:
         best = ModelCheckpoint(
             filename="best", monitor="val/loss", enable_version_counter=False,
         )  # fmt: skip
-        callbacks = [Throughput(), LearningRateMonitor("step"), cut]
+        callbacks = [*more, Throughput(), LearningRateMonitor("step"), cut]
+        options = {"max_epochs": 2, **options}
         data = [Noise(number, self.part) for number in (8, 4, 1)]
         datamodule = PoseDataModule(*data, [self.part.name], (SIZE, SIZE), batch_size=2)
         trainer = Trainer(
-            accelerator="cpu", max_epochs=2, log_every_n_steps=1, default_root_dir=folder,
+            accelerator="cpu", log_every_n_steps=1, default_root_dir=folder,
             logger=[table], callbacks=[*callbacks, best, last], enable_progress_bar=False,
             plugins=[AtomicCheckpointIO(prepare=table.write)], enable_model_summary=False,
             num_sanity_val_steps=0, use_distributed_sampler=False, **options,
@@ -211,6 +220,76 @@ def test_accumulated_gradients_are_not_cut_in_two(runs: Runs, tmp_path: Path) ->
             runs(tmp_path / str(at), Cut(at), accumulate_grad_batches=2)
         again = runs(tmp_path / str(at), Cut(None), accumulate_grad_batches=2)
         assert_ends_as(tmp_path / "whole", whole, tmp_path / str(at), again)
+
+
+class Recorder(Callback):
+    """Keeps the weights before the first step and after each."""
+
+    def __init__(self) -> None:
+        self.states: list[dict[str, torch.Tensor]] = []
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.on_train_batch_end(trainer, pl_module)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        self.states.append({k: v.clone() for k, v in pl_module.state_dict().items()})
+
+
+def last_state(folder: Path, name: str) -> dict[str, torch.Tensor]:
+    content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    return dict(content[name])
+
+
+def test_an_average_and_patience_outlive_cuts(runs: Runs, tmp_path: Path) -> None:
+    def more() -> list[Callback]:
+        # Nothing counts as an improvement: the third validation is the last one.
+        patience = EarlyStop("val/loss", min_delta=1e9, patience=2)
+        return [AveragedWeights(0.8), patience]
+
+    recorder = Recorder()
+    whole = runs(tmp_path / "whole", Cut(None), more=[*more(), recorder], max_epochs=6)
+    assert [row["epoch"] for row in rows(tmp_path / "whole") if row["val/loss"]] == ["0", "1", "2"]
+    expected = dict(recorder.states[0])
+    for n, state in enumerate(recorder.states[1:], start=1):
+        decay = min(0.8, n / (n + 9))
+        for name, value in state.items():
+            moving = value.is_floating_point()
+            expected[name] = decay * expected[name] + (1 - decay) * value if moving else value
+    averaged, trained = (last_state(tmp_path / "whole", name) for name in ("state_dict", TRAINED))
+    assert averaged.keys() == expected.keys()
+    for name, value in averaged.items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
+    assert_same(trained, whole.state_dict())  # training has gone on with them, to its end
+    assert any(not torch.equal(averaged[name], trained[name]) for name in trained)
+    for at in (16, 36):  # in the first validation, in the second one
+        cut = tmp_path / str(at)
+        with pytest.raises(CutError):
+            runs(cut, Cut(at), more=more(), max_epochs=6)
+        again = runs(cut, Cut(None), more=more(), max_epochs=6)
+        assert_ends_as(tmp_path / "whole", whole, cut, again)
+        assert_same(last_state(cut, "state_dict"), averaged)
+    # What has stopped early stays so, until there is more patience.
+    again = runs(cut, Cut(None), more=more(), max_epochs=6)
+    assert_ends_as(tmp_path / "whole", whole, cut, again)
+    patient = EarlyStop("val/loss", min_delta=1e9, patience=3)
+    runs(cut, Cut(None), more=[AveragedWeights(0.8), patient], max_epochs=6)
+    assert [row["epoch"] for row in rows(cut) if row["val/loss"]] == ["0", "1", "2", "3"]
+
+
+def test_an_average_may_begin_or_end_with_a_resume(runs: Runs, tmp_path: Path) -> None:
+    whole = runs(tmp_path / "whole", Cut(None))
+    for before, after in (([AveragedWeights(0.8)], []), ([], [AveragedWeights(0.8)])):
+        cut = tmp_path / str(len(before))
+        with pytest.raises(CutError):
+            runs(cut, Cut(9), more=before)
+        again = runs(cut, Cut(None), more=after)
+        assert_same(again.state_dict(), whole.state_dict())
+
+
+@pytest.mark.parametrize("decay", [1, -0.1, True, "much"])
+def test_a_decay_out_of_its_range(decay: object) -> None:
+    with pytest.raises(UserError, match="ema="):
+        AveragedWeights(decay)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("options", [{"every_s": -1.0}, {"max_share": 0.0}, {"max_share": 1.5}])

@@ -1,0 +1,134 @@
+"""``job=lr_finder``: which learning rate to begin with; nothing is kept of what is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from lightning.pytorch import seed_everything
+
+from dopepp.drawing.curves import figure_with_axes
+from dopepp.drawing.png import figure_image, write_png, write_whole
+from dopepp.errors import RunError, UserError
+from dopepp.experiment import display, record
+from dopepp.experiment.build import build_system, build_trainer
+from dopepp.experiment.objects import build_parts
+from dopepp.experiment.readme import write_job_readme
+from dopepp.experiment.sources import build_datamodule
+from dopepp.experiment.tables import csv_text
+from dopepp.models.gate import check_integer, check_number
+from dopepp.training.rate_sweep import RateSweep, Suggestion, exponential, smooth, suggest
+
+TABLE_FILE: Final = "lr_finder.csv"
+PICTURE_FILE: Final = "lr_finder.png"
+
+_LOWEST: Final = 1e-12
+_HIGHEST: Final = 1e3
+_MIN_STEPS: Final = 10
+_MOST: Final = 10**6
+"""Steps; and epochs, since the steps end the sweep."""
+
+
+def find_learning_rate(config: dict[str, Any], run_dir: Path) -> Suggestion | None:
+    """Train with a rate that grows from step to step; print, write and return what it suggests.
+
+    The chosen optimiser with its other settings; no schedule, no validation, no checkpoint.
+
+    Args:
+        config: The composed and resolved config, plain values.
+        run_dir: Folder that everything is written to.
+
+    Raises:
+        UserError: A choice or an option is wrong.
+        RunError: The loss is not finite from the start.
+    """
+    first, last, num_steps = _range(config["lr_finder"])
+    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
+    if config["resume"] is not None:
+        raise UserError(
+            f"resume={config['resume']} with job=lr_finder", "init_from=…, or neither", "leave it"
+        )
+    seed_everything(seed, verbose=False)
+    parts = build_parts(config["data"])
+    datamodule = build_datamodule(config["data"], parts, seed)
+    datamodule.check_objects()
+    system = build_system(_at_rate(config, first), parts, "")
+    system.make_scheduler = exponential(first, last)
+    sweep = RateSweep()
+    trainer = build_trainer(_sweep_config(config, num_steps), run_dir, [sweep])
+    record.write_config(run_dir, config)
+    record.write_environment(run_dir, seed, "")
+    trainer.fit(system, datamodule=datamodule)
+    if len(sweep.rates) < _MIN_STEPS:
+        raise RunError(
+            f"the loss diverged after {len(sweep.rates)} steps at a learning rate of {first:g}; "
+            "set a smaller lr_finder.min_lr"
+        )
+    found = _report(sweep, run_dir)
+    write_job_readme(run_dir, f"Learning rate of {config['model']['name']}")
+    return found
+
+
+def _range(options: Mapping[str, Any]) -> tuple[float, float, int]:
+    first = check_number("lr_finder.min_lr", options["min_lr"], _LOWEST, _HIGHEST)
+    last = check_number("lr_finder.max_lr", options["max_lr"], _LOWEST, _HIGHEST)
+    if last <= first:
+        raise UserError(
+            f"lr_finder.max_lr={last:g}", f"above lr_finder.min_lr={first:g}", "widen the range"
+        )
+    name = "lr_finder.num_steps"
+    return first, last, check_integer(name, options["num_steps"], _MIN_STEPS, _MOST)
+
+
+def _at_rate(config: dict[str, Any], rate: float) -> dict[str, Any]:
+    return {**config, "optimizer": {**config["optimizer"], "lr": rate}, "scheduler": {}}
+
+
+def _sweep_config(config: Mapping[str, Any], num_steps: int) -> dict[str, Any]:
+    """Return the config of the short training."""
+    trainer = {
+        **config["trainer"],
+        "max_steps": num_steps,
+        "max_epochs": _MOST,
+        "limit_val_batches": 0,
+        "enable_checkpointing": False,
+        "devices": 1,
+        "num_nodes": 1,
+        "strategy": "auto",
+    }
+    return {**config, "trainer": trainer, "callbacks": {}, "logger": {}, "ema": None}
+
+
+def _report(sweep: RateSweep, run_dir: Path) -> Suggestion | None:
+    """Write table and picture, and print the line that a person came for."""
+    rates, losses = np.array(sweep.rates), np.array(sweep.losses)
+    smoothed = smooth(losses)
+    rows = [
+        {"step": step, "learning_rate": rate, "loss": loss, "smoothed_loss": mean}
+        for step, (rate, loss, mean) in enumerate(zip(rates, losses, smoothed, strict=True))
+    ]
+    write_whole(run_dir / TABLE_FILE, csv_text(rows).encode())
+    found = suggest(rates, losses)
+    figure, axes = figure_with_axes("learning rate", "training loss")
+    axes.plot(rates, losses, alpha=0.3)
+    axes.plot(rates, smoothed, color="C0")
+    axes.set_xscale("log")
+    axes.set_ylim(min(losses.min(), 0.95 * smoothed.min()), 1.1 * smoothed[: len(losses)].max())
+    if found is not None:
+        axes.axvline(found.steepest, color="C3", label=f"falls fastest: {found.steepest:.2g}")
+        axes.axvline(found.lowest, color="C7", linestyle=":", label=f"lowest: {found.lowest:.2g}")
+        axes.legend()
+    write_png(run_dir / PICTURE_FILE, figure_image(figure))
+    if found is None:
+        display.console.print(
+            "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or "
+            f"look at the data; {run_dir / PICTURE_FILE}"
+        )
+    else:
+        display.console.print(
+            f"suggested optimizer.lr={found.steepest:.2g}, where the loss falls fastest; it is "
+            f"lowest at {found.lowest:.2g}; {run_dir / PICTURE_FILE}"
+        )
+    return found

@@ -1,0 +1,93 @@
+"""Run folders: none is written over, and each says what it holds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dopepp.experiment import record
+
+Runner = Callable[..., Any]
+
+
+def test_the_same_command_twice_makes_two_folders(
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    command = ("job=cost", "cost.num_frames=1", "cost.batch_size=1", f"output_dir={tmp_path}")
+    for count in (1, 2):
+        assert call("train.py", *tiny, *command).code == 0
+        folders = list(tmp_path.glob("*/*/cost.json"))
+        assert len(folders) == count
+    assert "# Cost of dopepp" in folders[0].with_name("README.md").read_text()
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_the_folder_of_a_run_is_refused_untouched(
+    script: str, call: Runner, tiny: tuple[str, ...], trained: tuple[Path, Any]
+) -> None:
+    run, _ = trained
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    options = tiny if script == "train.py" else (f"ckpt_path={run / record.BEST_CHECKPOINT}",)
+    done = call(script, *options, f"hydra.run.dir={run}")
+    assert f"got hydra.run.dir={run}, which holds a run" in done.line
+    assert f"resume={run}" in done.line
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_a_fast_dev_run_does_everything_and_keeps_no_weights(
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = call("train.py", *tiny, "debug=fdr", "data.num_test=1", f"output_dir={tmp_path}")
+    assert done.code == 0, done.err
+    assert "the checkpoints are removed" in done.out
+    (run,) = (tmp_path / "debug").iterdir()
+    assert (run / "metrics.json").is_file()
+    assert not list(run.rglob("*.ckpt"))
+    assert "nothing to go on with" in (run / "README.md").read_text()
+    done = call("train.py", f"resume={run}")
+    assert "keep_checkpoints=false" in done.line
+
+
+def test_the_learning_rate_finder_trains_nothing_else(
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = call(
+        "train.py", *tiny, "job=lr_finder", "lr_finder.num_steps=20", f"output_dir={tmp_path}"
+    )
+    assert done.code == 0, done.err
+    assert "lr_finder.png" in done.out
+    (run,) = tmp_path.glob("*/*")
+    names = {path.name for path in run.iterdir()}
+    assert {"lr_finder.csv", "lr_finder.png", "README.md", "config.yaml"} <= names
+    assert not names & {"checkpoints", "metrics.json"}
+    table = (run / "lr_finder.csv").read_text().splitlines()
+    assert table[0] == "step,learning_rate,loss,smoothed_loss"
+    rates = [float(line.split(",")[1]) for line in table[1:]]
+    assert rates[0] == pytest.approx(1e-6)
+    assert rates == sorted(rates)
+    assert len(rates) == 20 or rates[-1] < 1
+    done = call("train.py", *tiny, "job=lr_finder", "lr_finder.max_lr=1e-7")
+    assert "lr_finder.max_lr=1e-07; allowed: above lr_finder.min_lr=1e-06" in done.line
+
+
+def test_a_run_that_ends_otherwise_says_how_to_go_on(
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        (run,) = tmp_path.glob("*/*")
+        readme = (run / "README.md").read_text()
+        assert "# dopepp on virtual: running" in readme
+        assert "If that process is gone" in readme
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lightning.pytorch.Trainer.fit", interrupt)
+    assert call("train.py", *tiny, f"output_dir={tmp_path}").code == 130
+    (run,) = tmp_path.glob("*/*")
+    readme = (run / "README.md").read_text()
+    assert readme.startswith("# dopepp on virtual: interrupted\n\nnothing saved yet; go on with")
+    assert f"python train.py resume={run}  # go on" in readme
+    assert json.loads((run / record.VERSIONS_FILE).read_text())["command"][0] == "train.py"
