@@ -1,11 +1,16 @@
-"""Where a training's time goes: Lightning's profilers, written into the run's folder."""
+"""Where a training's time goes: Lightning's profilers, written into the run's folder.
+
+To add one, a subclass of Lightning's ``Profiler`` with :meth:`totals`, and a line in
+:func:`make_profiler`.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from lightning.pytorch.profilers import Profiler, PyTorchProfiler, SimpleProfiler
+from torch.profiler import profile
 
 from dopepp.errors import UserError
 
@@ -14,6 +19,65 @@ FOLDER: Final = "profile"
 
 _FILE: Final = "report"
 _US: Final = 1e-6
+_SHOWN: Final = 12
+
+Total = tuple[str, int, float]
+"""What took time, how often it was called, and seconds of all calls."""
+
+
+class Hooks(SimpleProfiler):
+    """The hooks of the training loop, over the whole training.
+
+    Args:
+        folder: Where the report is written to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(dirpath=folder, filename=_FILE)
+
+    def totals(self) -> list[Total]:
+        """Return every hook; one that calls another one contains its time."""
+        recorded = self.recorded_durations.items()
+        return [(name, len(seconds), sum(seconds)) for name, seconds in recorded]
+
+
+class Operators(PyTorchProfiler):
+    """Torch's operators in a few steps of training and of validation, without what they call.
+
+    Args:
+        folder: Where the report and a trace of each are written to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)
+        self._folder, self._num_traces = folder, 0
+        self._totals: dict[str, tuple[int, float]] = {}
+
+    def _collect(self, recorded: profile) -> None:
+        """Add a recording; Lightning's own report is of the last one alone, a validation."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
+        self._num_traces += 1
+        averages: Any = recorded.key_averages()
+        for one in averages:
+            if one.is_user_annotation or one.key.startswith("[pl]"):
+                continue  # Lightning's hooks
+            calls, seconds = self._totals.get(one.key, (0, 0.0))
+            spent = _US * (one.self_cpu_time_total + one.self_device_time_total)
+            self._totals[one.key] = (calls + one.count, seconds + spent)
+
+    def totals(self) -> list[Total]:
+        """Return every operator; of a GPU's, launching and running together."""
+        return [(name, *total) for name, total in self._totals.items()]
+
+    def summary(self) -> str:
+        """Return the report."""
+        self._delete_profilers()
+        lines = [
+            f"{seconds:12.6f} s {calls:8d} calls  {name}"
+            for name, calls, seconds in sorted(self.totals(), key=_seconds, reverse=True)
+        ]
+        return "\n".join(lines) + "\n"
 
 
 def make_profiler(kind: object, run_dir: Path) -> Profiler | None:
@@ -28,31 +92,24 @@ def make_profiler(kind: object, run_dir: Path) -> Profiler | None:
     """
     if kind is None:
         return None
-    kinds = {"simple": SimpleProfiler, "pytorch": PyTorchProfiler}
+    kinds: dict[str, type[Hooks] | type[Operators]] = {"simple": Hooks, "pytorch": Operators}
     if not isinstance(kind, str) or kind not in kinds:
         raise UserError(
             f"trainer.profiler={kind!r:.100}", f"null, {', '.join(kinds)}", "choose one of them"
         )
-    profiler: Profiler = kinds[kind](dirpath=run_dir / FOLDER, filename=_FILE)
-    return profiler
+    return kinds[kind](run_dir / FOLDER)
 
 
-def profile_rows(profiler: Profiler, limit: int = 12) -> list[dict[str, str]]:
+def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
     """Return what took longest, a row of texts each; empty where nothing was recorded.
 
     Args:
-        profiler: One of :func:`make_profiler`, after the training.
+        profiler: Of :func:`make_profiler`, after the training; of any other nothing is known.
         limit: Rows, at most.
     """
-    totals: list[tuple[str, int, float]] = []
-    if isinstance(profiler, SimpleProfiler):
-        recorded = profiler.recorded_durations
-        totals = [(name, len(times), sum(times)) for name, times in recorded.items()]
-    elif isinstance(profiler, PyTorchProfiler) and profiler.function_events:
-        for one in profiler.function_events.key_averages():  # type: ignore[no-untyped-call]
-            spent = one.self_cpu_time_total + one.self_device_time_total
-            totals.append((str(one.key), int(one.count), _US * spent))
-    totals.sort(key=lambda row: row[2], reverse=True)
+    if not isinstance(profiler, Hooks | Operators):
+        return []
+    totals = sorted(profiler.totals(), key=_seconds, reverse=True)
     return [
         {
             "what": name,
@@ -62,3 +119,7 @@ def profile_rows(profiler: Profiler, limit: int = 12) -> list[dict[str, str]]:
         }
         for name, calls, seconds in totals[:limit]
     ]
+
+
+def _seconds(total: Total) -> float:
+    return total[2]

@@ -70,7 +70,9 @@ def test_the_learning_rate_finder_trains_nothing_else(
     assert rates[0] == pytest.approx(1e-6)
     assert rates == sorted(rates)
     assert len(rates) == 20 or rates[-1] < 1
-    done = call("train.py", *tiny, "job=lr_finder", "lr_finder.max_lr=1e-7")
+    done = call(
+        "train.py", *tiny, "job=lr_finder", "lr_finder.max_lr=1e-7", f"output_dir={tmp_path}"
+    )
     assert "lr_finder.max_lr=1e-07; allowed: above lr_finder.min_lr=1e-06" in done.line
 
 

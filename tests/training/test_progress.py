@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
-from lightning.pytorch.profilers import PyTorchProfiler
 
 from dopepp.errors import UserError
 from dopepp.training import progress
-from dopepp.training.profiling import make_profiler, profile_rows
+from dopepp.training.profiling import Operators, make_profiler, profile_rows
 
 
 def test_time_is_left_for_the_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,13 +42,20 @@ def test_the_simple_profiler_lists_what_took_longest(tmp_path: Path) -> None:
     assert "step" in report.read_text()
 
 
-def test_the_operators_of_the_other_one() -> None:
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-        torch.ones(8, 8) @ torch.ones(8, 8)
-    profiler = PyTorchProfiler()
+def test_the_operators_of_training_and_validation(tmp_path: Path) -> None:
+    profiler = Operators(tmp_path / "profile")
     assert profile_rows(profiler) == []
-    profiler.function_events = profile.events()
-    assert "aten::mm" in {row["what"] for row in profile_rows(profiler)}
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    for _ in range(2):
+        recording = torch.profiler.profile(activities=activities, on_trace_ready=profiler._collect)
+        with recording, torch.profiler.record_function("[pl][profile]hook"):
+            torch.ones(8, 8) @ torch.ones(8, 8)
+    rows = {row["what"]: row for row in profile_rows(profiler, limit=100)}
+    assert rows["aten::mm"]["calls"] == "2"
+    assert not any("hook" in name for name in rows)
+    assert "2 calls  aten::mm" in profiler.summary()
+    traces = sorted(path.name for path in (tmp_path / "profile").iterdir())
+    assert traces == ["trace_0.json", "trace_1.json"]
 
 
 @pytest.mark.parametrize("kind", ["fast", 3, ["simple"]])
