@@ -92,6 +92,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(
     assert done.code == 0, done.err
 
 
+@pytest.mark.slow
 def test_an_evaluation_says_when_the_images_are_no_longer_those(
     run: Path,
     call: Runner,

@@ -157,7 +157,14 @@ def damage(path: Path, how: str) -> None:
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("how", ["cut", "empty", "byte"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "byte",
+        pytest.param("cut", marks=pytest.mark.slow),
+        pytest.param("empty", marks=pytest.mark.slow),
+    ],
+)
 def test_resume_takes_the_newest_whole_checkpoint(
     how: str, run: Path, call: Runner, caplog: pytest.LogCaptureFixture
 ) -> None:

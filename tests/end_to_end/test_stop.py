@@ -74,6 +74,7 @@ def test_a_signal_saves_the_step_and_names_the_checkpoint(
     assert steps(run) == ["0", "1"]
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
     call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -127,6 +128,7 @@ def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
     assert steps(find_run(tmp_path / "outputs")) == ["0", "1"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_keeps_what_is_finished(
     call: Runner, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -173,6 +175,7 @@ def fill(disk: Path) -> None:
             return
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_for_a_while_costs_nothing(
     small_disk: Path,
     call: Runner,

@@ -137,6 +137,7 @@ def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
     assert set(rows(folder / "auc.csv")[0]) >= {"dopepp pivconnector"}
 
 
+@pytest.mark.slow
 def test_shading_and_bins_are_measured_of_both_networks(
     trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
 ) -> None:

@@ -178,7 +178,7 @@ def assert_ends_as(folder: Path, system: PoseSystem, cut: Path, again: PoseSyste
     assert_same(best(cut)[1], best(folder)[1])
 
 
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [11, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(
     every: int, runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
 ) -> None:

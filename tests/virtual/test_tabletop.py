@@ -188,9 +188,9 @@ def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None
         preset = replace(
             PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
         )
-        rendered = [Factory(parts, preset, 0).render(0, index) for index in range(4)]
+        rendered = [Factory(parts, preset, 0).render(0, index) for index in range(2)]
         assert all(r.scene.targets == () for r in rendered)
-        assert sum(len(r.scene.objects) for r in rendered) >= 8
+        assert sum(len(r.scene.objects) for r in rendered) >= 4
         empty = replace(preset, distractors=Distractors((0, 0)))
         assert Factory(parts, empty, 0).render(0, 1).scene.objects == ()
 
