@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dopepp.errors import RunError
 from dopepp.models.storage import write_atomic
+from dopepp.training.checkpoints import FOLDER
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +24,9 @@ _ADVICE: Final = {
     errno.EROFS: "make it writable",
     errno.EACCES: "make it writable",
 }
+
+
+_PATHS: Final = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
 class SavingFailedError(RunError):
@@ -113,11 +117,22 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Load a file as plain data; a pickled object in it is refused, whoever asks."""
+        """Load a file as plain data; a pickled object in it is refused, whoever asks.
+
+        A run's folder may have been moved since: what its callbacks call their files is looked for
+        beside the file itself.
+        """
         loaded: Mapping[str, Any] = super().load_checkpoint(
             path, map_location=map_location, weights_only=True
         )
-        return dict(loaded)
+        if self._folder is None:
+            return dict(loaded)
+        folder = self._folder / FOLDER
+        callbacks = {
+            name: _moved(state, folder) if isinstance(state, dict) and "dirpath" in state else state
+            for name, state in loaded.get("callbacks", {}).items()
+        }
+        return {**loaded, "callbacks": callbacks}
 
 
 def _copy(value: Any) -> Any:
@@ -127,6 +142,17 @@ def _copy(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _copy(item) for key, item in value.items()}
     return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+def _moved(state: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a ``ModelCheckpoint``'s state with all of its files in a folder."""
+
+    def place(path: str) -> str:
+        return str(folder / Path(path).name) if path else path
+
+    moved = {key: place(state[key]) for key in _PATHS if key in state}
+    best = {place(path): score for path, score in state.get("best_k_models", {}).items()}
+    return {**state, **moved, "dirpath": str(folder), "best_k_models": best}
 
 
 def _failure(path: Path, error: OSError) -> str:

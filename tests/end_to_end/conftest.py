@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -144,6 +145,15 @@ def trained(
     done = command("train.py", *TINY, f"output_dir={output_dir}")
     assert done.code == 0, done.err[-4000:]
     return find_run(output_dir), done
+
+
+@pytest.fixture
+def run(trained: tuple[Path, Done], tmp_path: Path) -> Path:
+    """A finished run of one epoch of two steps, moved into this test's own folder."""
+    folder = trained[0]
+    copy = tmp_path / "outputs" / folder.parent.name / folder.name
+    shutil.copytree(folder, copy)
+    return copy
 
 
 @pytest.fixture

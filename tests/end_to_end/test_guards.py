@@ -19,13 +19,6 @@ Runner = Callable[..., Any]
 FindRun = Callable[[Path], Path]
 
 
-@pytest.fixture
-def run(call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path) -> Path:
-    done = call("train.py", *tiny, f"output_dir={tmp_path / 'outputs'}")
-    assert done.code == 0, done.err
-    return find_run(tmp_path / "outputs")
-
-
 def test_a_run_that_goes_on_tells_what_changed(run: Path, call: Runner) -> None:
     before = (run / ".hydra" / "overrides.yaml").read_text()
     refused = call("train.py", f"resume={run}", "seed=5", "trainer.max_epochs=2")

@@ -55,7 +55,9 @@ def send(*numbers: int) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+    ("number", "code"),
+    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
+    ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_saves_the_step_and_names_the_checkpoint(
     number: int, code: int, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
@@ -99,6 +101,7 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.ckpt"]
 
 
+@pytest.mark.slow
 def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
     call: Runner,
     find_run: FindRun,

@@ -111,6 +111,29 @@ def test_nothing_outside_of_the_run_is_removed(
     assert list((run / "checkpoints").iterdir()) == []
 
 
+def test_a_moved_run_finds_its_own_files(tmp_path: Path) -> None:
+    old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
+    best = {
+        "dirpath": str(old), "monitor": "val/x", "best_model_path": str(old / "best.ckpt"),
+        "kth_best_model_path": "", "last_model_path": "/etc/passwd",
+        "best_k_models": {str(old / "best.ckpt"): torch.tensor(0.5)},
+    }  # fmt: skip
+    state = {"callbacks": {"ModelCheckpoint": best, "other": {"a": 1}}, "epoch": 3}
+    AtomicCheckpointIO().save_checkpoint(state, old / "last.ckpt")
+    old.parent.rename(new.parent)
+    loaded = AtomicCheckpointIO(folder=new.parent).load_checkpoint(new / "last.ckpt")
+    moved = loaded["callbacks"]["ModelCheckpoint"]
+    assert moved["dirpath"] == str(new)
+    assert moved["best_model_path"] == str(new / "best.ckpt")
+    assert (moved["kth_best_model_path"], moved["last_model_path"]) == ("", str(new / "passwd"))
+    assert list(moved["best_k_models"]) == [str(new / "best.ckpt")]
+    assert (moved["monitor"], loaded["callbacks"]["other"], loaded["epoch"]) == (
+        "val/x",
+        {"a": 1},
+        3,
+    )
+
+
 def test_the_previous_file_is_kept(tmp_path: Path) -> None:
     io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
     for step in range(3):
