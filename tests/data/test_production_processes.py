@@ -82,6 +82,7 @@ class Run:
         pytest.fail("workers outlive the job")
 
 
+@pytest.mark.slow
 def test_killed_interrupted_and_terminated_it_ends_with_the_same_files(
     tmp_path: Path, bare_environment: dict[str, str]
 ) -> None:

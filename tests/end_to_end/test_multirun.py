@@ -57,6 +57,7 @@ def test_two_models_end_in_one_table_dope_first(
     assert prints[0] == prints[1]
 
 
+@pytest.mark.slow
 def test_a_failing_job_is_a_row_and_the_others_run(
     call: Runner, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:

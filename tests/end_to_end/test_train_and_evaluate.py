@@ -182,6 +182,7 @@ def test_other_data_must_show_the_checkpoints_objects(
     assert "pivconnector: 1 test images" in done.out
 
 
+@pytest.mark.slow
 def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
     call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:

@@ -213,6 +213,7 @@ def test_the_clock_and_the_share_of_time_decide(runs: Runs, tmp_path: Path) -> N
     assert saved["global_step"] == 1  # its duration is known from then on
 
 
+@pytest.mark.slow
 def test_accumulated_gradients_are_not_cut_in_two(runs: Runs, tmp_path: Path) -> None:
     whole = runs(tmp_path / "whole", Cut(None), accumulate_grad_batches=2)
     for at in (6, 9, 12):
@@ -276,6 +277,7 @@ def test_an_average_and_patience_outlive_cuts(runs: Runs, tmp_path: Path) -> Non
     assert [row["epoch"] for row in rows(cut) if row["val/loss"]] == ["0", "1", "2", "3"]
 
 
+@pytest.mark.slow
 def test_an_average_may_begin_or_end_with_a_resume(runs: Runs, tmp_path: Path) -> None:
     whole = runs(tmp_path / "whole", Cut(None))
     for before, after in (([AveragedWeights(0.8)], []), ([], [AveragedWeights(0.8)])):

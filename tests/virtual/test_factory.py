@@ -75,7 +75,13 @@ def test_a_distractor_has_no_keypoints() -> None:
         scene.keypoints(1)
 
 
-@pytest.mark.parametrize("name", ["quickstart", "table", "bin"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "table",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("quickstart", "bin")),
+    ],
+)
 def test_same_bytes_in_another_process_and_order(name: str) -> None:
     items = [(0, 0), (0, 1), (3, 1), (0, 12)]
     factory = make_factory(preset=small(name))
