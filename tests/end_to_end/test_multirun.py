@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import pytest
 
 Runner = Callable[..., Any]
 
