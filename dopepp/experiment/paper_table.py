@@ -96,7 +96,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
     """
     rows = KINDS[table.kind](table, entries, folder)
     rows += [
-        {_METHOD: f"{label}, the paper", **{key: f"{value:,g}" for key, value in figures.items()}}
+        {_METHOD: f"{label}, the paper", **{key: f"{value:,}" for key, value in figures.items()}}
         for label, figures in table.paper.items()
     ]
     display.show_table(table.title, rows)

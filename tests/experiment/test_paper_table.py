@@ -70,7 +70,11 @@ def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path: Path) -
     job(tmp_path / "0", ["model=dope", "seed=1"], [0.04, 0.06])
     job(tmp_path / "1", ["model=dope", "seed=2"], [0.04, 0.04])
     job(tmp_path / "2", ["model=dopepp", "seed=1"], None)
-    table = {"title": "Table 6", "labels": LABELS, "paper": {"DOPE": {"ADD<5cm %": 91.5}}}
+    table = {
+        "title": "Table 6",
+        "labels": LABELS,
+        "paper": {"DOPE": {"ADD<5cm %": 91.5, "AUC[0,10cm] %": 9696958}},
+    }
     with pytest.raises(SystemExit):
         end(tmp_path, table)
     dope, dopepp, reference, paper = read_table(tmp_path)
@@ -80,6 +84,7 @@ def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path: Path) -
     assert dopepp["method"] == "DOPE++: no memory"
     assert (reference["method"], reference["rotation °"]) == ("best constant pose", "50.0")
     assert (paper["method"], paper["ADD<5cm %"]) == ("DOPE, the paper", "91.5")
+    assert paper["AUC[0,10cm] %"] == "9,696,958"
     text = (tmp_path / "table.md").read_text()
     assert text.startswith("# Table 6\n")
     assert "pass rate is ADD < 0.05 m" in text

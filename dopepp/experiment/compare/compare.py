@@ -92,7 +92,8 @@ def compare_runs(
     entries = ordered(entries, baseline or BASELINE)
     text = write_comparison(entries, folder)
     panels = _panels(entries, folder)
-    tiles, note = picture_tiles(entries, num_pictures) if num_pictures else ([], "")
+    shown = num_pictures if any(entry.reports for entry in entries) else 0
+    tiles, note = picture_tiles(entries, shown) if shown else ([], "")
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(entries)))
         width = 2 * max([one.shape[1] for one in panels], default=_PANEL_PX)
