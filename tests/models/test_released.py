@@ -91,3 +91,26 @@ def test_a_file_without_a_description(text: str, trained: Checkpoint, tmp_path: 
     released.safetensors_file.write(path, {"network.a": torch.zeros(2)}, {"dopepp": text})
     with pytest.raises(UserError, match=r"other\.safetensors"):
         read(path)
+
+
+@pytest.mark.parametrize("name", sorted(released.released_paths()))
+def test_what_is_released_loads_and_is_small_and_portable(name: str) -> None:
+    path = released.released_paths()[name]
+    assert path.stat().st_size <= 5_000_000
+    assert f"pretrained/{name}" in path.with_suffix(".md").read_text()
+    network, checkpoint = load_network(Path("pretrained", name))
+    assert all(value.isfinite().all() for value in network.state_dict().values())
+    payload = checkpoint.to_payload()
+    assert not [
+        text for text in texts(payload) if text.startswith(("/", "~", "\\")) or ":\\" in text
+    ]
+    assert name in [part.name for part in checkpoint.parts]
+
+
+def texts(value: Any) -> list[str]:
+    """Return every text in a payload."""
+    if isinstance(value, dict):
+        return [text for item in value.values() for text in texts(item)]
+    if isinstance(value, list):
+        return [text for item in value for text in texts(item)]
+    return [value] if isinstance(value, str) else []
