@@ -210,6 +210,7 @@ def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
     assert rows(run / "metrics.csv")
 
 
+@pytest.mark.slow
 def test_weights_and_biases_stays_offline(
     command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:

@@ -241,6 +241,7 @@ def last_state(folder: Path, name: str) -> dict[str, torch.Tensor]:
     return dict(content[name])
 
 
+@pytest.mark.slow
 def test_an_average_and_patience_outlive_cuts(runs: Runs, tmp_path: Path) -> None:
     def more() -> list[Callback]:
         # Nothing counts as an improvement: the third validation is the last one.

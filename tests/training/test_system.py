@@ -128,7 +128,7 @@ def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> LRScheduler:
     return CosineAnnealingLR(optimizer, T_max=num_steps)
 
 
-@pytest.mark.parametrize("schedule", [one_cycle, cosine])
+@pytest.mark.parametrize("schedule", [one_cycle, pytest.param(cosine, marks=pytest.mark.slow)])
 def test_a_run_resumed_for_longer_follows_the_longer_schedule(
     schedule: Callable[[torch.optim.Optimizer, int], LRScheduler],
     make_system: SystemMaker,
