@@ -195,6 +195,7 @@ def test_millimetres_given_as_metres_name_the_likely_unit(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_an_inch_file_comes_out_in_its_size_and_checked(shared_data: Path, tmp_path: Path) -> None:
     import trimesh
 

@@ -198,6 +198,7 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(
     assert steps(run) == ["0", "1", "2", "3"]
 
 
+@pytest.mark.slow
 def test_a_disk_that_stays_full_fails_the_run_and_keeps_the_last_good_checkpoint(
     small_disk: Path, call: Runner, find_run: FindRun, tiny: tuple[str, ...]
 ) -> None:

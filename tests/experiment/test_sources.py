@@ -53,6 +53,7 @@ def test_splits_share_no_image(tiny: Composer) -> None:
     assert len(set(images)) == 3
 
 
+@pytest.mark.slow
 def test_one_seed_decides_everything(tiny: Composer) -> None:
     data = tiny()["data"]
     parts = build_parts(data)

@@ -68,7 +68,15 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "as_drawn"), CASES)
+@pytest.mark.parametrize(
+    ("name", "as_drawn"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow)
+        if case[0] in ("cube", "triangular prism")
+        else case
+        for case in CASES
+    ],
+)
 def test_the_group_of_a_known_shape_is_found(name: str, as_drawn: bool) -> None:
     shape, num_discrete, num_axes = SHAPES[name]
     mesh = as_mesh(shape if as_drawn else moved(shape, seed=len(name)))

@@ -336,6 +336,7 @@ torch.save([guard.skipped, line.seen], Path(sys.argv[1]) / f"{trainer.global_ran
 """
 
 
+@pytest.mark.slow
 @pytest.mark.ddp
 def test_all_processes_leave_a_step_out_together(tmp_path: Path) -> None:
     script = tmp_path / "line.py"
