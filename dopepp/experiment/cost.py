@@ -7,7 +7,6 @@ to poses takes on real maps stands in every evaluation's ``ms/frame``.
 from __future__ import annotations
 
 import csv
-import io
 import platform
 import time
 from collections.abc import Mapping
@@ -26,6 +25,7 @@ from dopepp.experiment import display, record
 from dopepp.experiment.build import network_spec
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.readme import write_job_readme
+from dopepp.experiment.tables import csv_text
 from dopepp.models.cost import network_cost
 from dopepp.models.gate import check_integer
 from dopepp.models.network import PoseNetwork
@@ -114,7 +114,8 @@ def measure_cost(config: Mapping[str, Any], run_dir: Path) -> NetworkCost:
     record.write_config(run_dir, config)
     record.write_json(run_dir / COST_FILE, asdict(cost))
     record.write_json(run_dir / record.VERSIONS_FILE, record.environment(int(config["seed"]), ""))
-    write_whole(run_dir / FRAMES_FILE, _frames(seconds).encode())
+    frames = [{"frame": n, "seconds": f"{one:.6f}"} for n, one in enumerate(seconds)]
+    write_whole(run_dir / FRAMES_FILE, csv_text(frames).encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: seconds})
     write_job_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
@@ -167,11 +168,3 @@ def _times(
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - start)
     return np.array(times[_WARM_UP:])
-
-
-def _frames(seconds: Float[np.ndarray, "frames"]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["frame", "seconds"])
-    writer.writerows((number, f"{value:.6f}") for number, value in enumerate(seconds))
-    return text.getvalue()

@@ -43,6 +43,7 @@ from dopepp.parts.part import Part
 
 def measure_and_record(
     estimators: Mapping[str, PoseEstimator],
+    parts: Sequence[Part],
     data: Mapping[str, Any],
     seed: int,
     run_dir: Path,
@@ -58,6 +59,7 @@ def measure_and_record(
 
     Args:
         estimators: By name, the baseline first where there is one.
+        parts: The objects that are scored, as the test data have them.
         data: The data config.
         seed: Of the test images, where they are renders, and of the shading's patches.
         run_dir: Folder that everything is written to.
@@ -75,7 +77,6 @@ def measure_and_record(
         UserError: The data or a file are wrong.
     """
     protocols = protocols or Protocols()
-    parts = _parts_of(list(estimators.values()), data)
     source = build_test_source(data, parts, seed)
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
@@ -141,7 +142,7 @@ def _write_results(
         write_results(run_dir / results_name(method, dataset, split), rows)
 
 
-def _parts_of(estimators: Sequence[PoseEstimator], data: Mapping[str, Any]) -> list[Part]:
+def parts_of(estimators: Sequence[PoseEstimator], data: Mapping[str, Any]) -> list[Part]:
     """Return the last estimator's parts as the test data have them; without one, all of these."""
     if not estimators:
         return build_parts(data)
@@ -190,18 +191,20 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     fingerprint = "" if own is None else own.data_fingerprint
     seed = held_out_seed(data)
     record.write_environment(run_dir, seed, fingerprint)
+    parts = parts_of(loaded, data)
     if loaded:
-        warn_of_other_images(loaded[-1].checkpoint, data, _parts_of(loaded, data), seed)
+        warn_of_other_images(loaded[-1].checkpoint, data, parts, seed)
     if check_flag("tune", config["tune"]):
         if protocols:
             raise UserError(
                 "tune=true with shading or by", "one of the two", "tune first, then measure"
             )
-        _tune(config, loaded, data, seed, run_dir)
+        _tune(config, loaded, parts, data, seed, run_dir)
         return []
     names = _names(loaded, [] if file is None else [_method_name(config)])
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
+        parts,
         data,
         seed,
         run_dir,
@@ -218,6 +221,7 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
 def _tune(
     config: Mapping[str, Any],
     loaded: Sequence[PoseEstimator],
+    parts: Sequence[Part],
     data: Mapping[str, Any],
     seed: int,
     run_dir: Path,
@@ -227,7 +231,7 @@ def _tune(
         allowed = "one ckpt_path, and no baseline"
         raise UserError("tune=true", allowed, "tune one checkpoint at a time")
     num_empty = check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS)
-    tuning = tune(loaded[0], data, _parts_of(loaded, data), seed, num_empty)
+    tuning = tune(loaded[0], data, parts, seed, num_empty)
     path = write_tuned(loaded[0].checkpoint, Path(config["ckpt_path"]), tuning.options)
     record.write_json(run_dir / "tuning.json", asdict(tuning))
     display.show_tuning(tuning, path)

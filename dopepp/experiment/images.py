@@ -7,7 +7,7 @@ its labels and a picture of 16 × 12 pixels, which another machine's rounding do
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.data.sample import DescribedSource, Sample
+from dopepp.experiment.options import flat
 from dopepp.geometry.camera import Letterbox
 
 _LOOK_SIZE: Final = (16, 12)
@@ -48,15 +49,6 @@ def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> l
     if _picture_difference(stored["first_image"], present["first_image"]) > _MAX_LEVELS:
         lines.append("pixels of the first image")
     return lines
-
-
-def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the leaves of nested mappings by their dotted names; lists are leaves."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from flat(item, f"{name}.{key}" if name else str(key))
-    else:
-        yield name, value
 
 
 def _look(sample: Sample) -> dict[str, Any]:

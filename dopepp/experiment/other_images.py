@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from dopepp.experiment.chosen_data import trained_on
-from dopepp.experiment.images import describe_images, differing_images, flat
+from dopepp.experiment.images import describe_images, differing_images
+from dopepp.experiment.options import below, flat
 from dopepp.experiment.sources import build_test_source
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
@@ -56,8 +57,5 @@ def warn_of_other_images(
 
 def _test_set(data: Mapping[str, Any]) -> dict[str, object]:
     return {
-        key: value
-        for key, value in flat(data)
-        if value is not None
-        and any(key == one or key.startswith(f"{one}.") for one in _DECIDE_TEST)
+        key: value for key, value in flat(data) if value is not None and below(key, _DECIDE_TEST)
     }

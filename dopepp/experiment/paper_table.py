@@ -22,13 +22,14 @@ from dopepp.experiment import display, record
 from dopepp.experiment.compare.entry import Entry
 from dopepp.experiment.compare.table import Line, with_deviation
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_frame_rates
+from dopepp.experiment.pass_rates import ADD_5CM, ADD_10CM, heading
 from dopepp.experiment.shading_report import SHADING_FILE
 from dopepp.experiment.tables import Row, csv_text, markdown_text
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
 
-_PASS_FIELDS: Final = {0.05: "pass_5cm", 0.1: "pass_10cm"}
+_PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
 _FIELDS: Final = ("auc_10cm", "add_01d", "median_rotation_deg")
 """What stands behind the paper's pass rate."""
 _METHOD: Final = "method"
@@ -125,7 +126,7 @@ def _pose_rows(table: PaperTable, entries: Sequence[Entry], folder: Path) -> lis
         else {
             _METHOD: table.label(entry),
             **{
-                _heading(column.heading, name, entry.objects): with_deviation(
+                _of_object(column.heading, name, entry.objects): with_deviation(
                     Line(entry.name, name, entry, entry.row(name)), column
                 )
                 for name in entry.objects
@@ -138,7 +139,7 @@ def _pose_rows(table: PaperTable, entries: Sequence[Entry], folder: Path) -> lis
         return rows
     for reference, by_object in measured.reports[0].references.items():
         texts = {
-            _heading(column.heading, name, measured.objects): column.text(by_object[name])
+            _of_object(column.heading, name, measured.objects): column.text(by_object[name])
             for name in measured.objects
             for column in columns
         }
@@ -151,15 +152,14 @@ def _shading_rows(table: PaperTable, entries: Sequence[Entry], folder: Path) -> 
     rows: list[Row] = []
     panels: dict[str, dict[str, RateCurve]] = {}
     for measure in (table.pass_field, "add_01d"):
-        heading = next(column.heading for column in COLUMNS if column.field == measure)
         for entry in entries:
             curve = _shading_curve([run.folder / SHADING_FILE for run in entry.runs], measure)
             if curve is None:
                 rows.append(_failed(table, entry))
                 continue
             texts = {f"{x:g} %": f"{100 * y:.1f}" for x, y in zip(curve.x, curve.rate, strict=True)}
-            rows.append({_METHOD: table.label(entry), "measure": heading, **texts})
-            panels.setdefault(heading, {})[table.label(entry)] = curve
+            rows.append({_METHOD: table.label(entry), "measure": heading(measure), **texts})
+            panels.setdefault(heading(measure), {})[table.label(entry)] = curve
     if panels:
         figure = rates_figure(panels, "share of the visible area covered (%)", len(panels))
         write_png(folder / "table_shading.png", figure_image(figure))
@@ -250,5 +250,5 @@ def _failed(table: PaperTable, entry: Entry) -> Row:
     return {_METHOD: f"{table.label(entry)}: {entry.failure or 'no such measurement'}"}
 
 
-def _heading(heading: str, name: str, objects: Sequence[str]) -> str:
-    return heading if len(objects) == 1 else f"{name} {heading}"
+def _of_object(text: str, name: str, objects: Sequence[str]) -> str:
+    return text if len(objects) == 1 else f"{name} {text}"

@@ -21,7 +21,8 @@ from hydra.core.hydra_config import HydraConfig
 from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
 from dopepp.experiment import record
-from dopepp.experiment.images import differing_images, flat
+from dopepp.experiment.images import differing_images
+from dopepp.experiment.options import below, flat
 from dopepp.experiment.yaml_file import read_yaml
 from dopepp.models.checkpoint import Checkpoint
 
@@ -91,7 +92,7 @@ def check_resume(
     found = config_differences(_read_config(path), config) if path.is_file() else []
     state = [one for one in found if one.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
-        network = [one for one in found if _below(one.key, _NETWORK)] + state
+        network = [one for one in found if below(one.key, _NETWORK)] + state
         raise UserError(
             f"resume={run}, whose network differs from the chosen one ({_listed(network)})"
             if not state
@@ -118,7 +119,7 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[D
     return [
         Difference(key, _text(one, key), _text(other, key))
         for key in {**one, **other}
-        if one.get(key) != other.get(key) and not _below(key, (*_THIS_CALL, _COPY))
+        if one.get(key) != other.get(key) and not below(key, (*_THIS_CALL, _COPY))
     ]
 
 
@@ -209,12 +210,8 @@ def _text(entries: Mapping[str, object], key: str) -> str:
     return str(entries[key]) if key in entries else _ABSENT
 
 
-def _below(key: str, nodes: Sequence[str]) -> bool:
-    return any(key == node or key.startswith(f"{node}.") for node in nodes)
-
-
 def _is_learnt_from(key: str) -> bool:
-    return _below(key, LEARNT_FROM) and not _below(key, _NOT_LEARNT_FROM)
+    return below(key, LEARNT_FROM) and not below(key, _NOT_LEARNT_FROM)
 
 
 def _listed(differences: Sequence[Difference]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import signal
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +29,7 @@ from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag, check_integer
+from dopepp.parts.part import Part
 from dopepp.training.checkpoints import FOLDER, check_room, newest_checkpoint, saved_step
 from dopepp.training.early_stopping import EarlyStop
 from dopepp.training.processes import ProcessDiedError
@@ -116,9 +117,7 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
         raise
     except RunError as error:
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
-            raise SystemExit(
-                1
-            ) from error  # all processes end for one reason, and the first says it
+            raise SystemExit(1) from error  # all end for one reason, and the first says it
         kept = (run_dir / record.LAST_CHECKPOINT).is_file()
         advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
@@ -126,7 +125,7 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
     if not trainer.is_global_zero:
         raise SystemExit(0)  # the first process alone measures and reports
     _say_how_it_ended(trainer, run_dir)
-    report = _measure_run(config, run_dir, trainer, protocols)
+    report = _measure_run(config, parts, run_dir, trainer, protocols)
     if not config["keep_checkpoints"]:
         shutil.rmtree(run_dir / FOLDER)
         display.console.print("everything has run; the checkpoints are removed")
@@ -204,7 +203,11 @@ def _advice(run_dir: Path) -> str:
 
 
 def _measure_run(
-    config: Mapping[str, Any], run_dir: Path, trainer: Trainer, protocols: Protocols
+    config: Mapping[str, Any],
+    parts: Sequence[Part],
+    run_dir: Path,
+    trainer: Trainer,
+    protocols: Protocols,
 ) -> Report:
     """Measure the best checkpoint of a finished run and write everything down."""
     checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
@@ -223,6 +226,7 @@ def _measure_run(
         details[FULL_SIZE_COST] = vars(cost)
     return measure_and_record(
         {str(config["model"]["name"]): estimator},
+        parts,
         config["data"],
         held_out_seed(config["data"]),
         run_dir,

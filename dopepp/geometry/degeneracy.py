@@ -48,7 +48,7 @@ def degenerate(
 def _spreads(
     object_points: Array, image_points: Array, sigma: Array
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Return how far points spread, for :func:`_degenerate`.
+    """Return how far points spread, for :func:`degenerate`.
 
     Returns:
         The object's largest extent, metres, and its two largest singular values over that; the

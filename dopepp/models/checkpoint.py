@@ -26,7 +26,7 @@ from dopepp.parts.part import Part
 
 __all__ = ["Checkpoint", "load_network", "read", "write_atomic"]
 
-KEY: Final = "dopepp"
+KEY: Final = released.KEY
 STATE_PREFIX: Final = "network."
 FORMAT_VERSION: Final = 1
 

@@ -20,7 +20,8 @@ from dopepp.models import safetensors_file
 SUFFIX: Final = ".safetensors"
 FOLDER: Final = "pretrained"
 
-_KEY: Final = "dopepp"
+KEY: Final = "dopepp"
+"""Of the description in a file, of either kind."""
 _PLACES: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the machine it was trained on."""
 
@@ -54,15 +55,15 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
     """
     tensors, metadata = safetensors_file.read(path)
     try:
-        payload = json.loads(metadata[_KEY])
+        payload = json.loads(metadata[KEY])
     except (KeyError, ValueError, RecursionError) as error:
         raise UserError(
-            f"{path} without a description under {_KEY!r}",
+            f"{path} without a description under {KEY!r}",
             "a checkpoint written by `dopepp release`", "get the file again",
         ) from error  # fmt: skip
     weights = {name: _single(value) for name, value in tensors.items()}
     size = sum(value.numel() * value.element_size() for value in weights.values())
-    return {"state_dict": weights, _KEY: payload}, size
+    return {"state_dict": weights, KEY: payload}, size
 
 
 def write_content(content: Mapping[str, Any], path: Path) -> None:
@@ -77,8 +78,8 @@ def write_content(content: Mapping[str, Any], path: Path) -> None:
         OSError: The folder cannot be written.
     """
     weights = {name: _half(name, value) for name, value in content["state_dict"].items()}
-    payload = json.dumps(_portable(content[_KEY]), allow_nan=False)
-    safetensors_file.write(path, weights, {_KEY: payload})
+    payload = json.dumps(_portable(content[KEY]), allow_nan=False)
+    safetensors_file.write(path, weights, {KEY: payload})
 
 
 def _half(name: str, value: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,21 +32,6 @@ def contents(root: Path) -> dict[str, bytes]:
 
 def processes(num: int) -> OpenPool:
     return lambda content, num_tasks: ProcessPool(content, num)
-
-
-@pytest.fixture
-def two_nodes() -> Iterator[Any]:
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    node = {"num_cpus": 1, "object_store_memory": 80_000_000}
-    cluster = Cluster(
-        initialize_head=True, head_node_args=node | {"include_dashboard": False}, connect=False
-    )
-    cluster.add_node(**node)
-    cluster.wait_for_nodes()
-    yield cluster
-    cluster.shutdown()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -147,21 +147,6 @@ def test_slurm_gets_an_array_with_the_options(sweep: Callable[..., Called], tmp_
         "--gpus-per-node=1", "--signal=USR2@300", "--job-name=dopepp",
     ):  # fmt: skip
         assert f"#SBATCH {option}" in submitted
-
-
-@pytest.fixture
-def two_nodes() -> Iterator[Any]:
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    node = {"num_cpus": 1, "object_store_memory": 80_000_000}
-    cluster = Cluster(
-        initialize_head=True, head_node_args=node | {"include_dashboard": False}, connect=False
-    )
-    cluster.add_node(**node)
-    cluster.wait_for_nodes()
-    yield cluster
-    cluster.shutdown()
 
 
 @pytest.mark.slow

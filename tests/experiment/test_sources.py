@@ -11,7 +11,7 @@ import trimesh
 
 from dopepp.errors import UserError
 from dopepp.experiment.build import build_system
-from dopepp.experiment.evaluation import measure_and_record
+from dopepp.experiment.evaluation import measure_and_record, parts_of
 from dopepp.experiment.objects import PAPER_OBJECTS, build_parts
 from dopepp.experiment.record import METRICS_FILE, read_json
 from dopepp.experiment.sources import build_datamodule, build_test_source
@@ -129,7 +129,9 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(
     write_atomic({"state_dict": weights, "dopepp": system.payload}, path)
     estimator = PoseEstimator(*load_network(path))
 
-    (report,) = measure_and_record({"dopepp": estimator}, data, 0, tmp_path, num_pictures=1)
+    (report,) = measure_and_record(
+        {"dopepp": estimator}, parts_of([estimator], data), data, 0, tmp_path, num_pictures=1
+    )
     assert report.rows["003_cracker_box"].num_instances == 1
     absent = read_json(tmp_path / METRICS_FILE)["objects"]["010_potted_meat_can"]
     assert absent["num_instances"] == 0

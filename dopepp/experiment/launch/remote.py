@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from dopepp.experiment import display, record
+from dopepp.experiment.yaml_file import read_yaml
 
 LOG_FILE: Final = "job.log"
 _OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -72,7 +72,7 @@ def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
         return False
     if not (run_dir / record.LAST_CHECKPOINT).is_file():
         return False
-    before = yaml.safe_load(stored.read_text())
+    before = read_yaml(stored)
     return isinstance(before, dict) and {**before, "resume": None} == dict(config)
 
 

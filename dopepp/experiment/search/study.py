@@ -16,6 +16,7 @@ from optuna.trial import TrialState
 
 from dopepp.errors import UserError
 from dopepp.experiment import record
+from dopepp.experiment.options import below, flat
 from dopepp.training.trial import open_storage
 
 _LOCK_FILE: Final = ".search.lock"
@@ -94,20 +95,8 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
 
 def facts_of(config: Mapping[str, Any], texts: Mapping[str, str]) -> dict[str, str]:
     """Return a config, and what it is varied by, flat and without what names only places."""
-    flat = {key: str(value) for key, value in _flat(config) if not _is_no_part(key)}
-    return {**flat, **{f"search.space {key}": text for key, text in texts.items()}}
-
-
-def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _is_no_part(key: str) -> bool:
-    return any(key == one or key.startswith(f"{one}.") for one in _NO_PART)
+    facts = {key: str(value) for key, value in flat(config) if not below(key, _NO_PART)}
+    return {**facts, **{f"search.space {key}": text for key, text in texts.items()}}
 
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:
