@@ -20,24 +20,54 @@ from dopepp.recovery.solve import solve_group
 ROUNDS: Final = 3
 """Most turns of grouping and solving; in crowds one or two change anything."""
 
+BORDER: Final = 1.0
+"""Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
+
+BORDER_DEVIATION: Final = 0.75
+"""Error of such a peak, cells: half a network's belief lies where there are no cells, so the peak
+is pulled inward. Two trained networks' peaks were off by 0.3 to 0.5 cells on average there, by
+0.75 in the root mean square, and by nothing on average two cells further in."""
+
 
 def peaks_of_object(
-    peaks: Peaks, image: int, number: int, threshold: float, area: float
+    peaks: Peaks, image: int, number: int, threshold: float, cells: tuple[int, int], stride: float
 ) -> ObjectPeaks:
-    """Pick the peaks of one object on one image."""
+    """Pick the peaks of one object on one image; those at the border are less certain.
+
+    Args:
+        peaks: Of a batch of images.
+        image: Which image.
+        number: Which object.
+        threshold: Belief below which a centroid is no instance.
+        cells: Width and height of the maps.
+        stride: Input pixels per cell.
+    """
     first = number * NUM_KEYPOINTS
     corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
     strong = peaks.score[centroid] >= threshold
+    extent = np.array(cells) * stride
     return ObjectPeaks(
         peaks.position[corners],
         peaks.score[corners],
-        peaks.covariance_px[corners],
+        _covariance_px(peaks.position[corners], peaks.covariance_px[corners], extent, stride),
         peaks.toward[corners],
         peaks.position[centroid][strong],
         peaks.score[centroid][strong],
         peaks.covariance_px[centroid][strong],
-        area,
+        float(extent.prod()),
     )
+
+
+def _covariance_px(
+    position: Float[np.ndarray, "8 peaks 2"],
+    covariance: Float[np.ndarray, "8 peaks 2 2"],
+    extent: Float[np.ndarray, "2"],
+    stride: float,
+) -> Float[np.ndarray, "8 peaks 2 2"]:
+    """Add what a peak at the border of the maps does not know; the outermost pixel ends at −½."""
+    inward = np.minimum(position + 0.5, extent - 0.5 - position).min(-1)
+    added = np.where(inward < BORDER * stride, (BORDER_DEVIATION * stride) ** 2, 0.0)
+    return np.asarray(covariance + added[..., None, None] * np.eye(2))
 
 
 def pose_instances(

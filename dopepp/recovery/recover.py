@@ -105,12 +105,12 @@ def _decode(
         return [[] for _ in K]
     geometry = MapGeometry(stride, chosen.sigma)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
-    area = float(belief.shape[-2] * belief.shape[-1] * stride**2)
+    cells = (belief.shape[-1], belief.shape[-2])
     batch = []
     for image, camera in enumerate(K):
         found: list[Detection | str] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
-            own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, area)
+            own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
             found += _recover_object(own, cuboid, camera, name, chosen, stride)
         batch.append(sorted(found, key=lambda one: -getattr(one, "score", -1.0)))
     return batch
