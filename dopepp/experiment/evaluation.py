@@ -118,6 +118,48 @@ def measure_and_record(
     return reports
 
 
+def check_num_empty(config: Mapping[str, Any]) -> int:
+    """Return the config's ``num_empty``.
+
+    Raises:
+        UserError: It is no positive number of images.
+    """
+    return check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS)
+
+
+def tune_and_record(
+    estimator: PoseEstimator,
+    path: Path,
+    parts: Sequence[Part],
+    data: Mapping[str, Any],
+    seed: int,
+    run_dir: Path,
+    num_empty: int,
+) -> Path:
+    """Tune a checkpoint, write the tuned one beside it and say what came of it.
+
+    Args:
+        estimator: Of the checkpoint.
+        path: The checkpoint.
+        parts: The objects as the data have them.
+        data: The data config.
+        seed: Of renders.
+        run_dir: Folder that ``tuning.json`` is written to.
+        num_empty: Images without objects, for choosing and again for checking.
+
+    Returns:
+        The tuned checkpoint.
+
+    Raises:
+        UserError: Validation images teach nothing, see :func:`~dopepp.experiment.tuning.tune`.
+    """
+    tuning = tune(estimator, data, parts, seed, num_empty)
+    tuned = write_tuned(estimator.checkpoint, path, tuning.options)
+    record.write_json(run_dir / "tuning.json", asdict(tuning))
+    display.show_tuning(tuning, tuned)
+    return tuned
+
+
 def _write_results(
     run_dir: Path,
     poses: Mapping[str, Sequence[MeasuredPose]],
@@ -199,7 +241,12 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
             raise UserError(
                 "tune=true with shading or by", "one of the two", "tune first, then measure"
             )
-        _tune(config, loaded, parts, data, seed, run_dir)
+        if config["ckpt_path"] is None or len(loaded) > 1:
+            allowed = "one ckpt_path, and no baseline"
+            raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+        path, num_empty = Path(config["ckpt_path"]), check_num_empty(config)
+        tune_and_record(loaded[0], path, parts, data, seed, run_dir, num_empty)
+        display.show_files(run_dir)
         return []
     names = _names(loaded, [] if file is None else [_method_name(config)])
     reports = measure_and_record(
@@ -216,26 +263,6 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     )
     write_job_readme(run_dir, f"Evaluation of {measured}", reports[-1])
     return reports
-
-
-def _tune(
-    config: Mapping[str, Any],
-    loaded: Sequence[PoseEstimator],
-    parts: Sequence[Part],
-    data: Mapping[str, Any],
-    seed: int,
-    run_dir: Path,
-) -> None:
-    """Tune the checkpoint and say what came of it."""
-    if config["ckpt_path"] is None or len(loaded) > 1:
-        allowed = "one ckpt_path, and no baseline"
-        raise UserError("tune=true", allowed, "tune one checkpoint at a time")
-    num_empty = check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS)
-    tuning = tune(loaded[0], data, parts, seed, num_empty)
-    path = write_tuned(loaded[0].checkpoint, Path(config["ckpt_path"]), tuning.options)
-    record.write_json(run_dir / "tuning.json", asdict(tuning))
-    display.show_tuning(tuning, path)
-    display.show_files(run_dir)
 
 
 def _method_name(config: Mapping[str, Any]) -> str:

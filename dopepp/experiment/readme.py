@@ -31,7 +31,8 @@ FAILED: Final = "failed"
 PRUNED: Final = "stopped by the search"
 
 FILES: Final = {
-    "checkpoints/best.ckpt": "the weights with the best validation; the one to use",
+    "checkpoints/best_tuned.ckpt": "the same as `best.ckpt`, tuned; the one to use",
+    "checkpoints/best.ckpt": "the weights with the best validation",
     "checkpoints/last.ckpt": "where `resume=` goes on",
     "checkpoints/previous.ckpt": "the one before, should that be damaged",
     "metrics.json": "the measurement on the test set, every instance's error included",
@@ -104,12 +105,13 @@ class RunReadme:
         sections = [f"# {name}: {state}", reason, _commands(self._folder)]
         if report is not None:
             sections.append(_result(report))
-        sections += [_pictures(self._folder), self._what_next(state), _files(self._folder)]
+        sections += [_pictures(self._folder), self._what_next(state, report), _files(self._folder)]
         _write(self._folder, sections)
 
-    def _what_next(self, state: str) -> str:
+    def _what_next(self, state: str, report: Report | None) -> str:
         run = shlex.quote(shown(self._folder))
-        best = shlex.quote(shown(self._folder / record.BEST_CHECKPOINT))
+        details = {} if report is None else report.details
+        best = shlex.quote(shown(self._folder / details.get("checkpoint", record.BEST_CHECKPOINT)))
         if not self._config["keep_checkpoints"]:
             return (
                 "A trial of the program itself (`keep_checkpoints=false`): nothing to go on with."

@@ -18,7 +18,11 @@ from dopepp.data.production.stopping import Interruption
 from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, readme, record
 from dopepp.experiment.build import build_system, build_trainer
-from dopepp.experiment.evaluation import measure_and_record
+from dopepp.experiment.evaluation import (
+    check_num_empty,
+    measure_and_record,
+    tune_and_record,
+)
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
 from dopepp.experiment.images import describe_images
 from dopepp.experiment.objects import build_parts
@@ -78,6 +82,8 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
 def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme) -> Report:
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     _check_kept(config)
+    check_flag("tune", config["tune"])
+    check_num_empty(config)
     seed_everything(seed, verbose=False)
     keep_freed_memory()
     display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
@@ -216,7 +222,17 @@ def _measure_run(
         path = run_dir / record.LAST_CHECKPOINT
         _log.warning("the run ended before its first validation: measuring %s", path.name)
     device = trainer.strategy.root_device
+    seed = held_out_seed(config["data"])
     estimator = PoseEstimator.load(path, device)
+    if config["tune"]:
+        try:
+            path = tune_and_record(
+                estimator, path, parts, config["data"], seed, run_dir, check_num_empty(config)
+            )
+        except UserError as error:  # a network that learned little is measured as it is
+            display.console.print(f"not tuned: {error}")
+        else:
+            estimator = PoseEstimator.load(path, device)
     details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
     score = checkpoints[0].best_model_score if checkpoints else None
     if score is not None and score.isfinite():
@@ -228,7 +244,7 @@ def _measure_run(
         {str(config["model"]["name"]): estimator},
         parts,
         config["data"],
-        held_out_seed(config["data"]),
+        seed,
         run_dir,
         num_pictures=12,
         details=details,

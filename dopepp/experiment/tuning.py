@@ -1,7 +1,8 @@
-"""Score and threshold of a checkpoint, chosen on validation images and checked on others.
+"""Distance factor, score and threshold of a checkpoint, from validation images, checked on others.
 
-The score's weights are fitted to "ADD below a tenth of the diameter"; the threshold is the lowest
-at which the network keeps silent on images without its objects. Both go into a new checkpoint.
+The factor is the median ratio of true to estimated distances. The score's weights are fitted to
+"ADD below a tenth of the diameter"; the threshold is the lowest at which the network keeps silent
+on images without its objects. All go into a new checkpoint.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from dopepp.experiment.sources import (
 )
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.assignment import match_by_centre
+from dopepp.metrics.assignment import assign, match_by_centre
 from dopepp.metrics.errors import symmetries
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
@@ -36,10 +37,12 @@ from dopepp.recovery.calibration import (
     FEATURES,
     PASSING,
     detection_features,
+    fit_distance_factor,
     fit_weights,
     score,
 )
 from dopepp.recovery.detection import Detection
+from dopepp.recovery.options import RecoveryOptions
 
 LOUD: Final = 0.005
 """Share of validation images without objects on which the threshold may let a detection pass."""
@@ -111,7 +114,7 @@ def tune(
     seed: int,
     num_empty: int,
 ) -> Tuning:
-    """Choose score weights and threshold on validation images, and measure them on test images.
+    """Choose factor, weights and threshold on validation images; measure them on test images.
 
     Args:
         estimator: The trained network.
@@ -124,29 +127,30 @@ def tune(
         UserError: The network finds nothing, or everything it finds is right or wrong.
     """
     old = estimator.recovery
-    estimator.recovery = replace(old, min_score=0.0)
+    validation = build_validation_source(data, parts, seed)
+    test = build_test_source(data, parts, seed)
+    empty, empty_test = (
+        build_source_without_objects(data, parts, seed, split, num_empty)
+        for split in ("val", "test")
+    )
+
+    def scored(options: RecoveryOptions, source: Source) -> Scored:
+        # Every detection counts here, whatever its score.
+        estimator.recovery = replace(options, min_score=0.0)
+        return score_images(estimator, parts, source)
+
     try:
-        chosen_on = [
-            score_images(estimator, parts, source)
-            for source in (
-                build_validation_source(data, parts, seed),
-                build_source_without_objects(data, parts, seed, "val", num_empty),
-            )
-        ]
-        options = choose(*chosen_on)
-        test = score_images(estimator, parts, build_test_source(data, parts, seed))
-        empty = score_images(
-            estimator, parts, build_source_without_objects(data, parts, seed, "test", num_empty)
-        )
+        before = _figures(scored(old, test), scored(old, empty_test), old.min_score)
+        estimator.recovery = replace(old, min_score=0.0, distance_factor=1.0)
+        factor = fit_distance_factor(*matched_poses(estimator, parts, validation))
+        new = replace(old, distance_factor=factor)
+        chosen = choose(scored(new, validation), scored(new, empty))
+        new = replace(new, **chosen)  # type: ignore[arg-type]
+        after = _figures(scored(new, test), scored(new, empty_test), new.min_score)
     finally:
         estimator.recovery = old
-    weights = np.array([options[f"score_{name}"] for name in FEATURES])
-    before = _figures(test, empty, test.scores, empty.scores, old.min_score)
-    after = _figures(
-        test, empty, score(test.features, weights), score(empty.features, weights),
-        options["min_score"],
-    )  # fmt: skip
-    return Tuning(options, before, after, (test.num_images, empty.num_images))
+    changed = {"distance_factor": factor} | chosen
+    return Tuning(changed, before, after, (len(test), num_empty))
 
 
 def choose(shown: Scored, empty: Scored) -> dict[str, float]:
@@ -204,6 +208,27 @@ def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source
     )
 
 
+def matched_poses(
+    estimator: PoseEstimator, parts: Sequence[Part], source: Source
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
+    """Return the poses found on a source and, for each, that of the instance it found."""
+    estimated, true = [np.empty((0, 4, 4))], [np.empty((0, 4, 4))]
+    for number in range(len(source)):
+        sample = source.sample(number, 0)
+        found = estimator.predict(sample.image, sample.K)
+        for part in parts:
+            pairs = assign(
+                part.cuboid[CENTROID],
+                [one for one in found if one.object == part.name],
+                [one for one in sample.instances if one.label == part.name],
+                MIN_VISIBLE_FRACTION,
+            )
+            hit = np.isfinite(pairs.scores)
+            estimated.append(pairs.T_est[hit])
+            true.append(pairs.T_gt[hit])
+    return np.concatenate(estimated), np.concatenate(true)
+
+
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
     """Write a checkpoint with other recovery options beside the old one; returns its path."""
     tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
@@ -239,14 +264,10 @@ def _judge(
     return right, judged
 
 
-def _figures(
-    test: Scored,
-    empty: Scored,
-    scores: Float[np.ndarray, "n"],
-    empty_scores: Float[np.ndarray, "m"],
-    threshold: float,
-) -> Figures:
-    error = expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(test.correct))
-    loud = empty.loudest(np.where(empty_scores >= threshold, 1.0, 0.0))
-    recall = float((test.correct & (scores >= threshold)).sum()) / max(test.num_instances, 1)
-    return Figures(error, float(loud.mean()), recall)
+def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
+    error = expected_calibration_error(
+        torch.from_numpy(test.scores), torch.from_numpy(test.correct)
+    )
+    loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
+    right = test.correct & (test.scores >= threshold)
+    return Figures(error, float(loud.mean()), float(right.sum()) / max(test.num_instances, 1))

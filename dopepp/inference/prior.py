@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 UNKNOWN_TURN: Final = math.radians(8.0)
 UNKNOWN_ACROSS: Final = 0.07
@@ -41,7 +41,8 @@ class Prior:
 
     def offset(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
         """Return the turn and the shift from a pose to the prior's."""
-        turn = cv2.Rodrigues(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T)[0][:, 0]
+        # OpenCV's Rodrigues rounds turns below 1e-5 to none.
+        turn = Rotation.from_matrix(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T).as_rotvec()
         return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
 
     def doubt(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> str:

@@ -1,26 +1,31 @@
-"""The score: how likely a detection's ADD is below a tenth of the diameter.
+"""What validation images teach about a network's poses; ``evaluate.py tune=true`` fits both parts.
 
-A logistic model of what recovery knows about a pose. As long as nobody has fitted it, its weights
-make the score the mean belief; ``evaluate.py tune=true`` fits them on validation images. To add a
-feature, name it in ``options.FEATURES``, compute it in :func:`detection_features` and
-give ``RecoveryOptions`` its weight.
+Distance: a network's keypoints are means over the poses it holds possible, and the mean of a turned
+figure is a smaller one, so its poses are too far away, each by about the same factor.
+
+Score: how likely a detection's ADD is below a tenth of the diameter, a logistic model of what
+recovery knows about a pose. As long as nobody has fitted it, its weights make the score the mean
+belief. To add a feature, name it in ``options.FEATURES``, compute it in :func:`detection_features`
+and give ``RecoveryOptions`` its weight.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.geometry.camera import project, transform
+from dopepp.geometry.camera import project, project_keypoints, transform
 from dopepp.geometry.cuboid import NUM_CORNERS
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.options import FEATURES
+from dopepp.recovery.options import DISTANCE_FACTORS, FEATURES, RecoveryOptions
 
-__all__ = ["FEATURES", "PASSING", "calibrated", "detection_features", "fit_weights", "score"]
+__all__ = [
+    "FEATURES", "PASSING", "calibrated", "detection_features", "fit_distance_factor", "fit_weights",
+    "score",
+]  # fmt: skip
 
 _CERTAIN: Final = 1e-3
 """Beliefs nearer to 0 or 1 than this are all the same."""
@@ -48,13 +53,37 @@ def calibrated(
     detection: Detection,
     cuboid: Float[np.ndarray, "9 3"],
     K: Float[np.ndarray, "3 3"],
-    weights: Sequence[float],
+    options: RecoveryOptions,
 ) -> Detection:
-    """Return a detection with its score; with nobody's weights that is the mean belief."""
-    if tuple(weights) == _MEAN_BELIEF:
+    """Return a detection at its corrected distance, with its score.
+
+    The part moves along the ray through its origin. With nobody's weights the score is the mean
+    belief.
+    """
+    if options.distance_factor != 1.0:
+        T = detection.T_cam_obj.copy()
+        T[:3, 3] *= options.distance_factor
+        keypoints = project_keypoints(cuboid, T, K)
+        detection = replace(detection, T_cam_obj=T, keypoints=keypoints)
+    if options.score_weights == _MEAN_BELIEF:
         return replace(detection, score=detection.belief)
     features = detection_features(detection, cuboid, K)
-    return replace(detection, score=float(score(features, np.array(weights))))
+    return replace(detection, score=float(score(features, np.array(options.score_weights))))
+
+
+def fit_distance_factor(
+    estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
+) -> float:
+    """Return the median ratio of true to estimated distance; 1 where there are no poses.
+
+    Args:
+        estimated: Object-to-camera transforms found with a factor of 1.
+        true: Those of the instances that they found.
+    """
+    if not len(estimated):
+        return 1.0
+    distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
+    return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
 
 
 def detection_features(

@@ -10,6 +10,9 @@ from dopepp.errors import UserError
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
 """What the score is made of, in this order (:mod:`dopepp.recovery.calibration`)."""
 
+DISTANCE_FACTORS: Final = (0.5, 2.0)
+"""Smallest and greatest factor on a distance; trained networks' are within a tenth of 1."""
+
 _HEAVIEST: Final = 1000.0
 """Largest weight of a feature; fitted ones are a hundred times smaller."""
 
@@ -25,6 +28,8 @@ class RecoveryOptions:
         max_angle_deg: Largest angle between a corner's vector and its centroid, degrees.
         max_peaks: Most peaks kept per channel.
         min_score: Detections below this score are dropped.
+        distance_factor: On the distance of every pose (:mod:`dopepp.recovery.calibration`), as
+            ``evaluate.py tune=true`` measures it.
         score_bias: Weights of the score's features (:mod:`dopepp.recovery.calibration`), as
             ``evaluate.py tune=true`` fits them; these defaults leave the mean belief.
         score_belief: Idem.
@@ -39,6 +44,7 @@ class RecoveryOptions:
     max_angle_deg: float = 45.0
     max_peaks: int = 16
     min_score: float = 0.0
+    distance_factor: float = 1.0
     score_bias: float = 0.0
     score_belief: float = 1.0
     score_spread: float = 0.0
@@ -53,6 +59,7 @@ class RecoveryOptions:
             "max_angle_deg": (1e-3, 180.0),
             "max_peaks": (1, 1000),
             "min_score": (0.0, 1.0),
+            "distance_factor": DISTANCE_FACTORS,
             **{f"score_{name}": (-_HEAVIEST, _HEAVIEST) for name in FEATURES},
         }
         for name, (lowest, highest) in limits.items():

@@ -135,7 +135,7 @@ def _recover_object(
         if detection is None:
             found.append(f"{where}: {result.reason}")
             continue
-        detection = calibrated(detection, cuboid, K, options.score_weights)
+        detection = calibrated(detection, cuboid, K, options)
         if detection.score < options.min_score:
             found.append(f"{where}: score {detection.score:.3f} below {options.min_score:g}")
         else:

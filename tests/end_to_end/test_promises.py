@@ -29,6 +29,7 @@ def test_the_quickstart_learns(tmp_path: Path) -> None:
     assert row["num_instances"] == 300
     assert row["add_01d"] >= 0.40
     assert row["median_rotation_deg"] < 12.0
+    assert record["checkpoint"] == "checkpoints/best_tuned.ckpt"
     references = record["references"]
     assert row["add_01d"] > references["best constant pose"]["pivconnector"]["add_01d"]
 

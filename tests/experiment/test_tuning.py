@@ -13,7 +13,14 @@ import torch
 
 from dopepp.data.sample import Instance, Sample
 from dopepp.errors import UserError
-from dopepp.experiment.tuning import LOUD, Scored, choose, score_images, write_tuned
+from dopepp.experiment.tuning import (
+    LOUD,
+    Scored,
+    choose,
+    matched_poses,
+    score_images,
+    write_tuned,
+)
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import expected_calibration_error
@@ -137,6 +144,16 @@ def test_what_finds_a_hidden_instance_is_not_judged() -> None:
     assert result.num_instances == 0
 
 
+def test_poses_are_paired_with_the_instances_that_they_find() -> None:
+    part = load_part("pivconnector")
+    near, stray = found(part, POSE, 0.9, 0.05), found(part, POSE, 0.8, 3.0)
+    estimated, true = matched_poses(estimator(near, stray), [part], Images(part, POSE))
+    assert np.array_equal(estimated, near.T_cam_obj[None])
+    assert np.array_equal(true, POSE[None])
+    hidden = matched_poses(estimator(near), [part], Images(part, POSE, 0.05))
+    assert [poses.shape for poses in hidden] == [(0, 4, 4)] * 2
+
+
 def test_a_symmetric_part_is_right_at_any_of_its_poses() -> None:
     part = load_part("pivconnector")
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -160,9 +177,12 @@ def test_the_tuned_checkpoint_stands_beside_the_old_one(tmp_path: Path) -> None:
     weights = build_network(SPEC).state_dict()
     part = load_part("pivconnector")
     old = Checkpoint(SPEC, weights, [part], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
-    path = write_tuned(old, tmp_path / "best.ckpt", {"min_score": 0.5, "score_bias": -1.5})
+    path = write_tuned(
+        old, tmp_path / "best.ckpt", {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
+    )
     assert path == tmp_path / "best_tuned.ckpt"
     tuned = PoseEstimator.load(path)
     assert tuned.recovery.max_angle_deg == 30.0
     assert tuned.recovery.min_score == 0.5
+    assert tuned.recovery.distance_factor == 0.95
     assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)

@@ -11,8 +11,16 @@ from scipy.optimize import minimize
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.recovery.calibration import FEATURES, detection_features, fit_weights, score
+from dopepp.recovery.calibration import (
+    FEATURES,
+    calibrated,
+    detection_features,
+    fit_distance_factor,
+    fit_weights,
+    score,
+)
 from dopepp.recovery.detection import Detection
+from dopepp.recovery.options import DISTANCE_FACTORS, RecoveryOptions
 
 K = camera_matrix(600, 600, 320, 240)
 CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))
@@ -54,6 +62,35 @@ def test_the_spread_is_what_poses_with_this_covariance_scatter_by() -> None:
     expected = np.log(np.sqrt((distance**2).mean()) / size / 0.1)
     features = detection_features(detection(covariance=covariance), CUBOID, K)
     assert features[FEATURES.index("spread")] == pytest.approx(expected, abs=0.05)
+
+
+def test_the_distance_changes_along_the_ray_through_the_origin() -> None:
+    before = detection(belief=0.7)
+    after = calibrated(before, CUBOID, K, RecoveryOptions(distance_factor=0.9))
+    assert np.array_equal(after.T_cam_obj[:3, :3], T[:3, :3])
+    assert np.allclose(after.T_cam_obj[:3, 3], [0.018, 0, 0.54], atol=1e-15)
+    # The origin stays where it is in the image; the measured peaks stay as they are.
+    origin = np.zeros((1, 3))
+    assert np.allclose(
+        project(transform(after.T_cam_obj, origin), K), project(transform(T, origin), K)
+    )
+    assert np.allclose(after.keypoints, project(transform(after.T_cam_obj, CUBOID), K))
+    assert np.array_equal(after.peaks, before.peaks)
+    assert after.score == before.belief
+    same = calibrated(before, CUBOID, K, RecoveryOptions())
+    assert np.array_equal(same.T_cam_obj, T)
+
+
+def test_the_factor_is_the_median_ratio_of_distances() -> None:
+    rng = np.random.default_rng(0)
+    true = np.tile(T, (201, 1, 1))
+    true[:, :3, 3] += rng.uniform(-0.1, 0.1, (201, 3))
+    estimated = true.copy()
+    estimated[:, :3, 3] *= rng.normal(1.07, 0.02, (201, 1))
+    estimated[:30, :3, 3] *= 3  # gross errors change a median little
+    assert fit_distance_factor(estimated, true) == pytest.approx(1 / 1.07, abs=0.01)
+    assert fit_distance_factor(true[:0], true[:0]) == 1.0
+    assert fit_distance_factor(100 * true, true) == DISTANCE_FACTORS[0]
 
 
 def test_missing_keypoints_and_worse_fits_are_seen() -> None:

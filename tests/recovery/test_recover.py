@@ -9,9 +9,13 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.errors import UserError
-from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.geometry.camera import camera_matrix, project_keypoints, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.pnp import solve_pnp
+from dopepp.maps import MapGeometry, encode
+from dopepp.maps.peaks import Peaks
 from dopepp.recovery import Detection, RecoveryOptions, explain, recover, recover_batch
+from dopepp.recovery.instances import BORDER_DEVIATION, peaks_of_object
 
 Make = Callable[..., Any]
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
@@ -291,3 +295,41 @@ def test_the_covariance_is_that_of_the_peaks(make_scene: Make, box: np.ndarray, 
         assert_allclose(one.covariance, one.covariance.T, rtol=1e-6)
         assert np.linalg.eigvalsh(one.covariance).min() > 0
     assert np.trace(wide.covariance) > 4 * np.trace(sharp.covariance)
+
+
+def test_peaks_at_the_border_are_less_certain() -> None:
+    inside, outside = [(8.0, 8.0), (71.0, 30.0)], [(7.0, 30.0), (30.0, 7.0), (73.0, 30.0), (-3, -3)]
+    position = np.full((1, 9, 6, 2), np.nan)
+    position[0, 0] = inside + outside
+    covariance = np.tile(np.diag([2.0, 3.0]), (1, 9, 6, 1, 1))
+    score = np.ones((1, 9, 6))
+    peaks = Peaks(position, score, covariance, np.zeros((1, 9, 6, 2)), np.ones((1, 9, 6), bool))
+    own = peaks_of_object(peaks, 0, 0, 0.05, (10, 6), 8.0)
+    added = own.covariance_px[0] - covariance[0, 0]
+    assert_array_equal(added[:2], 0.0)
+    assert_array_equal(added[2:], np.tile((8.0 * BORDER_DEVIATION) ** 2 * np.eye(2), (4, 1, 1)))
+    assert own.area_px == 80 * 48
+
+
+def test_corners_pulled_in_at_the_border_harm_the_pose_less(plate: np.ndarray, pose: Make) -> None:
+    """A network's peaks in the outermost cells lie half a cell too far inside."""
+    rng, K, size = np.random.default_rng(11), camera_matrix(153, 153, 63.5, 63.5), 128
+    ours, plain = [], []
+    while len(ours) < 30:
+        T = pose(rng, *rng.uniform(-0.02, 0.02, 2), 0.16)
+        points = project_keypoints(plate, T, K)
+        inward = np.minimum(points + 0.5, size - 0.5 - points)
+        pulled = inward < 4
+        if not pulled.any() or (inward < 0).any():
+            continue
+        points += 4 * pulled * np.sign(63.5 - points)
+        belief, field = encode(
+            torch.from_numpy(points)[None, None], torch.zeros(1, 1, dtype=torch.long), 1,
+            (16, 16), MapGeometry(8, 1.0),
+        )  # fmt: skip
+        (found,) = recover(belief[0], field[0], plate[None], K)
+        unweighted = solve_pnp(plate, points, K).T_cam_obj
+        assert unweighted is not None
+        for errors, estimate in ((ours, found.T_cam_obj), (plain, unweighted)):
+            errors.append(np.linalg.norm(transform(estimate, plate) - transform(T, plate), axis=1))
+    assert np.mean(ours) < 0.6 * np.mean(plain)
