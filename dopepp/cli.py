@@ -245,6 +245,10 @@ def compare(
     pictures: Annotated[
         int, typer.Option(min=0, help="test images that are shown through every model")
     ] = 3,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="conf/experiment/NAME.yaml: the methods in that table's layout, too"),
+    ] = None,
 ) -> None:
     """Compare runs: a table with Δ and how sure it is, training and AUC curves, test pictures.
 
@@ -253,7 +257,7 @@ def compare(
     from dopepp.experiment.compare.compare import compare_paths
 
     with _mistakes_told():
-        typer.echo(compare_paths(runs, out, baseline, pictures))
+        typer.echo(compare_paths(runs, out, baseline, pictures, table))
 
 
 @app.command()

@@ -25,6 +25,7 @@ from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_fra
 from dopepp.experiment.pass_rates import ADD_5CM, ADD_10CM, heading
 from dopepp.experiment.shading_report import SHADING_FILE
 from dopepp.experiment.tables import Row, csv_text, markdown_text
+from dopepp.experiment.yaml_file import read_yaml
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
@@ -73,6 +74,22 @@ class PaperTable:
             allowed = ", ".join(f"{one:g}" for one in _PASS_FIELDS)
             raise UserError(f"table.threshold={table.threshold}", f"{allowed}, metres", "change it")
         return table
+
+    @classmethod
+    def read(cls, path: Path) -> PaperTable:
+        """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``.
+
+        Raises:
+            UserError: The file cannot be read, or its table is missing or wrong.
+        """
+        config = read_yaml(path)
+        table = config.get("table") if isinstance(config, dict) else None
+        if not isinstance(table, dict):
+            raise UserError(
+                f"{path}, which lays out no table", "an experiment with `table:`",
+                "pass conf/experiment/table….yaml",
+            )  # fmt: skip
+        return cls.of(table)
 
     @property
     def pass_field(self) -> str:

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from dopepp.drawing.pictures import read_rgb
 from dopepp.errors import UserError
 from dopepp.experiment import record
+from dopepp.experiment.compare.compare import compare_paths
 from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.methods import Cost
 from dopepp.experiment.paper_table import PaperTable
@@ -26,10 +27,9 @@ from dopepp.metrics.row import mean_row, summarise
 
 Composer = Callable[..., dict[str, Any]]
 
+FOLDER = Path(__file__).parents[2] / "conf" / "experiment"
 EXPERIMENTS = sorted(
-    path.stem
-    for path in (Path(__file__).parents[2] / "conf" / "experiment").glob("*.yaml")
-    if path.stem.startswith(("table", "fig"))
+    path.stem for path in FOLDER.glob("*.yaml") if path.stem.startswith(("table", "fig"))
 )
 LABELS = {"model=dope": "DOPE", "model=dopepp": "DOPE++"}
 
@@ -158,3 +158,27 @@ def test_every_experiment_composes(composed: Composer, experiment: str, scale: s
 def test_impossible_tables(table: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         PaperTable.of(table)
+
+
+def test_finished_runs_in_another_tables_layout(tmp_path: Path) -> None:
+    job(tmp_path / "sweep" / "0", ["model=dope"], [0.04, 0.06])
+    job(tmp_path / "sweep" / "1", ["model=dopepp"], [0.04, 0.04])
+    out = compare_paths(
+        [tmp_path / "sweep"],
+        tmp_path / "out",
+        table=FOLDER / "table6_dope_vs_dopepp.yaml",
+    )
+    assert [row["method"] for row in read_table(out)] == ["DOPE", "DOPE++", "best constant pose"]
+    assert (out / "table.md").read_text().startswith("# Table 6")
+
+
+@pytest.mark.parametrize("text", ["model: dope\n", "table: Table 6\n", "- table\n"])
+def test_an_experiment_without_a_table_is_refused_before_anything_is_written(
+    text: str, tmp_path: Path
+) -> None:
+    job(tmp_path / "0", ["model=dope"], [0.04, 0.06])
+    path = tmp_path / "experiment.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match="lays out no table"):
+        compare_paths([tmp_path / "0"], tmp_path / "out", table=path)
+    assert not (tmp_path / "out").exists()

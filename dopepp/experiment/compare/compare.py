@@ -27,6 +27,7 @@ from dopepp.experiment.compare.write import (
     accuracy_curves,
     write_comparison,
 )
+from dopepp.experiment.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.tables import Row, markdown_text
 
 PANELS_FILE: Final = "compare.png"
@@ -48,6 +49,7 @@ def compare_paths(
     out: Path | None = None,
     baseline: str | None = None,
     num_pictures: int = NUM_PICTURES,
+    table: Path | None = None,
 ) -> Path:
     """Compare run folders and return the folder with the comparison.
 
@@ -56,11 +58,13 @@ def compare_paths(
         out: Where to; a new folder under ``outputs/compare`` by default.
         baseline: Name of the method that Δ is against; ``dope`` by default, else the first one.
         num_pictures: Test images that are shown through every model.
+        table: An experiment's file, whose table the methods are laid out in as well.
 
     Raises:
-        UserError: A path holds no run, the baseline is none of the methods, or ``out`` holds a
-            comparison already.
+        UserError: A path holds no run, the baseline is none of the methods, the experiment has no
+            table, or ``out`` holds a comparison already.
     """
+    layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)
     if out is None:
         out = Path("outputs", "compare", datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f"))
@@ -68,7 +72,9 @@ def compare_paths(
         raise UserError(
             f"{out}, which holds {TABLE_FILE}", "a folder without a comparison", "choose another"
         )
-    compare_runs(runs, out, baseline, num_pictures)
+    entries = compare_runs(runs, out, baseline, num_pictures)
+    if layout is not None:
+        write_paper_table(layout, entries, out)
     return out
 
 
