@@ -142,7 +142,8 @@ def save_frame_rates(path: Path, frames: Mapping[str, Float[np.ndarray, "frames"
         name: (np.cumsum(seconds).tolist(), (1 / seconds).tolist())
         for name, seconds in frames.items()
     }
-    figure = training_figure(curves, "frames a second", "time (s)", log_y=True)
+    log_y = len(frames) > 1  # networks differ by factors; one network's frames hardly vary
+    figure = training_figure(curves, "frames a second", "time (s)", log_y)
     write_png(path, figure_image(figure))
 
 
