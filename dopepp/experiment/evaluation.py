@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from dopepp.data.bop_results import UNKNOWN_TIME, PoseResult, results_name, write_results
-from dopepp.data.rendered import MAX_ITEMS
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.png import write_png
 from dopepp.drawing.sheet import contact_sheet
@@ -35,9 +34,9 @@ from dopepp.experiment.report import Report, measure
 from dopepp.experiment.shading import check_masks, check_methods, measure_shading
 from dopepp.experiment.shading_report import record_shading
 from dopepp.experiment.sources import build_test_source, held_out_seed
-from dopepp.experiment.tuning import tune, write_tuned
+from dopepp.experiment.tuning import Silence, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.gate import check_flag, check_integer
+from dopepp.models.gate import check_flag
 from dopepp.parts.part import Part
 
 
@@ -118,15 +117,6 @@ def measure_and_record(
     return reports
 
 
-def check_num_empty(config: Mapping[str, Any]) -> int:
-    """Return the config's ``num_empty``.
-
-    Raises:
-        UserError: It is no positive number of images.
-    """
-    return check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS)
-
-
 def tune_and_record(
     estimator: PoseEstimator,
     path: Path,
@@ -134,7 +124,7 @@ def tune_and_record(
     data: Mapping[str, Any],
     seed: int,
     run_dir: Path,
-    num_empty: int,
+    silence: Silence,
 ) -> Path:
     """Tune a checkpoint, write the tuned one beside it and say what came of it.
 
@@ -145,7 +135,7 @@ def tune_and_record(
         data: The data config.
         seed: Of renders.
         run_dir: Folder that ``tuning.json`` is written to.
-        num_empty: Images without objects, for choosing and again for checking.
+        silence: Demanded where no object is.
 
     Returns:
         The tuned checkpoint.
@@ -153,7 +143,7 @@ def tune_and_record(
     Raises:
         UserError: Validation images teach nothing, see :func:`~dopepp.experiment.tuning.tune`.
     """
-    tuning = tune(estimator, data, parts, seed, num_empty)
+    tuning = tune(estimator, data, parts, seed, silence)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     record.write_json(run_dir / "tuning.json", asdict(tuning))
     display.show_tuning(tuning, tuned)
@@ -244,8 +234,8 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
         if config["ckpt_path"] is None or len(loaded) > 1:
             allowed = "one ckpt_path, and no baseline"
             raise UserError("tune=true", allowed, "tune one checkpoint at a time")
-        path, num_empty = Path(config["ckpt_path"]), check_num_empty(config)
-        tune_and_record(loaded[0], path, parts, data, seed, run_dir, num_empty)
+        path, silence = Path(config["ckpt_path"]), Silence.of(config)
+        tune_and_record(loaded[0], path, parts, data, seed, run_dir, silence)
         display.show_files(run_dir)
         return []
     names = _names(loaded, [] if file is None else [_method_name(config)])

@@ -18,11 +18,7 @@ from dopepp.data.production.stopping import Interruption
 from dopepp.errors import RunError, UserError
 from dopepp.experiment import display, readme, record
 from dopepp.experiment.build import build_system, build_trainer
-from dopepp.experiment.evaluation import (
-    check_num_empty,
-    measure_and_record,
-    tune_and_record,
-)
+from dopepp.experiment.evaluation import measure_and_record, tune_and_record
 from dopepp.experiment.hardware import estimate_training_s, keep_freed_memory
 from dopepp.experiment.images import describe_images
 from dopepp.experiment.objects import build_parts
@@ -31,6 +27,7 @@ from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
 from dopepp.experiment.resume import Difference, check_resume, remember_overrides
 from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
+from dopepp.experiment.tuning import Silence
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag, check_integer
 from dopepp.parts.part import Part
@@ -83,7 +80,7 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     _check_kept(config)
     check_flag("tune", config["tune"])
-    check_num_empty(config)
+    Silence.of(config)  # refused before the work, not after
     seed_everything(seed, verbose=False)
     keep_freed_memory()
     display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
@@ -227,7 +224,7 @@ def _measure_run(
     if config["tune"]:
         try:
             path = tune_and_record(
-                estimator, path, parts, config["data"], seed, run_dir, check_num_empty(config)
+                estimator, path, parts, config["data"], seed, run_dir, Silence.of(config)
             )
         except UserError as error:  # a network that learned little is measured as it is
             display.console.print(f"not tuned: {error}")

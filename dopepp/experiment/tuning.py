@@ -11,12 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from dopepp.data.rendered import MAX_ITEMS
 from dopepp.data.sample import Instance, Source
 from dopepp.errors import UserError
 from dopepp.experiment.sources import (
@@ -31,6 +32,7 @@ from dopepp.metrics.errors import symmetries
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.gate import check_integer, check_number
 from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import (
@@ -44,8 +46,31 @@ from dopepp.recovery.calibration import (
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.options import RecoveryOptions
 
-LOUD: Final = 0.005
-"""Share of validation images without objects on which the threshold may let a detection pass."""
+
+@dataclass(frozen=True)
+class Silence:
+    """How silent a network must be where its objects are not.
+
+    Attributes:
+        num_empty: Images without objects, for choosing the threshold and again for checking it.
+        false_positive_rate: Share of them on which the threshold may let a detection pass; 1 sets
+            no threshold.
+    """
+
+    num_empty: int = 500
+    false_positive_rate: float = 0.005
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Silence:
+        """Read the config's ``num_empty`` and ``false_positive_rate``.
+
+        Raises:
+            UserError: One of them is out of range.
+        """
+        return cls(
+            check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS),
+            check_number("false_positive_rate", config["false_positive_rate"], 0, 1),
+        )
 
 
 @dataclass(frozen=True)
@@ -112,7 +137,7 @@ def tune(
     data: Mapping[str, Any],
     parts: Sequence[Part],
     seed: int,
-    num_empty: int,
+    silence: Silence,
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
@@ -121,7 +146,7 @@ def tune(
         data: The data config.
         parts: The objects as the data have them.
         seed: Of renders.
-        num_empty: Images without objects, for choosing and again for measuring.
+        silence: Demanded where no object is.
 
     Raises:
         UserError: The network finds nothing, or everything it finds is right or wrong.
@@ -130,7 +155,7 @@ def tune(
     validation = build_validation_source(data, parts, seed)
     test = build_test_source(data, parts, seed)
     empty, empty_test = (
-        build_source_without_objects(data, parts, seed, split, num_empty)
+        build_source_without_objects(data, parts, seed, split, silence.num_empty)
         for split in ("val", "test")
     )
 
@@ -144,21 +169,24 @@ def tune(
         estimator.recovery = replace(old, min_score=0.0, distance_factor=1.0)
         factor = fit_distance_factor(*matched_poses(estimator, parts, validation))
         new = replace(old, distance_factor=factor)
-        chosen = choose(scored(new, validation), scored(new, empty))
+        chosen = choose(scored(new, validation), scored(new, empty), silence.false_positive_rate)
         new = replace(new, **chosen)  # type: ignore[arg-type]
         after = _figures(scored(new, test), scored(new, empty_test), new.min_score)
     finally:
         estimator.recovery = old
     changed = {"distance_factor": factor} | chosen
-    return Tuning(changed, before, after, (len(test), num_empty))
+    return Tuning(changed, before, after, (len(test), silence.num_empty))
 
 
-def choose(shown: Scored, empty: Scored) -> dict[str, float]:
+def choose(
+    shown: Scored, empty: Scored, false_positive_rate: float = Silence.false_positive_rate
+) -> dict[str, float]:
     """Choose the weights and the threshold.
 
     Args:
         shown: Detections on images with objects.
         empty: Detections on images without; each is wrong.
+        false_positive_rate: See :class:`Silence`.
 
     Raises:
         UserError: There is nothing to learn from.
@@ -176,7 +204,7 @@ def choose(shown: Scored, empty: Scored) -> dict[str, float]:
         )
     weights = fit_weights(features, correct)
     loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
-    allowed = int(LOUD * empty.num_images)
+    allowed = int(false_positive_rate * empty.num_images)
     # A detection passes from the threshold on, so it lies just above the first that must not.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
     named = zip(FEATURES, weights, strict=True)

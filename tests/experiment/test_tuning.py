@@ -14,8 +14,8 @@ import torch
 from dopepp.data.sample import Instance, Sample
 from dopepp.errors import UserError
 from dopepp.experiment.tuning import (
-    LOUD,
     Scored,
+    Silence,
     choose,
     matched_poses,
     score_images,
@@ -52,16 +52,28 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
     correct = np.concatenate([shown.correct, empty.correct])
     assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
     loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
-    assert loud.mean() <= 4 * LOUD
+    assert loud.mean() <= 4 * Silence.false_positive_rate
     assert options["min_score"] < 1
 
 
 def test_the_threshold_lets_no_more_pass_than_it_may() -> None:
     shown, empty = scored(4, 500), scored(5, 250, right=False)
-    options = choose(shown, empty)
-    weights = np.array([options[f"score_{name}"] for name in FEATURES])
-    loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
-    assert loud.sum() == int(LOUD * 250)
+    for rate in (0.0, 0.005, 0.1):
+        options = choose(shown, empty, rate)
+        weights = np.array([options[f"score_{name}"] for name in FEATURES])
+        loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
+        assert loud.sum() == int(rate * 250)
+    assert choose(shown, empty, 1.0)["min_score"] == 0.0
+
+
+@pytest.mark.parametrize(
+    "change", [{"num_empty": 0}, {"num_empty": 2.5}, {"false_positive_rate": 1.5}]
+)
+def test_impossible_silence_is_refused(change: dict[str, Any]) -> None:
+    allowed = {"num_empty": 500, "false_positive_rate": 0.005}
+    assert Silence.of(allowed) == Silence()
+    with pytest.raises(UserError, match=next(iter(change))):
+        Silence.of(allowed | change)
 
 
 def test_silence_needs_no_threshold() -> None:
