@@ -304,7 +304,14 @@ def test_weights_that_are_not_what_they_seem(
         PoseEstimator.load(path)
 
 
-@pytest.mark.parametrize("value", [float("nan"), -float("inf"), 3e38])
+@pytest.mark.parametrize(
+    "value",
+    [
+        float("nan"),
+        pytest.param(-float("inf"), marks=pytest.mark.slow),
+        pytest.param(3e38, marks=pytest.mark.slow),
+    ],
+)
 def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(
     value: float, content: dict[str, Any], tmp_path: Path, bounded: Callable[..., Any]
 ) -> None:
