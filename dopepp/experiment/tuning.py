@@ -7,7 +7,7 @@ on images without its objects. All go into a new checkpoint.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from dopepp.data.rendered import MAX_ITEMS
-from dopepp.data.sample import Instance, Source
+from dopepp.data.sample import Instance, Sample, Source
 from dopepp.errors import UserError
 from dopepp.experiment.sources import (
     build_source_without_objects,
@@ -215,17 +215,12 @@ def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source
     """Run an estimator over a source and judge every detection."""
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
-    for number in range(len(source)):
-        sample = source.sample(number, 0)
-        found = estimator.predict(sample.image, sample.K)
-        for part in parts:
-            own = [one for one in found if one.object == part.name]
-            true = [one for one in sample.instances if one.label == part.name]
-            num_instances += sum(one.visible_fraction >= MIN_VISIBLE_FRACTION for one in true)
-            right, judged = _judge(part, own, true)
-            for one, is_right in zip(compress(own, judged), right[judged], strict=True):
-                features = detection_features(one, part.cuboid, sample.K)
-                rows.append((features, one.score, bool(is_right), number))
+    for number, sample, part, own, true in _by_object(estimator, parts, source):
+        num_instances += sum(one.visible_fraction >= MIN_VISIBLE_FRACTION for one in true)
+        right, judged = _judge(part, own, true)
+        for one, is_right in zip(compress(own, judged), right[judged], strict=True):
+            features = detection_features(one, part.cuboid, sample.K)
+            rows.append((features, one.score, bool(is_right), number))
     return Scored(
         np.array([row[0] for row in rows]).reshape(-1, len(FEATURES)),
         np.array([row[1] for row in rows], np.float64),
@@ -241,20 +236,25 @@ def matched_poses(
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
     """Return the poses found on a source and, for each, that of the instance it found."""
     estimated, true = [np.empty((0, 4, 4))], [np.empty((0, 4, 4))]
+    for _, _, part, own, instances in _by_object(estimator, parts, source):
+        pairs = assign(part.cuboid[CENTROID], own, instances, MIN_VISIBLE_FRACTION)
+        hit = np.isfinite(pairs.scores)
+        estimated.append(pairs.T_est[hit])
+        true.append(pairs.T_gt[hit])
+    return np.concatenate(estimated), np.concatenate(true)
+
+
+def _by_object(
+    estimator: PoseEstimator, parts: Sequence[Part], source: Source
+) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
+    """Run an estimator over a source; for every image and part what was found and what is there."""
     for number in range(len(source)):
         sample = source.sample(number, 0)
         found = estimator.predict(sample.image, sample.K)
         for part in parts:
-            pairs = assign(
-                part.cuboid[CENTROID],
-                [one for one in found if one.object == part.name],
-                [one for one in sample.instances if one.label == part.name],
-                MIN_VISIBLE_FRACTION,
-            )
-            hit = np.isfinite(pairs.scores)
-            estimated.append(pairs.T_est[hit])
-            true.append(pairs.T_gt[hit])
-    return np.concatenate(estimated), np.concatenate(true)
+            own = [one for one in found if one.object == part.name]
+            true = [one for one in sample.instances if one.label == part.name]
+            yield number, sample, part, own, true
 
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
