@@ -84,6 +84,22 @@ class BackgroundCrops:
                 return self._crop(int(rng.choice(places)), size)
         return None
 
+    def largest(
+        self, size: tuple[int, int], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Return a crop of (height, width), of half that where there is none, and so on.
+
+        None where the background has no contrast at all, or no room for two pixels by two.
+        """
+        height, width = size
+        while True:
+            crop = self.draw((height, width), rng)
+            if crop is None:
+                crop = self.search((height, width), rng)
+            if crop is not None or max(height, width) == MIN_PATCH_PX:
+                return crop
+            height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
+
     def _is_free(self, size: tuple[int, int]) -> Bool[np.ndarray, "rows columns"]:
         """Tell of the top left corner of every window whether it is free of objects."""
         return np.asarray(_windows(self._integral, size) == 0)

@@ -1,7 +1,7 @@
 """Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
 
 A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
-box high and wide. The network still has to place the keypoints that the patch covers: keypoints
+box high and wide; it is smaller where the background has no such window. The network still has to place the keypoints that the patch covers: keypoints
 stay as they are, while masks and visible fractions lose the covered pixels.
 """
 
@@ -76,10 +76,9 @@ class RandomMask:
             patch = self._patch(seen, rng)
             if patch is None:
                 continue
-            rows, columns = patch
-            size = (rows.stop - rows.start, columns.stop - columns.start)
-            crop = self._crop(crops, size, rng, other)
+            crop = self._crop(crops, (_length(patch[0]), _length(patch[1])), rng, other)
             if crop is not None:
+                rows, columns = map(_middle, patch, crop.shape)
                 image[rows, columns], covered[rows, columns] = crop, True
         instances = [
             covered_instance(instance, seen, covered)
@@ -110,8 +109,11 @@ class RandomMask:
         rng: np.random.Generator,
         other: Backgrounds,
     ) -> UInt8[np.ndarray, "rows columns 3"] | None:
-        """Draw a crop from the image's background, else from another picture."""
-        crop = crops.draw(size, rng)
+        """Draw a crop from the image's background, smaller where it must be.
+
+        Only where there is no background, or one of a single colour, another picture gives it.
+        """
+        crop = crops.largest(size, rng)
         if crop is not None:
             return crop
         for _ in range(self.max_draws):
@@ -119,6 +121,16 @@ class RandomMask:
             if has_contrast(crop, self.min_contrast):
                 return crop
         return None
+
+
+def _length(patch: slice) -> int:
+    return int(patch.stop - patch.start)
+
+
+def _middle(patch: slice, length: int) -> slice:
+    """Return the middle of a patch's rows or columns."""
+    start = patch.start + (_length(patch) - length) // 2
+    return slice(start, start + length)
 
 
 def _crop_of_other(

@@ -177,13 +177,7 @@ class _Cover:
         height, width = (
             max(MIN_PATCH_PX, int(rng.uniform(*_SIDES) * extent[axis])) for axis in (0, 1)
         )
-        while True:
-            crop = crops.draw((height, width), rng)
-            if crop is None:
-                crop = crops.search((height, width), rng)
-            if crop is not None or max(height, width) == MIN_PATCH_PX:
-                return crop
-            height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
+        return crops.largest((height, width), rng)
 
     def _lay(
         self,

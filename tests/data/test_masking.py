@@ -110,6 +110,21 @@ def test_the_crop_is_a_piece_of_the_own_background() -> None:
     assert not mask[row : row + last - first, column : column + stop - start].any()
 
 
+def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken() -> None:
+    # Three columns of background are left: no patch of this part is so narrow.
+    mask = np.ones(SIZE, bool)
+    mask[:, :3] = False
+    own = {tuple(pixel) for pixel in sample_of(mask).image[~mask]}
+    for seed in range(20):
+        sample, other = sample_of(mask), Stripes()
+        result = RandomMask(1.0)(sample, np.random.default_rng(seed), other)
+        changed = (result.image != sample.image).any(axis=2)
+        assert other.calls == 0
+        assert {tuple(pixel) for pixel in result.image[changed]} <= own
+        assert result.instances[0].masked_fraction > 0
+        assert not changed[~mask].any()
+
+
 def test_a_part_that_fills_the_frame_takes_another_picture() -> None:
     sample, other = sample_of(np.ones(SIZE, bool)), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(0), other)
