@@ -5,14 +5,16 @@ To add one: a subclass of :class:`Head` in this module and one YAML file in ``co
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from typing import Final, TypeAlias, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dopepp.errors import UserError
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.models.activation import find_activation
 from dopepp.models.gate import check_flag, check_integer
@@ -31,6 +33,21 @@ _OUTPUT_STD: Final = 0.01
 give or take a tenth, and still passes a gradient on."""
 
 
+class Branch(nn.Module, ABC):
+    """Feature maps to one kind of maps: a stage's beliefs or its field."""
+
+    @property
+    @abstractmethod
+    def outputs(self) -> list[nn.Conv2d]:
+        """The convolutions that answer maps."""
+
+    @abstractmethod
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> list[Float[Tensor, "batch out_channels height width"]]:
+        """Return the branch's maps as the last; before them, what else is to be learned from."""
+
+
 class Head(nn.Module):
     """A chain of stages, each a belief branch and a field branch.
 
@@ -42,8 +59,7 @@ class Head(nn.Module):
         num_objects: Number of objects C; 9·C belief and 16·C field channels.
         activation: Name of the belief activation.
         stages: Number of stages.
-        make_branch: Called with input channels, output channels and the stage's number (from 0);
-            returns a branch, whose last convolution is its output.
+        make_branch: Called with input channels, output channels and the stage's number (from 0).
 
     Attributes:
         cell_multiple: The feature map's height and width must be multiples of this.
@@ -60,7 +76,7 @@ class Head(nn.Module):
         num_objects: int,
         activation: str,
         stages: int,
-        make_branch: Callable[[int, int, int], nn.Module],
+        make_branch: Callable[[int, int, int], Branch],
     ) -> None:
         super().__init__()
         self.activate = find_activation(activation)
@@ -79,11 +95,12 @@ class Head(nn.Module):
             (self.belief_branches, self.activate.initial_logit),
             (self.field_branches, 0.0),
         ):
-            for branch in branches:
-                _start_output(branch, bias)
+            for output in (one for branch in branches for one in cast(Branch, branch).outputs):
+                nn.init.normal_(output.weight, std=_OUTPUT_STD)
+                nn.init.constant_(cast(Tensor, output.bias), bias)
 
     def forward(self, features: Float[Tensor, "batch channels height width"]) -> list[Stage]:
-        """Return every stage's belief logits and vector field."""
+        """Return every stage's belief logits and vector field, the head's answer as the last."""
         stages: list[Stage] = []
         for belief_branch, field_branch in zip(
             self.belief_branches, self.field_branches, strict=True
@@ -93,7 +110,7 @@ class Head(nn.Module):
                 logits, field = stages[-1]
                 belief = self.activate(logits).to(features.dtype)
                 inputs = torch.cat([features, belief, field.to(features.dtype)], dim=1)
-            stages.append((belief_branch(inputs), field_branch(inputs)))
+            stages += zip(belief_branch(inputs), field_branch(inputs), strict=True)
         return stages
 
 
@@ -127,15 +144,30 @@ class Cascade(Head):
         narrow, wide = scaled_channels(128, width), scaled_channels(512, width)
         check_flag("batch_norm", batch_norm)
 
-        def make_branch(inputs: int, outputs: int, stage: int) -> nn.Module:
+        def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
             steps = [(7, narrow)] * 5 + [(1, narrow)] if stage else [(3, narrow)] * 3 + [(1, wide)]
             layers: list[nn.Module] = []
             for kernel_size, channels in steps:
                 layers.append(conv_block(inputs, channels, kernel_size, batch_norm=batch_norm))
                 inputs = channels
-            return nn.Sequential(*layers, nn.Conv2d(inputs, outputs, 1))
+            return CascadeBranch(*layers, nn.Conv2d(inputs, outputs, 1))
 
         super().__init__(in_channels, num_objects, activation, stages, make_branch)
+
+
+class CascadeBranch(nn.Sequential, Branch):
+    """One branch of a stage of DOPE's cascade: its layers in order, the last answers the maps."""
+
+    @property
+    def outputs(self) -> list[nn.Conv2d]:
+        """The last layer."""
+        return [cast(nn.Conv2d, self[-1])]
+
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> list[Float[Tensor, "batch out_channels height width"]]:
+        """Return the maps."""
+        return [super().forward(features)]  # type: ignore[no-untyped-call]
 
 
 class MultiScale(Head):
@@ -147,7 +179,10 @@ class MultiScale(Head):
         activation: Name of the belief activation.
         stages: Number of stages, 1–12.
         width: Factor on the channel counts; 1 is 128 channels.
-        batch_norm: Put batch norm behind every convolution but the last, in place of its bias.
+        batch_norm: Put batch norm behind every convolution but those of maps, in place of its bias.
+        maps: What the three scales hand to the fusion: ``plain`` for maps of 9 or 16 channels each,
+            as §3.3 has them; ``learned`` for the same, and each scale's maps are answers of their
+            own, before the fused ones, that the loss sees as well; None for features.
 
     Raises:
         UserError: An argument is out of range.
@@ -163,35 +198,47 @@ class MultiScale(Head):
         stages: int = 1,
         width: float = 1.0,
         batch_norm: bool = False,
+        maps: str | None = None,
     ) -> None:
         channels = scaled_channels(128, width)
         check_flag("batch_norm", batch_norm)
+        if maps not in (None, "plain", "learned"):
+            raise UserError(f"maps={maps!r}", "plain, learned or null", "choose one of them")
 
-        def make_branch(inputs: int, outputs: int, stage: int) -> nn.Module:
-            return MultiScaleBranch(inputs, channels, outputs, batch_norm)
+        def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
+            return MultiScaleBranch(inputs, channels, outputs, batch_norm, maps)
 
         super().__init__(in_channels, num_objects, activation, stages, make_branch)
 
 
-class MultiScaleBranch(nn.Module):
+class MultiScaleBranch(Branch):
     """One branch of a MultiScaleDOPEstage: three scales down, then top-down fusion.
 
     Down: five 3×3 convolutions at full scale, three to one half, three to one quarter (the first
     of the three with stride 2). Up: convset at a quarter, 1×1, ×2 nearest, concatenated with the
     half scale; the same again into full scale; convset; 1×1 to the maps. ReLU after every
-    convolution but the last: without one between them a convset's five would be one linear map.
+    convolution but those of maps: without one between them a convset's five would be one linear
+    map.
 
     Args:
         in_channels: Channels in.
         channels: Channels inside.
         out_channels: Channels of the maps.
         batch_norm: As in :class:`MultiScale`.
+        maps: Likewise.
     """
 
     def __init__(
-        self, in_channels: int, channels: int, out_channels: int, batch_norm: bool
+        self,
+        in_channels: int,
+        channels: int,
+        out_channels: int,
+        batch_norm: bool,
+        maps: str | None,
     ) -> None:
         super().__init__()
+        self.learned = maps == "learned"
+        scale_channels = out_channels if maps else channels
 
         def chain(inputs: int, kernel_sizes: tuple[int, ...], stride: int = 1) -> nn.Sequential:
             return nn.Sequential(
@@ -207,34 +254,40 @@ class MultiScaleBranch(nn.Module):
                 )
             )
 
+        def scale(inputs: int, length: int, stride: int = 1) -> nn.Sequential:
+            if not maps:
+                return chain(inputs, (3,) * length, stride)
+            to_maps = nn.Conv2d(channels, out_channels, 3, padding=1)
+            return nn.Sequential(*chain(inputs, (3,) * (length - 1), stride), to_maps)
+
         convset = (1, 3, 1, 1, 3)
-        self.down_full = chain(in_channels, (3,) * 5)
-        self.down_half = chain(channels, (3,) * 3, stride=2)
-        self.down_quarter = chain(channels, (3,) * 3, stride=2)
-        self.up_quarter = chain(channels, (*convset, 1))
-        self.up_half = chain(2 * channels, (*convset, 1))
-        self.up_full = chain(2 * channels, convset)
+        self.down_full = scale(in_channels, 5)
+        self.down_half = scale(scale_channels, 3, stride=2)
+        self.down_quarter = scale(scale_channels, 3, stride=2)
+        self.up_quarter = chain(scale_channels, (*convset, 1))
+        self.up_half = chain(channels + scale_channels, (*convset, 1))
+        self.up_full = chain(channels + scale_channels, convset)
         self.output = nn.Conv2d(channels, out_channels, 1)
+
+    @property
+    def outputs(self) -> list[nn.Conv2d]:
+        """The fused maps' convolution, and those of the scales' where they are learned."""
+        scales = [self.down_quarter, self.down_half, self.down_full] if self.learned else []
+        return [*(cast(nn.Conv2d, one[-1]) for one in scales), self.output]
 
     def forward(
         self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch out_channels height width"]:
+    ) -> list[Float[Tensor, "batch out_channels height width"]]:
         """Return the maps; height and width must be multiples of 4."""
         full = self.down_full(features)
         half = self.down_half(full)
-        top = self.up_quarter(self.down_quarter(half))
+        quarter = self.down_quarter(half)
+        top = self.up_quarter(quarter)
         top = self.up_half(torch.cat([_double(top), half], dim=1))
         top = self.up_full(torch.cat([_double(top), full], dim=1))
-        return self.output(top)  # type: ignore[no-any-return]
+        sides = [_double(_double(quarter)), _double(half), full] if self.learned else []
+        return [*sides, self.output(top)]
 
 
 def _double(maps: Tensor) -> Tensor:
     return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
-
-
-def _start_output(branch: nn.Module, bias: float) -> None:
-    """Let a branch's output convolution, its last, answer little more than its bias."""
-    output = [layer for layer in branch.modules() if isinstance(layer, nn.Conv2d)][-1]
-    nn.init.normal_(output.weight, std=_OUTPUT_STD)
-    if output.bias is not None:
-        nn.init.constant_(output.bias, bias)

@@ -53,6 +53,41 @@ def test_every_combination_gives_stages_of_the_right_shape(
             assert torch.isfinite(field).all()
 
 
+@pytest.mark.parametrize("stages", [1, 2])
+def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, stages):
+    head = {"head_width": 0.125, "head_stages": stages, "head_batch_norm": True}
+    network = build_network(make_spec(backbone_width=0.125, **head, head_maps="learned"))
+    images = torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8)
+    answers = network(images)
+    assert len(answers) == 4 * stages  # a quarter, a half, full scale, fused
+    for number, (belief, field) in enumerate(answers):
+        assert belief.shape == (2, 9, 8, 12)
+        assert field.shape == (2, 16, 8, 12)
+        # Untrained, each answers the bias, give or take little: an empty map.
+        assert (network.activate(belief) - network.activate(belief.new_tensor(
+            network.activate.initial_logit))).abs().max() < 0.1  # fmt: skip
+        factor = (4, 2, 1, 1)[number % 4]
+        coarse = belief[:, :, ::factor, ::factor]
+        repeated = coarse.repeat_interleave(factor, 2).repeat_interleave(factor, 3)
+        torch.testing.assert_close(belief, repeated)
+    # The loss of the coarsest maps alone reaches no convolution of the fusion.
+    answers[0][0].sum().backward()
+    branch = network.head.belief_branches[0]
+    assert branch.down_quarter[-1].weight.grad is not None
+    assert all(one.grad is None for one in branch.up_quarter.parameters())
+
+
+def test_maps_of_nine_channels_cost_less_than_features(make_spec):
+    counts = {
+        maps: num_parameters(build_network(make_spec(head_batch_norm=True, head_maps=maps)))
+        for maps in (None, "plain", "learned")
+    }
+    assert counts["plain"] == counts["learned"] == 5_152_694
+    assert counts[None] == 6_573_419
+    with pytest.raises(UserError, match="maps='all'; allowed: plain, learned or null"):
+        build_network(make_spec(head_maps="all"))
+
+
 def test_full_size_input_gives_52_by_52_cells(make_spec):
     network = build_network(make_spec(backbone_width=0.125, head_width=0.125)).eval()
     with torch.no_grad():
