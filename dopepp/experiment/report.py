@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from dopepp.drawing.sheet import Tile
 from dopepp.experiment.methods import Cost, MeasuredPose, Method, image_id
 from dopepp.experiment.test_set import Fingerprint
 from dopepp.metrics.pose import MEAN, PoseMetrics
-from dopepp.metrics.row import PoseRow
+from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.models.cost import network_cost
 from dopepp.models.spec import build_network
 
@@ -95,6 +95,37 @@ class Report:
             diameters=dict(record.get("diameters", {})),
             test_set=record.get("test_set", ""),
         )
+
+    @classmethod
+    def joined(cls, reports: Sequence[Report]) -> Report:
+        """Return the results of several networks, one a part, as those of one method.
+
+        Args:
+            reports: Of networks that differ in nothing but their parts; no part occurs twice.
+        """
+        reports = sorted(reports, key=lambda report: list(report.rows))
+        first = reports[0]
+        known = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
+        return replace(
+            first,
+            rows=_joined_rows([report.rows for report in reports]),
+            references={
+                reference: _joined_rows([report.references[reference] for report in reports])
+                for reference in first.references
+            },
+            errors={name: e for report in reports for name, e in report.errors.items()},
+            cost=replace(first.cost, ms_per_frame=statistics.mean(known) if known else None),
+            num_images=sum(report.num_images for report in reports),
+            rotation_deg={name: e for one in reports for name, e in one.rotation_deg.items()},
+            diameters={name: d for report in reports for name, d in report.diameters.items()},
+            test_set=" ".join(report.test_set for report in reports),
+        )
+
+
+def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
+    """Put the rows of several tables into one and average them anew."""
+    rows = {name: row for group in groups for name, row in group.items() if name != MEAN}
+    return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
 
 
 _FIELDS: Final = (

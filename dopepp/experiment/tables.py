@@ -10,7 +10,7 @@ from typing import Final
 Row = dict[str, str]
 """Heading to text."""
 
-_TEXTS: Final = ("method", "object", "overrides", "folder")
+_TEXTS: Final = ("method", "object", "measure", "overrides", "folder")
 """Headings of what is no number."""
 
 

@@ -1,9 +1,10 @@
-"""From run folders to the lines of a comparison: seeds of one method together, each with a name."""
+"""From run folders to the lines of a comparison: a method's seeds and parts together, and names."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from dopepp.experiment.compare.entry import Entry
@@ -17,7 +18,9 @@ _LONGEST_NAME: Final = 60
 def group(runs: Sequence[Run]) -> list[Entry]:
     """Put runs that differ in nothing but the seed into one entry, in order of the first one.
 
-    They must have been measured on the same test set. A run without a result stands alone.
+    They must have been measured on the same test set. Networks of other parts, trained alike with
+    the same seeds, join the entry: one network a part, as the paper has it. A run without a result
+    stands alone.
     """
     entries: list[Entry] = []
     for run in runs:
@@ -29,8 +32,44 @@ def group(runs: Sequence[Run]) -> list[Entry]:
         if run.report is not None:
             entry.reports.append(run.report)
             entry.seeds.append(run.seed)
+    entries = _joined(entries)
     _name(entries)
     return entries
+
+
+def _joined(entries: Sequence[Entry]) -> list[Entry]:
+    """Join entries that differ in nothing but their parts."""
+    methods: list[list[Entry]] = []
+    for entry in entries:
+        method = next((one for one in methods if _is_of_another_part(entry, one)), None)
+        if method is None:
+            methods.append([entry])
+        else:
+            method.append(entry)
+    return [method[0] if len(method) == 1 else _join(method) for method in methods]
+
+
+def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
+    first = method[0]
+    if not entry.reports or not first.reports or not entry.runs[0].recipe:
+        return False
+    known = {name for one in method for name in one.reports[0].errors}
+    return (
+        entry.runs[0].recipe == first.runs[0].recipe
+        and entry.reports[0].name == first.reports[0].name
+        and None not in entry.seeds
+        and set(entry.seeds) == set(first.seeds)
+        and known.isdisjoint(entry.reports[0].errors)
+    )
+
+
+def _join(method: Sequence[Entry]) -> Entry:
+    by_seed = [dict(zip(entry.seeds, entry.reports, strict=True)) for entry in method]
+    return replace(
+        method[0],
+        reports=[Report.joined([one[seed] for one in by_seed]) for seed in method[0].seeds],
+        runs=[run for entry in method for run in entry.runs],
+    )
 
 
 def _belongs(run: Run, entry: Entry) -> bool:
@@ -57,10 +96,9 @@ def _name(entries: Sequence[Entry]) -> None:
     Where these are too many, and where two entries would have one name, the folder's name serves.
     """
     overrides = [
-        [text for text in entry.runs[0].overrides
-         if not (text.startswith("seed=") and len(entry.runs) > 1)]
+        [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]
         for entry in entries
-    ]  # fmt: skip
+    ]
     for entry, mine in zip(entries, overrides, strict=True):
         differing = [text for text in mine if not all(text in other for other in overrides)]
         rest = [text for text in differing if not text.startswith("model=")]

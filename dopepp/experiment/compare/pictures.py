@@ -36,14 +36,33 @@ def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[li
     """Predict on the first test images of the first method whose images can be opened.
 
     Args:
-        entries: The methods, the baseline first; of several seeds the first run is shown.
+        entries: The methods, the baseline first; of several seeds the first run is shown, of
+            several networks, one a part, one after the other.
         num: Test images.
 
     Returns:
         Row by row the tiles of an image, one per method; and why there are none, where they are
         missing.
     """
-    models = [_load(entry) for entry in entries]
+    kinds = list(
+        dict.fromkeys(_parts(run) for entry in entries for run in entry.runs if run.report)
+    )
+    tiles, notes = [], []
+    for number, parts in enumerate(kinds or [()]):
+        share = num // max(1, len(kinds)) + (number < num % max(1, len(kinds)))
+        rows, note = _rows([_load(entry, parts) for entry in entries], share)
+        tiles += rows
+        notes += [note] if note else []
+    return tiles, " ".join(notes)
+
+
+def _parts(run: Run) -> tuple[str, ...]:
+    """Return the names of the parts that a run was measured on."""
+    return tuple(sorted(run.report.errors)) if run.report is not None else ()
+
+
+def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
+    """Return the tiles of some images, one per method; and why there are none."""
     samples, reasons = [], []
     for model in models:
         if model.run is None or model.estimator is None:
@@ -55,17 +74,17 @@ def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[li
             reasons.append(f"{model.name}: {error}")
     if not samples:
         why = "; ".join(reasons or [f"{one.name}: {one.reason}" for one in models])
-        return [], f"No pictures of the same test images. {why}"
+        return [], f"No pictures of the same test images. {why}" if num else ""
     first = next(model for model in models if model.estimator is not None)
     return [_tile(model, sample, BLUE if model is first and len(models) > 1 else YELLOW)
             for sample in samples for model in models], ""  # fmt: skip
 
 
-def _load(entry: Entry) -> _Model:
-    """Load a method's checkpoint, or say why that cannot be."""
+def _load(entry: Entry, parts: tuple[str, ...]) -> _Model:
+    """Load a method's checkpoint of some parts, or say why that cannot be."""
     if not entry.runs:
         return _Model(entry.name, reason="there is no checkpoint of it")
-    run = entry.runs[0]
+    run = next((one for one in entry.runs if _parts(one) == parts), entry.runs[0])
     if run.checkpoint is None or not run.checkpoint.is_file():
         return _Model(entry.name, run, reason=entry.failure or f"no file {run.checkpoint}")
     try:

@@ -40,8 +40,8 @@ class Run:
         seed: Of the training; None where unknown.
         config: The resolved config, empty where there is none.
         checkpoint: Its best checkpoint, None where unknown.
-        recipe: Everything but the seed that decides about the result, as one text; empty where
-            unknown.
+        recipe: Everything but seed and parts that decides about the result, as one text; empty
+            where unknown.
         cost: What its network costs; None where unknown.
         pruned: Whether it has no result because a search stopped it.
     """
@@ -95,13 +95,13 @@ def read_run(folder: Path) -> Run:
     checkpoint = folder / record.BEST_CHECKPOINT
     if report is not None and "checkpoint" in report.details:
         checkpoint = folder / str(report.details["checkpoint"])
-    training, overrides = config, _overrides(folder)
+    training, overrides = config, overrides_of(folder)
     configs = [config] if config else []
     if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
         checkpoint = Path(str(config["ckpt_path"]))
         trained = checkpoint.parent.parent
         training = _mapping(trained / record.CONFIG_FILE)
-        overrides = [*_overrides(trained), *overrides]
+        overrides = [*overrides_of(trained), *overrides]
         configs = [config, training] if training else []
     seed = training.get("seed")
     return Run(
@@ -131,11 +131,14 @@ def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report |
 
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
-    """Return configs as one text, without the seed and without what only names places."""
+    """Return configs as one text, without seed and parts and without what only names places."""
     kept = [
         {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}
         for config in configs
     ]
+    for config in kept:
+        if isinstance(config.get("data"), dict):
+            config["data"] = {k: v for k, v in config["data"].items() if k != "parts"}
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
@@ -183,7 +186,8 @@ def _cost(folder: Path) -> Cost:
         raise _FailedError(f"{COST_FILE} is not of this version: {error}") from error
 
 
-def _overrides(folder: Path) -> list[str]:
+def overrides_of(folder: Path) -> list[str]:
+    """Return what a run was overridden with, without Hydra's own and what only names places."""
     path = folder / _HYDRA / "overrides.yaml"
     try:
         listed = read_yaml(path) if path.is_file() else []

@@ -83,7 +83,7 @@ def headline(table: Sequence[Line]) -> list[Row]:
                 column = columns[name]
                 row[column.heading] = with_deviation(line, column)
                 if name in _WITH_INTERVAL:
-                    row[f"Δ {column.heading}"] = _interval(line, column)
+                    row[f"Δ {column.heading}"] = interval(line, column)
         row |= _costs(line, full_size=False)
         rows.append(row)
     return rows
@@ -142,7 +142,7 @@ def _numbers(difference: Difference, column: Column) -> tuple[str, str, str]:
     return value, low, high
 
 
-def _interval(line: Line, column: Column) -> str:
+def interval(line: Line, column: Column) -> str:
     """Return Δ with its interval and, where it may be chance, that word."""
     if column.field not in line.differences:
         return ""

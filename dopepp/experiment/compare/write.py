@@ -19,6 +19,7 @@ from dopepp.experiment.tables import csv_text, markdown_text
 
 TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"
+CURVES_FILE: Final = "compare_auc.png"
 
 _TOO_WIDE: Final = ("Δ rotation °", "parameters", "GMACs")
 """What a terminal has no room for."""
@@ -51,7 +52,9 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
     write_whole(folder / TEXT_FILE, text.encode())
     curves = accuracy_curves(entries)
     if curves:
-        save_accuracy_curves(folder / "compare_auc", curves, title="ADD, all objects")
+        save_accuracy_curves(
+            (folder / CURVES_FILE).with_suffix(""), curves, title="ADD, all objects"
+        )
     return text
 
 
