@@ -1,8 +1,9 @@
 """Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
 
 A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
-box high and wide; it is smaller where the background has no such window. The network still has to place the keypoints that the patch covers: keypoints
-stay as they are, while masks and visible fractions lose the covered pixels.
+box high and wide; it is smaller where the background has no such window. The network still has to
+place the keypoints that the patch covers: keypoints stay as they are, while masks and visible
+fractions lose the covered pixels.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +16,6 @@ from dopepp.experiment import display
 from dopepp.experiment.devices import num_processes
 from dopepp.experiment.gates import (
     CALLBACKS,
-    LOGGERS,
     optimizer_factory,
     scheduler_factory,
 )
@@ -25,11 +23,11 @@ from dopepp.experiment.hardware import choose_precision
 from dopepp.inference.estimator import parse_recovery
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
-from dopepp.models.gate import TARGET, check_integer, check_number
+from dopepp.models.gate import check_integer, check_number
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.training.averaging import AveragedWeights
-from dopepp.training.loggers import GuardedLogger, MetricsTable
+from dopepp.training.loggers import MetricsTable
 from dopepp.training.processes import WatchedDDP
 from dopepp.training.profiling import make_profiler
 from dopepp.training.progress import RunProgress
@@ -120,14 +118,18 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 
 
 def build_trainer(
-    config: Mapping[str, Any], run_dir: Path, further: Sequence[Callback] = ()
+    config: Mapping[str, Any],
+    run_dir: Path,
+    further: Sequence[Callback] = (),
+    trackers: Sequence[Logger] = (),
 ) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks and loggers.
+    """Build Lightning's trainer with the config's callbacks.
 
     Args:
         config: The whole config.
         run_dir: Folder that everything is written to.
         further: Callbacks besides the config's.
+        trackers: Loggers besides the CSV table that is always on.
     """
     options = dict(config["trainer"])
     check_integer("trainer.max_epochs", options["max_epochs"], 1, _MAX_EPOCHS)
@@ -149,15 +151,11 @@ def build_trainer(
         callbacks.append(AveragedWeights(config["ema"]))
     options["profiler"] = make_profiler(options["profiler"], run_dir)
     table = MetricsTable(run_dir / "metrics.csv")
-    loggers: list[Logger] = [table]
-    for node in config.get("logger", {}).values():
-        LOGGERS.resolve(node.get(TARGET))  # a wrong name is a mistake, not a logger's failure
-        loggers.append(GuardedLogger(partial(LOGGERS.build, node, save_dir=str(run_dir))))
     try:
         return Trainer(
             **{**options, "accelerator": accelerator},
             default_root_dir=run_dir,
-            logger=loggers,
+            logger=[table, *trackers],
             callbacks=[*callbacks, *further, RunProgress()],
             # A checkpoint is never newer than the table.
             plugins=[AtomicCheckpointIO(prepare=table.write, folder=run_dir)],

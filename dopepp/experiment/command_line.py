@@ -95,7 +95,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     except KeyboardInterrupt:
         if not remote.is_remote(str(HydraConfig.get().launcher._target_)):
             # What is finished: Hydra ends without its hook.
-            compare_jobs(Path(HydraConfig.get().sweep.dir), _plain(config)["table"])
+            compare_jobs(Path(HydraConfig.get().sweep.dir), _plain(config))
         raise
     except PrunedError as end:
         display.console.print(f"pruned {end}")

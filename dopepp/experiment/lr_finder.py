@@ -98,7 +98,7 @@ def _sweep_config(config: Mapping[str, Any], num_steps: int) -> dict[str, Any]:
         "num_nodes": 1,
         "strategy": "auto",
     }
-    return {**config, "trainer": trainer, "callbacks": {}, "logger": {}, "ema": None}
+    return {**config, "trainer": trainer, "callbacks": {}, "ema": None}
 
 
 def _report(sweep: RateSweep, run_dir: Path) -> Suggestion | None:

@@ -27,12 +27,14 @@ from dopepp.experiment.report import FULL_SIZE_COST, Report, full_size_cost
 from dopepp.experiment.resume import Difference, check_resume, remember_overrides
 from dopepp.experiment.shading import check_masks
 from dopepp.experiment.sources import build_datamodule, held_out_seed
+from dopepp.experiment.tracking import log_report, tracked
 from dopepp.experiment.tuning import Silence
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag, check_integer
 from dopepp.parts.part import Part
 from dopepp.training.checkpoints import FOLDER, check_room, newest_checkpoint, saved_step
 from dopepp.training.early_stopping import EarlyStop
+from dopepp.training.loggers import GuardedLogger
 from dopepp.training.processes import ProcessDiedError
 from dopepp.training.profiling import FOLDER as PROFILE
 from dopepp.training.profiling import profile_rows
@@ -60,7 +62,8 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     """
     explanation = readme.RunReadme(config, run_dir)
     try:
-        report = _train(config, run_dir, explanation)
+        with tracked(config, run_dir) as trackers:
+            report = _train(config, run_dir, explanation, trackers)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
         advice = _advice(run_dir)
@@ -76,7 +79,12 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
     return report
 
 
-def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme) -> Report:
+def _train(
+    config: dict[str, Any],
+    run_dir: Path,
+    explanation: readme.RunReadme,
+    trackers: Sequence[GuardedLogger],
+) -> Report:
     seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
     _check_kept(config)
     check_flag("tune", config["tune"])
@@ -98,7 +106,8 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
     }
     system = build_system(config, parts, fingerprint, images)
     resume_from, changes = _resume_path(config, system)
-    trainer = build_trainer(config, run_dir)  # whatever it refuses, nothing is written yet
+    # Whatever it refuses, nothing is written yet.
+    trainer = build_trainer(config, run_dir, trackers=trackers)
     weights = system.network.state_dict().values()
     check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
     display.show_config(config)
@@ -110,6 +119,8 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
         if config["resume"] is not None:
             remember_overrides(run_dir)
         explanation.begin()
+        for tracker in trackers:
+            tracker.log_hyperparams(dict(config))
     display.show_sources(datamodule.summary())
     _announce_duration(config, system, datamodule, trainer)
     try:
@@ -129,6 +140,7 @@ def _train(config: dict[str, Any], run_dir: Path, explanation: readme.RunReadme)
         raise SystemExit(0)  # the first process alone measures and reports
     _say_how_it_ended(trainer, run_dir)
     report = _measure_run(config, parts, run_dir, trainer, protocols)
+    log_report(trackers, report, run_dir)
     if not config["keep_checkpoints"]:
         shutil.rmtree(run_dir / FOLDER)
         display.console.print("everything has run; the checkpoints are removed")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from dopepp.experiment.compare.runs import read_run
 from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.readme import write_sweep_readme
+from dopepp.experiment.tracking import log_comparison
 
 
 class CompareJobs(Callback):
@@ -34,27 +36,29 @@ class CompareJobs(Callback):
         Raises:
             SystemExit: With code 1 if a job failed.
         """
-        table = config.get("table")
-        if not compare_jobs(
-            Path(str(config.hydra.sweep.dir)),
-            None if table is None else OmegaConf.to_container(table, resolve=True),
-        ):
+        plain = {
+            key: OmegaConf.to_container(config[key], resolve=True)
+            for key in ("table", "logger")
+            if config.get(key) is not None
+        }
+        if not compare_jobs(Path(str(config.hydra.sweep.dir)), plain):
             raise SystemExit(1)
 
 
-def compare_jobs(folder: Path, table: Any = None) -> bool:
+def compare_jobs(folder: Path, config: Mapping[str, Any]) -> bool:
     """Compare the jobs that a sweep's folder holds; return whether none has failed.
 
     Args:
         folder: The sweep's folder.
-        table: The config's ``table``, plain values; None for none.
+        config: The resolved config, of which ``table`` and ``logger`` are read.
     """
     jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
     if not jobs:
         return True
     entries = compare_runs([read_run(job) for job in jobs], folder)
-    if table is not None:
-        write_paper_table(PaperTable.of(table), entries, folder)
+    if config.get("table") is not None:
+        write_paper_table(PaperTable.of(config["table"]), entries, folder)
+    log_comparison(config.get("logger"), folder)
     write_sweep_readme(folder, _command(), {job.name: _state(job) for job in jobs})
     display.console.print(f"comparison in {folder}")
     return not any(entry.failure and not entry.pruned for entry in entries)

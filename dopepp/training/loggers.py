@@ -6,11 +6,14 @@ import csv
 import io
 import logging
 from argparse import Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers import Logger
+import numpy as np
+from jaxtyping import UInt8
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.drawing.png import write_whole
@@ -157,3 +160,68 @@ class GuardedLogger(Logger):
         inner = self.inner
         if inner is not None:
             self.guard(lambda: inner.finalize(status))
+
+    def log_picture(
+        self, name: str, image: UInt8[np.ndarray, "height width 3"], step: int | None = None
+    ) -> None:
+        """Hand an RGB picture to TensorBoard or Weights & Biases."""
+        inner = self.inner
+        if isinstance(inner, TensorBoardLogger):
+            self.guard(lambda: inner.experiment.add_image(name, image, step, dataformats="HWC"))
+        elif isinstance(inner, WandbLogger):
+            self.guard(lambda: inner.log_image(name, [image], step=step))
+
+    def log_table(self, name: str, rows: Sequence[Mapping[str, str]], text: str) -> None:
+        """Hand a table over: its rows to Weights & Biases, its Markdown text to TensorBoard.
+
+        Args:
+            name: What it is called there.
+            rows: Heading to text; the first one has all headings.
+            text: The same as Markdown.
+        """
+        inner = self.inner
+        if isinstance(inner, TensorBoardLogger):
+            self.guard(lambda: inner.experiment.add_text(name, text))
+        elif isinstance(inner, WandbLogger):
+            columns = list(rows[0])
+            cells = [[row.get(heading, "") for heading in columns] for row in rows]
+            self.guard(lambda: inner.log_table(name, columns, cells))
+
+    def log_summary(self, figures: Mapping[str, float]) -> None:
+        """Hand over what a run ends with: to Weights & Biases as the run's summary."""
+        inner = self.inner
+        if isinstance(inner, WandbLogger):
+            self.guard(lambda: inner.experiment.summary.update(dict(figures)))
+        elif inner is not None:
+            self.guard(lambda: inner.log_metrics(dict(figures)))
+
+    def close(self, failed: bool) -> None:
+        """End the run there: what is logged after this would be another one's.
+
+        Args:
+            failed: How the run ended.
+        """
+        if isinstance(self.inner, WandbLogger):
+            self._failed = False  # a run that failed midway has to end as well
+            self.guard(lambda: _finish_wandb(failed))
+        else:
+            self.finalize("failed" if failed else "success")
+
+
+def _finish_wandb(failed: bool) -> None:
+    """End the run of Weights & Biases that is open; without one, do nothing.
+
+    Where its service has died, so has the run; the next one starts a service of its own.
+
+    Raises:
+        OSError: The service has died.
+    """
+    import wandb  # takes a second, and few runs need it
+
+    try:
+        wandb.finish(exit_code=int(failed))
+    except OSError:
+        with suppress(OSError):
+            wandb.teardown(exit_code=1)
+        wandb.run = None
+        raise

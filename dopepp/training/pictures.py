@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
 from lightning.pytorch import Trainer
-from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 
 from dopepp.training.loggers import GuardedLogger
 
@@ -20,15 +18,8 @@ _log = logging.getLogger(__name__)
 def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
     for logger in trainer.loggers:
-        if isinstance(logger, GuardedLogger) and logger.inner is not None:
-            logger.guard(partial(_send, logger.inner, name, image, trainer.global_step))
-
-
-def _send(logger: Logger, name: str, image: UInt8[np.ndarray, "height width 3"], step: int) -> None:
-    if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_image(name, image, step, dataformats="HWC")
-    elif isinstance(logger, WandbLogger):
-        logger.log_image(name, [image], step=step)
+        if isinstance(logger, GuardedLogger):
+            logger.log_picture(name, image, trainer.global_step)
 
 
 @contextmanager

@@ -1,0 +1,174 @@
+"""What Weights & Biases and TensorBoard hold of runs and multiruns, read back from their files."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from wandb.proto import wandb_internal_pb2
+
+Runner = Callable[..., Any]
+
+BLOCK = 32768
+"""Bytes of a block of LevelDB's log format, which the files have behind seven bytes of their own;
+a record's header is checksum, length and type (1: whole, 2–4: first, middle and last piece)."""
+HEADER = struct.Struct("<IHB")
+
+
+def records(path: Path) -> Iterator[Any]:
+    """Read a ``.wandb`` file back."""
+    content, place, pieces = path.read_bytes(), 7, b""
+    assert content.startswith(b":W&B")
+    while place + HEADER.size <= len(content):
+        left = BLOCK - place % BLOCK
+        if left < HEADER.size:
+            place += left
+            continue
+        _, length, kind = HEADER.unpack_from(content, place)
+        pieces += content[place + HEADER.size : place + HEADER.size + length]
+        place += HEADER.size + length
+        if kind in (1, 4):
+            record = wandb_internal_pb2.Record()  # type: ignore[attr-defined]
+            record.ParseFromString(pieces)
+            pieces = b""
+            yield record
+
+
+@dataclass
+class Tracked:
+    """What one file says of its run."""
+
+    name: str = ""
+    group: str = ""
+    job_type: str = ""
+    config: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    exit_code: int | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> Tracked:
+        found = cls()
+        for record in records(path):
+            kind = record.WhichOneof("record_type")
+            if kind == "run":
+                found.name, found.group = record.run.display_name, record.run.run_group
+                found.job_type = record.run.job_type
+                found.config |= {one.key: one.value_json for one in record.run.config.update}
+            elif kind == "config":
+                found.config |= {
+                    one.key or one.nested_key[0]: one.value_json for one in record.config.update
+                }
+            elif kind == "summary":
+                found.summary |= {
+                    one.key or one.nested_key[0]: json.loads(one.value_json)
+                    for one in record.summary.update
+                }
+            elif kind == "history":
+                found.history.append(
+                    {
+                        one.key or "/".join(one.nested_key): json.loads(one.value_json)
+                        for one in record.history.item
+                    }
+                )
+            elif kind == "exit":
+                found.exit_code = record.exit.exit_code
+        return found
+
+
+def only(folder: Path) -> Tracked:
+    (path,) = folder.glob("wandb/offline-run-*/*.wandb")
+    return Tracked.read(path)
+
+
+def sweep_of(output_dir: Path) -> Path:
+    (sweep,) = (output_dir / "compare").iterdir()
+    return sweep
+
+
+def test_every_job_is_a_run_and_the_comparison_one_more(
+    command: Runner, tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = command(
+        "train.py", "-m", *tiny, "model=dope,dopepp", "logger=wandb", f"output_dir={tmp_path}"
+    )
+    assert done.code == 0, done.err[-3000:]
+    assert "already in progress" not in done.err
+    sweep = sweep_of(tmp_path)
+    for job, model in (("0", "dope"), ("1", "dopepp")):
+        run = only(sweep / job)
+        assert run.name.startswith(f"{model} virtual")
+        assert (run.group, run.job_type, run.exit_code) == (sweep.name, "train", 0)
+        assert json.loads(run.config["model"])["name"] == model
+        steps = [one["trainer/global_step"] for one in run.history if "train/loss" in one]
+        assert steps == sorted(steps)
+        assert len(steps) == 2  # of this job's two steps, and no other's
+        measured = json.loads((sweep / job / "metrics.json").read_text())
+        assert run.summary["test/pivconnector/auc_10cm"] == pytest.approx(
+            measured["objects"]["pivconnector"]["auc_10cm"]
+        )
+        assert run.summary["reference/best constant pose/pivconnector/add_01d"] == pytest.approx(
+            measured["references"]["best constant pose"]["pivconnector"]["add_01d"]
+        )
+        pictures = {
+            one.name.split("_")[0]
+            for one in (sweep / job).glob("wandb/offline-run-*/files/media/images/test/*")
+        }
+        assert pictures == {"overlay", "auc"}
+    comparison = only(sweep)
+    assert (comparison.name, comparison.job_type) == ("comparison", "comparison")
+    assert (comparison.group, comparison.exit_code) == (sweep.name, 0)
+    (file,) = sweep.glob("wandb/offline-run-*/files/media/table/compare_*.table.json")
+    table = json.loads(file.read_text())
+    assert table["columns"][:2] == ["method", "object"]
+    assert [row[0] for row in table["data"]][:2] == ["dope", "dopepp"]
+    pictures = sweep.glob("wandb/offline-run-*/files/media/images/*.png")
+    assert {one.name.rsplit("_", 2)[0] for one in pictures} == {
+        "compare_auc", "compare_pictures", "compare_loss",
+    }  # fmt: skip
+
+
+def test_a_service_that_dies_in_the_middle_ends_nothing(
+    start: Callable[..., subprocess.Popen[str]], tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    arguments = [*tiny, "trainer.max_epochs=2", "logger=wandb", f"output_dir={tmp_path}"]
+    with start("train.py", "-m", *arguments, "model/attention=none,cbam") as process:
+        until = time.monotonic() + 200
+        while not list(tmp_path.glob("compare/*/0/metrics.csv")):  # after the first epoch
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        killed = subprocess.run(["pkill", "-9", "-P", str(process.pid), "wandb-core"], check=False)
+        out, err = process.communicate(timeout=200)
+    assert killed.returncode == 0
+    assert process.returncode == 0, err[-3000:]
+    assert "a logger failed and is off for the rest of the run" in err
+    sweep = sweep_of(tmp_path)
+    assert all((sweep / job / "metrics.json").is_file() for job in "01")
+    assert "comparison" in out
+    # The next job starts a service of its own.
+    assert only(sweep / "1").exit_code == 0
+
+
+def test_tensorboard_holds_the_same(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> None:
+    done = call(
+        "train.py", "-m", *tiny, "model=dopepp", "logger=tensorboard", f"output_dir={tmp_path}"
+    )
+    assert done.code == 0, done.err[-3000:]
+    sweep = sweep_of(tmp_path)
+    events = EventAccumulator(str(sweep / "0" / "tensorboard")).Reload()
+    tags = events.Tags()
+    assert {"train/loss", "test/pivconnector/add_01d"} <= set(tags["scalars"])
+    assert {"test/overlay", "test/auc", "val/overlay"} <= set(tags["images"])
+    comparison = EventAccumulator(str(sweep / "tensorboard")).Reload()
+    (text,) = comparison.Tensors("compare/text_summary")
+    assert b"| dopepp" in text.tensor_proto.string_val[0]
+    assert "compare_auc" in comparison.Tags()["images"]
