@@ -1,4 +1,4 @@
-"""How long it takes from maps to poses: one thread, 50×50 maps, process time.
+"""How long it takes from maps to poses: one thread, process time; 50×50 maps, and real networks'.
 
 python benchmarks/decode.py
 """
@@ -14,12 +14,19 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from dopepp.data.rendered import RenderedSource
+from dopepp.experiment.timing import likely_maps
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.inference.estimator import Maps, PoseEstimator
 from dopepp.maps import MapGeometry, encode, find_peaks
+from dopepp.parts.catalogue import BUILTIN
 from dopepp.recovery import recover
+from dopepp.virtual import PRESETS, Factory
 
 CELLS, STRIDE, REPEATS = 50, 8, 100
+IMAGES = 12
+RELEASED = {"pivconnector": "quickstart", "pivconnector_wide": "wide", "servoholder": "quickstart"}
 K = camera_matrix(600, 600, 199.5, 199.5)
 CRACKER_BOX = cuboid_keypoints(
     np.array([-0.036, -0.082, -0.1065]), np.array([0.036, 0.082, 0.1065])
@@ -60,12 +67,45 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
-    rng = np.random.default_rng(parser.parse_args().seed)
+    seed = parser.parse_args().seed
+    rng = np.random.default_rng(seed)
     torch.set_num_threads(1)
     head = ("instances", "found", "recover ms", "peaks ms", "filter ms", "ratio")
     print("".join(f"{word:>11}" for word in head))
     for count in (1, 3, 10):
         print("".join(f"{value:>11}" for value in row(count, *scene(count, rng))))
+    print("\nTest images: on the network's own maps, and on true ones with the noise of job=cost")
+    print(f"{'network':>20}{'own ms':>10}{'peaks':>8}{'noisy ms':>10}{'peaks':>8}")
+    for name, preset in RELEASED.items():
+        own, own_peaks, noisy, noisy_peaks = released(name, preset, seed)
+        print(f"{name:>20}{own:10.2f}{own_peaks:8.1f}{noisy:10.2f}{noisy_peaks:8.1f}")
+
+
+def released(name: str, preset: str, seed: int) -> tuple[float, ...]:
+    """Time recovery behind a released network: medians and mean peaks of both kinds of maps."""
+    estimator = PoseEstimator.load(f"pretrained/{name}")
+    geometry = MapGeometry(estimator.network.stride, estimator.recovery.sigma)
+    part = BUILTIN[estimator.parts[0].name]()
+    source = RenderedSource(Factory([part], PRESETS[preset], seed), IMAGES, "test")
+    generator = torch.Generator().manual_seed(seed)
+    rows = []
+    for index in range(IMAGES):
+        sample = source.sample(index)  # of the network's own size: nothing to resize
+        own = estimator.maps(sample.image)
+        noisy = likely_maps(sample, estimator, geometry, generator)
+        rows.append([*decoding(own, sample.K, estimator), *decoding(noisy, sample.K, estimator)])
+    own_ms, own_peaks, noisy_ms, noisy_peaks = np.array(rows).T
+    return np.median(own_ms), own_peaks.mean(), np.median(noisy_ms), noisy_peaks.mean()
+
+
+def decoding(maps: Maps, K: np.ndarray, estimator: PoseEstimator) -> tuple[float, int]:
+    """Time recovery from an image's maps, and count their peaks."""
+    options, stride = estimator.recovery, estimator.network.stride
+    found = find_peaks(
+        maps[0][None], MapGeometry(stride, options.sigma), options.peak_threshold
+    ).found
+    spent = milliseconds(lambda: recover(*maps, estimator.cuboids, K, stride, **vars(options)))
+    return spent, int(found.sum())
 
 
 def row(count: int, belief: torch.Tensor, field: torch.Tensor) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Curves: share of poses below a threshold, and what changed over training.
+"""Curves: share of poses below a threshold.
 
 Figures are objects (:class:`matplotlib.figure.Figure`), never pyplot's global state, so threads
 and tests cannot see each other's. ``figure_image`` turns one into pixels.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -88,30 +88,6 @@ def save_accuracy_curves(
     write_whole(path.with_name(path.name + ".csv"), text.getvalue().encode())
     figure = accuracy_figure(curves, max_threshold, title)
     write_png(path.with_name(path.name + ".png"), figure_image(figure))
-    return figure
-
-
-def training_figure(
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    y_label: str,
-    x_label: str = "step",
-    log_y: bool = False,
-) -> Figure:
-    """Draw values over training or time, e.g. losses (paper Fig. 12).
-
-    Args:
-        curves: For each name the steps and the values at them; NaN leaves a gap.
-        y_label: What is drawn, with its unit.
-        x_label: What counts the progress.
-        log_y: Logarithmic values; those that are not positive leave a gap.
-    """
-    figure, axes = figure_with_axes(x_label, y_label)
-    for name, (steps, values) in curves.items():
-        axes.plot(np.asarray(steps, np.float64), np.asarray(values, np.float64), label=name)
-    if log_y:
-        axes.set_yscale("log", nonpositive="mask")
-    if curves:
-        axes.legend()
     return figure
 
 

@@ -35,12 +35,14 @@ class Line:
         x: Progress, ascending.
         values: Of each run; NaN where there is none.
         colour: Matplotlib's name of a colour.
+        dashed: Whether it is what another line is compared with.
     """
 
     name: str
     x: Float[np.ndarray, "points"]
     values: Float[np.ndarray, "runs points"]
     colour: str
+    dashed: bool = False
 
 
 def lines_figure(lines: Sequence[Line], x_label: str, y_label: str, log_y: bool = False) -> Figure:
@@ -61,8 +63,8 @@ def lines_figure(lines: Sequence[Line], x_label: str, y_label: str, log_y: bool 
         marker = "o" if len(mean) <= _SMOOTHING else ""
         if len(mean) > _SMOOTHING and len(line.values) == 1:
             axes.plot(line.x, mean, color=line.colour, alpha=0.2)
-        axes.plot(line.x, smoothed(mean), color=line.colour, label=line.name, marker=marker,
-                  markersize=3)  # fmt: skip
+        axes.plot(line.x, smoothed(mean), "--" if line.dashed else "-", color=line.colour,
+                  label=line.name, marker=marker, markersize=3)  # fmt: skip
     positive = [(line.values[np.isfinite(line.values)] > 0).all() for line in lines]
     if log_y and lines and all(positive):
         axes.set_yscale("log")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +25,7 @@ from dopepp.inference.estimator import parse_recovery
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.gate import check_integer, check_number
+from dopepp.models.network import PoseNetwork
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.training.averaging import AveragedWeights
@@ -57,25 +59,12 @@ def build_system(
         fingerprint: Of the data, for the checkpoint.
         images: What the images are, by split, for the checkpoint.
     """
-    model, maps = config["model"], config["maps"]
-    for group, lowest in (("maps", _MIN_CELLS), ("recovery", 0)):
-        for name, value in config[group].items():
-            check_number(f"{group}.{name}", value, lowest, _MAX_THRESHOLD)
-    loss = LOSSES.build(model["loss"])
-    spec = network_spec(model, loss.activation, len(parts))
-    network = build_network(spec)
-    geometry = MapGeometry(network.stride, maps["sigma"], maps["field_radius"])
-    recovery = parse_recovery({"sigma": geometry.sigma, **config["recovery"]})
-    description = Checkpoint(
-        spec=spec,
-        state_dict={},
-        parts=parts,
-        input_size=tuple(config["data"]["input_size"]),
-        stride=network.stride,
-        sigma=geometry.sigma,
-        recovery=vars(recovery),
+    loss = LOSSES.build(config["model"]["loss"])
+    network, description = build_untrained(config, parts)
+    description = replace(
+        description,
         data={
-            "name": model["name"],
+            "name": config["model"]["name"],
             "seed": config["seed"],
             "config": config["data"],
             **({} if images is None else {"images": images}),
@@ -88,8 +77,8 @@ def build_system(
         network,
         loss,
         parts,
-        geometry,
-        recovery,
+        map_geometry(config["maps"], network.stride),
+        parse_recovery(description.recovery),
         optimizer_factory(config["optimizer"]),
         scheduler_factory(config["scheduler"]),
         description.to_payload(),
@@ -98,10 +87,44 @@ def build_system(
     )
 
 
-def network_spec(model: Mapping[str, Any], activation: str, num_objects: int) -> dict[str, Any]:
-    """Return the network's spec: the chosen components, what the loss and the objects decide."""
-    spec = {name: model[name] for name in ("backbone", "attention", "head")}
-    return {**spec, "activation": activation, "num_objects": num_objects}
+def build_untrained(config: Mapping[str, Any], parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
+    """Build the chosen network and what it is to be trained for, its data left out.
+
+    Its spec is the chosen components, and what the loss and the objects decide.
+
+    Raises:
+        UserError: A choice or a threshold is wrong.
+    """
+    model = config["model"]
+    spec = {
+        **{name: model[name] for name in ("backbone", "attention", "head")},
+        "activation": LOSSES.build(model["loss"]).activation,
+        "num_objects": len(parts),
+    }
+    network = build_network(spec)
+    sigma = map_geometry(config["maps"], network.stride).sigma
+    for name, value in config["recovery"].items():
+        check_number(f"recovery.{name}", value, 0, _MAX_THRESHOLD)
+    return network, Checkpoint(
+        spec=spec,
+        state_dict={},
+        parts=parts,
+        input_size=tuple(config["data"]["input_size"]),
+        stride=network.stride,
+        sigma=sigma,
+        recovery=vars(parse_recovery({"sigma": sigma, **config["recovery"]})),
+    )
+
+
+def map_geometry(maps: Mapping[str, Any], stride: int) -> MapGeometry:
+    """Return how target maps are drawn, from the config's ``maps``.
+
+    Raises:
+        UserError: A peak or a disc is too narrow, too wide, or no number.
+    """
+    for name, value in maps.items():
+        check_number(f"maps.{name}", value, _MIN_CELLS, _MAX_THRESHOLD)
+    return MapGeometry(stride, maps["sigma"], maps["field_radius"])
 
 
 def _start_from(network: torch.nn.Module, path: Path) -> None:

@@ -143,11 +143,7 @@ class PoseSystem(LightningModule):
         return self._draw(batch, keypoints)
 
     def _draw(self, batch: Batch, keypoints: Float[Tensor, "batch instances 9 2"]) -> Targets:
-        height, width = batch.images.shape[-2:]
-        map_size = height // self.geometry.stride, width // self.geometry.stride
-        seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
-        index = torch.where(seen, batch.object_index, PADDING)
-        return encode(keypoints, index, len(self.parts), map_size, self.geometry)
+        return draw_maps(batch, keypoints, len(self.parts), self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss and log it with its terms."""
@@ -242,6 +238,27 @@ class PoseSystem(LightningModule):
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
+
+
+def draw_maps(
+    batch: Batch,
+    keypoints: Float[Tensor, "batch instances 9 2"],
+    num_objects: int,
+    geometry: MapGeometry,
+) -> Targets:
+    """Draw the maps of what a network is asked for: the instances that a metric counts, too.
+
+    Args:
+        batch: Images and how much of each instance is visible.
+        keypoints: Of the instances, pixels; those of the batch, or of poses that look alike.
+        num_objects: Number of objects.
+        geometry: Stride, peak width and disc radius of the maps.
+    """
+    height, width = batch.images.shape[-2:]
+    map_size = height // geometry.stride, width // geometry.stride
+    seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
+    index = torch.where(seen, batch.object_index, PADDING)
+    return encode(keypoints, index, num_objects, map_size, geometry)
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """How targets are turned and where they stand: the typed choices a preset makes.
 
-To add one, write a frozen dataclass with a ``draw`` method like those below and name it in a
-preset.
+To add one, write a frozen dataclass with a ``draw`` method, a placement on :class:`Placement`, and
+name it in a preset.
 """
 
 from __future__ import annotations
@@ -58,6 +58,23 @@ class Placement(Protocol):
             rotated_hull: The object's extreme vertices, already turned into camera axes, metres.
         """
 
+    def redraw(
+        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """Return what to try after a place at which the object is not well in the frame.
+
+        What a placement keeps of such a place has the distribution it was drawn from, however often
+        the camera does not see the object there.
+
+        Args:
+            rng: Source of randomness.
+            place: The last place tried, metres.
+
+        Returns:
+            Another place for the same orientation; None to draw both anew.
+        """
+        return None
+
 
 @dataclass(frozen=True)
 class FreeTurning:
@@ -99,8 +116,12 @@ class FacingTurning:
 
 
 @dataclass(frozen=True)
-class OffsetPlacement:
+class OffsetPlacement(Placement):
     """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
+
+    Where the camera does not see all of the box, a place is moved along the optical axis until it
+    does: offsets across the axis and orientations keep their uniform distributions, and the depth
+    is uniform over those at which the object is seen there.
 
     Attributes:
         distance: Of the box's centre from the camera, metres.
@@ -132,11 +153,20 @@ class OffsetPlacement:
     ) -> Float[np.ndarray, "3"]:
         """Return the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
-        return np.array([x, y, self.distance + rng.uniform(-self.axial, self.axial)])
+        return np.array([x, y, self._draw_depth(rng)])
+
+    def redraw(
+        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return the same offsets across the optical axis at another depth, metres."""
+        return np.array([place[0], place[1], self._draw_depth(rng)])
+
+    def _draw_depth(self, rng: np.random.Generator) -> float:
+        return self.distance + rng.uniform(-self.axial, self.axial)
 
 
 @dataclass(frozen=True)
-class DistancePlacement:
+class DistancePlacement(Placement):
     """Uniform in depth and, laterally, over the image.
 
     Attributes:
@@ -175,7 +205,7 @@ class DistancePlacement:
 
 
 @dataclass(frozen=True)
-class FillPlacement:
+class FillPlacement(Placement):
     """The part fills a drawn share of the image and lies inside it.
 
     The share is the larger of bounding-box width over image width and bounding-box height over

@@ -17,7 +17,6 @@ from dopepp.drawing.curves import (
     accuracy_curve,
     accuracy_figure,
     save_accuracy_curves,
-    training_figure,
 )
 from dopepp.drawing.png import figure_image, write_png, write_whole
 from dopepp.metrics.functional import auc
@@ -75,21 +74,6 @@ def test_png_and_csv_hold_the_curves(tmp_path: Path) -> None:
 def test_figures_without_curves_are_drawn() -> None:
     assert figure_image(accuracy_figure({})).ndim == 3
     assert figure_image(accuracy_figure({"none": np.array([])})).ndim == 3
-    assert figure_image(training_figure({}, "loss")).ndim == 3
-
-
-def test_training_curves_hold_their_values_and_survive_nan() -> None:
-    figure = training_figure(
-        {"train": ([0, 1, 2], [1.0, math.nan, 0.1]), "validation": ([0, 2], [2.0, 0.0])},
-        "loss",
-        log_y=True,
-    )
-    axes = figure.axes[0]
-    assert axes.get_yscale() == "log"
-    assert axes.get_ylabel() == "loss"
-    assert [line.get_label() for line in axes.lines] == ["train", "validation"]
-    assert axes.lines[1].get_ydata().tolist() == [2.0, 0.0]
-    assert figure_image(figure).std() > 5
 
 
 def test_no_global_state_of_pyplot_is_touched() -> None:

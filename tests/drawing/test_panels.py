@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -36,6 +38,12 @@ def test_a_long_line_is_drawn_pale_and_smooth() -> None:
     pale, smooth = lines_figure([line(noisy)], "step", "loss").axes[0].lines
     assert np.std(np.asarray(smooth.get_ydata())) < 0.5 * np.std(np.asarray(pale.get_ydata()))
     assert [one.get_label() for one in (pale, smooth)][1] == "dope"
+
+
+def test_what_is_compared_with_is_dashed() -> None:
+    one = line(np.ones((1, 3)))
+    figure = lines_figure([replace(one, dashed=True), one], "step", "loss")
+    assert [drawn.get_linestyle() for drawn in figure.axes[0].lines] == ["--", "-"]
 
 
 @settings(max_examples=30, deadline=None)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import kstest
 
 from dopepp.errors import UserError
 from dopepp.geometry.camera import project, resize_camera, transform
@@ -102,6 +103,35 @@ def test_paper_poses(parts: list[Part]) -> None:
     tilts = np.array([angles(s.objects[0].T_cam_obj[:3, :3])[1] for s in drawn])
     assert tilts.min() < 30
     assert tilts.max() > 150
+
+
+def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(
+    parts: list[Part],
+) -> None:
+    preset = PRESETS["paper"]
+    factory = Factory(parts, preset.resized(80, 60), seed=90125)
+    T = np.array([factory.scene(0, index).objects[0].T_cam_obj for index in range(600)])
+    x, y, z = T[:, :3, 3].T
+    for aside in (x, y):
+        assert kstest(np.abs(aside) / 0.15, "uniform").pvalue > 0.05
+        assert np.abs(aside).mean() == pytest.approx(0.075, abs=0.003)
+    # A sphere's area is uniform over its height.
+    assert kstest((T[:, 2, 2] + 1) / 2, "uniform").pvalue > 0.05
+    # At 90° the picture shows the box's whole width where y is small and z large: no skew there.
+    whole = (np.abs(y) < 0.05) & (np.abs(x) < 0.05)
+    assert z[whole].mean() == pytest.approx(0.2, abs=0.02)
+    assert z.mean() == pytest.approx(0.219, abs=0.005)
+
+
+def test_a_place_that_no_depth_suits_is_given_up(box_part: Part) -> None:
+    assert box_part.mesh is not None
+    large = make_part("large", replace(box_part.mesh, vertices=box_part.mesh.vertices * 3))
+    preset = replace(PRESETS["paper"].resized(80, 60), placement=OffsetPlacement(lateral=0.25))
+    factory = Factory([large], preset, seed=0)
+    places = np.array([factory.scene(0, n).objects[0].T_cam_obj[:3, 3] for n in range(20)])
+    assert (
+        np.abs(places[:, 1]) < 0.225
+    ).all()  # of the drawn ones, a tenth is never in the picture
 
 
 def test_ycb_distances(box_part: Part) -> None:
