@@ -18,6 +18,7 @@ from dopepp.experiment import display, record
 from dopepp.experiment.breakdown import record_breakdown
 from dopepp.experiment.chosen_data import chosen_data, trained_on
 from dopepp.experiment.compare.write import compare_reports
+from dopepp.experiment.condition_report import record_condition
 from dopepp.experiment.methods import (
     EstimatorMethod,
     FileMethod,
@@ -31,8 +32,7 @@ from dopepp.experiment.pass_rates import reported_rates
 from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.readme import write_job_readme
 from dopepp.experiment.report import Report, measure
-from dopepp.experiment.shading import check_masks, check_methods, measure_shading
-from dopepp.experiment.shading_report import record_shading
+from dopepp.experiment.shading import SHADING, check_masks, measure_shading
 from dopepp.experiment.sources import build_test_source, held_out_seed
 from dopepp.experiment.tuning import Silence, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
@@ -84,7 +84,7 @@ def measure_and_record(
         **files,
     }
     if protocols.shading:
-        check_methods(methods)
+        SHADING.check_methods(methods)
         check_masks(source)
     samples = (source.sample(index, 0) for index in range(len(source)))
     measured = measure(methods, samples, num_pictures)
@@ -112,7 +112,7 @@ def measure_and_record(
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
     if protocols.shading:
         shaded = measure_shading(methods, source, protocols.shading, seed, reports, num_pictures)
-        record_shading(run_dir, *shaded, rates)
+        record_condition(run_dir, SHADING, *shaded, rates)
     display.show_files(run_dir)
     return reports
 

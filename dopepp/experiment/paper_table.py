@@ -23,7 +23,7 @@ from dopepp.experiment.compare.entry import Entry
 from dopepp.experiment.compare.table import Line, with_deviation
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_frame_rates
 from dopepp.experiment.pass_rates import ADD_5CM, ADD_10CM, heading
-from dopepp.experiment.shading_report import SHADING_FILE
+from dopepp.experiment.shading import SHADING
 from dopepp.experiment.tables import Row, csv_text, markdown_text
 from dopepp.experiment.yaml_file import read_yaml
 from dopepp.metrics.functional import wilson_interval
@@ -170,7 +170,7 @@ def _shading_rows(table: PaperTable, entries: Sequence[Entry], folder: Path) -> 
     panels: dict[str, dict[str, RateCurve]] = {}
     for measure in (table.pass_field, "add_01d"):
         for entry in entries:
-            curve = _shading_curve([run.folder / SHADING_FILE for run in entry.runs], measure)
+            curve = _shading_curve([run.folder / SHADING.table_file for run in entry.runs], measure)
             if curve is None:
                 rows.append(_failed(table, entry))
                 continue
@@ -178,7 +178,7 @@ def _shading_rows(table: PaperTable, entries: Sequence[Entry], folder: Path) -> 
             rows.append({_METHOD: table.label(entry), "measure": heading(measure), **texts})
             panels.setdefault(heading(measure), {})[table.label(entry)] = curve
     if panels:
-        figure = rates_figure(panels, "share of the visible area covered (%)", len(panels))
+        figure = rates_figure(panels, SHADING.axis, len(panels))
         write_png(folder / "table_shading.png", figure_image(figure))
     return rows
 
