@@ -4,6 +4,7 @@ import hydra
 from omegaconf import DictConfig
 
 from dopepp.experiment.command_line import entry, run_job
+from dopepp.experiment.protocols import SHORT_NAMES
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
@@ -15,4 +16,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    entry(main, open_nodes=["data", "virtual"])
+    entry(main, open_nodes=["data", "virtual"], short_names=SHORT_NAMES)

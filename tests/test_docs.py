@@ -15,6 +15,7 @@ import typer.main
 import yaml
 
 from dopepp.cli import app
+from dopepp.experiment.protocols import SHORT_NAMES
 from dopepp.virtual.presets import PRESETS
 
 ROOT: Final = Path(__file__).parents[1]
@@ -156,6 +157,9 @@ def test_options_of_training_and_evaluation_exist(path: Path) -> None:
             overrides = [word for word in words if re.match(r"[\w./]+(=|$)", word)]
         else:
             continue
+        if words[1:2] == ["evaluate.py"]:
+            overrides = [re.sub(r"^\w+", lambda key: SHORT_NAMES.get(key[0], key[0]), one)
+                         for one in overrides]  # fmt: skip
         problems = [problem for one in overrides if (problem := option_problem(one))]
         # A guide may tell its reader to write the file.
         bad += [problem for problem in problems if f"`{problem.removeprefix('no ')}`" not in text]

@@ -6,6 +6,7 @@ two of them. Only training images change with the epoch.
 
 from __future__ import annotations
 
+import math
 from typing import Final, Literal
 
 import numpy as np
@@ -29,17 +30,26 @@ class RenderedSource:
         num_items: Images of an epoch.
         split: Which of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
         name: Name of the source.
+        scale: How many times as large the parts appear: the camera of the same scenes, moved (see
+            :mod:`dopepp.virtual.approach`).
 
     Raises:
-        ValueError: ``num_items`` is not in 1 … 10⁹.
+        ValueError: ``num_items`` is not in 1 … 10⁹, or ``scale`` is not positive and finite.
     """
 
     def __init__(
-        self, factory: Factory, num_items: int, split: Split = "train", name: str = "virtual"
+        self,
+        factory: Factory,
+        num_items: int,
+        split: Split = "train",
+        name: str = "virtual",
+        scale: float = 1.0,
     ) -> None:
         if not 1 <= num_items <= MAX_ITEMS:
             raise ValueError(f"num_items must be in 1 … {MAX_ITEMS}, got {num_items}")
-        self.factory, self.split, self.name = factory, split, name
+        if not 0 < scale < math.inf:
+            raise ValueError(f"scale must be positive and finite, got {scale}")
+        self.factory, self.split, self.name, self.scale = factory, split, name, scale
         self._num_items = num_items
 
     def __len__(self) -> int:
@@ -55,7 +65,7 @@ class RenderedSource:
         if not 0 <= index < self._num_items:
             raise IndexError(f"item {index} of {self._num_items}")
         epoch = epoch if self.split == "train" else 0
-        rendered = self.factory.render(epoch, FIRST_INDEX[self.split] + index)
+        rendered = self.factory.render(epoch, FIRST_INDEX[self.split] + index, self.scale)
         return rendered_sample(rendered, self.name, f"{self.split}/{epoch}/{index}")
 
     def contains(self, label: str) -> bool:
@@ -64,7 +74,7 @@ class RenderedSource:
 
     def describe(self) -> list[SourceInfo]:
         """Return the range, the factory's settings and the parts' hashes."""
-        identity = {
+        identity: dict[str, object] = {
             "split": self.split,
             "seed": self.factory.seed,
             "preset": repr(self.factory.preset),
@@ -73,6 +83,8 @@ class RenderedSource:
             "parts": {part.name: part.mesh_hash for part in self.factory.parts},
             "negatives": {part.name: part.mesh_hash for part in self.factory.negatives},
         }
+        if self.scale != 1:  # what was rendered before there were scales keeps its identity
+            identity["scale"] = self.scale
         return [SourceInfo(self.name, self._num_items, identity)]
 
 

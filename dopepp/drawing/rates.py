@@ -36,6 +36,8 @@ def rates_figure(
     x_label: str,
     columns: int,
     edges: Float[np.ndarray, "edges"] | None = None,
+    *,
+    ratio: bool = False,
 ) -> Figure:
     """Draw panels row by row, each with a line and a band of confidence for every method.
 
@@ -44,6 +46,8 @@ def rates_figure(
         x_label: The quantity with its unit.
         columns: Panels in a row.
         edges: Where bins end, marked on the axis; None for none.
+        ratio: Whether the quantity is a ratio: its axis is logarithmic, marked where it was
+            measured.
 
     Raises:
         ValueError: There is no panel or no column.
@@ -56,6 +60,11 @@ def rates_figure(
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         _draw_panel(axes, title, curves, x_label, edges)
+        if ratio:
+            measured = sorted({float(x) for curve in curves.values() for x in curve.x})
+            axes.set_xscale("log")
+            axes.set_xticks(measured, [f"{x:g}" for x in measured])
+            axes.minorticks_off()
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     return figure

@@ -30,7 +30,7 @@ def chosen_data(config: Mapping[str, Any], stored: object, checkpoint: str) -> d
     data = dict(given) if whole else _changed(base, given, "data")
     data["test"] = {"renderer": None, "cache": "none", **(data.get("test") or {})}
     how_to_render = config.get("virtual") or {}
-    if how_to_render or base.get("virtual") is not None or _are_renders(data):
+    if how_to_render or base.get("virtual") is not None or are_renders(data):
         data["virtual"] = _chosen_virtual(how_to_render, base.get("virtual"), checkpoint)
     return data
 
@@ -48,7 +48,7 @@ def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
     return {"eval_seed": description.get("seed", 0), **config}
 
 
-def _are_renders(data: Mapping[str, Any]) -> bool:
+def are_renders(data: Mapping[str, Any]) -> bool:
     """Tell whether the test images are rendered."""
     return data.get("root") is None or data["test"]["renderer"] is not None
 

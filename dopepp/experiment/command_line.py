@@ -13,7 +13,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -139,19 +139,25 @@ def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
         )
 
 
-def entry(main: Callable[[], object], open_nodes: Sequence[str] = ()) -> None:
+def entry(
+    main: Callable[[], object],
+    open_nodes: Sequence[str] = (),
+    short_names: Mapping[str, str] | None = None,
+) -> None:
     """Run an entry point and exit with its code; a user's mistake is printed as one line.
 
     Args:
         main: The function under ``@hydra.main``.
         open_nodes: Nodes whose keys are not in ``conf/`` but checked later, so that they can be
             set without Hydra's ``+``: ``virtual.scene`` takes any field of a preset.
+        short_names: What options may be called instead of their names.
     """
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     remote.configure_logging()
     try:
-        arguments = [_opened(text, open_nodes) for text in sys.argv[1:]]
+        named = [_named(text, short_names or {}) for text in sys.argv[1:]]
+        arguments = [_opened(text, open_nodes) for text in named]
         begun = slurm.begun_run(arguments)
         if begun is not None:
             arguments.append(f"resume={begun}")
@@ -185,6 +191,12 @@ def _exit(line: str, code: int) -> None:
     display.console.file.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)
+
+
+def _named(argument: str, short_names: Mapping[str, str]) -> str:
+    """Call an option by its name."""
+    key, equals, value = argument.partition("=")
+    return f"{short_names[key]}{equals}{value}" if key in short_names else argument
 
 
 def _opened(argument: str, open_nodes: Sequence[str]) -> str:

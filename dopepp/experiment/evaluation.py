@@ -18,6 +18,7 @@ from dopepp.experiment import display, record
 from dopepp.experiment.breakdown import record_breakdown
 from dopepp.experiment.chosen_data import chosen_data, trained_on
 from dopepp.experiment.compare.write import compare_reports
+from dopepp.experiment.condition_report import record_condition
 from dopepp.experiment.methods import (
     EstimatorMethod,
     FileMethod,
@@ -31,9 +32,13 @@ from dopepp.experiment.pass_rates import reported_rates
 from dopepp.experiment.protocols import Protocols
 from dopepp.experiment.readme import write_job_readme
 from dopepp.experiment.report import Report, measure
-from dopepp.experiment.shading import check_masks, check_methods, measure_shading
-from dopepp.experiment.shading_report import record_shading
-from dopepp.experiment.sources import build_test_source, held_out_seed
+from dopepp.experiment.scale import SCALE, measure_scales
+from dopepp.experiment.shading import SHADING, check_masks, measure_shading
+from dopepp.experiment.sources import (
+    build_scaled_test_source,
+    build_test_source,
+    held_out_seed,
+)
 from dopepp.experiment.tuning import Silence, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.gate import check_flag
@@ -84,8 +89,11 @@ def measure_and_record(
         **files,
     }
     if protocols.shading:
-        check_methods(methods)
+        SHADING.check_methods(methods)
         check_masks(source)
+    if protocols.scales:
+        SCALE.check_methods(methods)
+    scaled = {one: build_scaled_test_source(data, parts, seed, one) for one in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
     measured = measure(methods, samples, num_pictures)
     for file in files.values():
@@ -112,7 +120,10 @@ def measure_and_record(
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
     if protocols.shading:
         shaded = measure_shading(methods, source, protocols.shading, seed, reports, num_pictures)
-        record_shading(run_dir, *shaded, rates)
+        record_condition(run_dir, SHADING, *shaded, rates)
+    if scaled:
+        levels = measure_scales(methods, scaled, measured, num_pictures)
+        record_condition(run_dir, SCALE, *levels, rates)
     display.show_files(run_dir)
     return reports
 
@@ -229,7 +240,7 @@ def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
     if check_flag("tune", config["tune"]):
         if protocols:
             raise UserError(
-                "tune=true with shading or by", "one of the two", "tune first, then measure"
+                "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
             )
         if config["ckpt_path"] is None or len(loaded) > 1:
             allowed = "one ckpt_path, and no baseline"

@@ -24,7 +24,7 @@ from dopepp.experiment.compare.runs import Run
 from dopepp.experiment.compare.table import Line, interval, with_deviation
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_frame_rates
 from dopepp.experiment.pass_rates import heading
-from dopepp.experiment.shading_report import SHADING_FILE
+from dopepp.experiment.shading import SHADING
 from dopepp.experiment.tables import Row
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN
@@ -168,7 +168,7 @@ def shading_rows(table: Layout, methods: Mapping[str, Entry], folder: Path) -> l
                     rows.append({**head, _METHOD: f"{label}, {_PAPER}", **texts})
                 panels.setdefault(f"{name}: {heading(field)}", {})[label] = _curve(rates)
     if panels:
-        figure = rates_figure(panels, "share of the visible area covered (%)", 2)
+        figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
     return rows
 
@@ -177,7 +177,7 @@ def _shading(runs: Sequence[Run]) -> dict[str, dict[str, _Rates]]:
     """Return what runs have measured, by object and field; of one network a part, the mean, too."""
     found: dict[str, dict[str, _Rates]] = {}
     for run in runs:
-        for row in _read_csv(run.folder / SHADING_FILE):
+        for row in _read_csv(run.folder / SHADING.table_file):
             for field in (key for key in row if key in _COLUMNS and row[key]):
                 by_share = found.setdefault(row["object"], {}).setdefault(field, {})
                 seeds = by_share.setdefault(float(row["share"]), {})

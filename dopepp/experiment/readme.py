@@ -45,6 +45,8 @@ FILES: Final = {
     "val_belief.png": "their belief maps: strongest corner and centroid",
     "val_auc.png": "their errors (numbers in `val_auc.csv`)",
     "shading.png": "pass rate with parts of the object covered (`shading.csv`)",
+    "scale.png": "pass rate with the camera nearer or farther (`scale.csv`)",
+    "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
     "compare.md": "the methods side by side (numbers in `compare.csv`)",
     "lr_finder.png": "loss against learning rate (numbers in `lr_finder.csv`)",
     "cost.json": "parameters, operations, and times from picture to poses and of the network alone",
@@ -60,7 +62,7 @@ FILES: Final = {
 
 _PICTURES: Final = (
     "overlay.png", "auc.png", "val_overlay.png", "val_belief.png", "lr_finder.png",
-    "frame_rate.png", "shading.png",
+    "frame_rate.png", "shading.png", "scale.png", "scale_examples.png",
 )  # fmt: skip
 
 

@@ -34,15 +34,15 @@ def training_renders(data: Mapping[str, Any], parts: Sequence[Part], seed: int) 
 
 
 def held_out_renders(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split, scale: float = 1.0
 ) -> DescribedSource:
-    """Render a range that no other split uses, at its native size."""
+    """Render a range that no other split uses, at its native size, with parts of any scale."""
     renderer, cache = data["virtual"]["renderer"], "none"
     if split == "test":
         renderer, cache = data["test"]["renderer"] or renderer, data["test"]["cache"]
     factory = _factory(data, parts, choose_preset(data), seed, renderer)
     name = "virtual" if renderer == "raster" else renderer
-    source = RenderedSource(factory, data[f"num_{split}"], split, name)
+    source = RenderedSource(factory, data[f"num_{split}"], split, name, scale)
     return kept(source, data, cache, None)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -12,56 +11,27 @@ from dopepp.data.sample import Instance, Sample, Source
 from dopepp.data.shading import TOLERANCE, Shaded, shade
 from dopepp.drawing.sheet import Tile
 from dopepp.errors import UserError
-from dopepp.experiment.methods import FileMethod, ImageId, Method, image_id
+from dopepp.experiment.condition import MAX_EXAMPLES, Condition, Level
+from dopepp.experiment.methods import ImageId, Method, image_id
 from dopepp.experiment.report import Report
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION, PoseMetrics
-from dopepp.metrics.row import PoseRow
-
-_MAX_EXAMPLES: Final = 4
-"""Images on the sheet; each is shown once per share."""
 
 _MARGIN: Final = 0.3
 """Around the objects on the sheet, as a share of their extent."""
 
 
-@dataclass
-class ShadedRows:
-    """What was measured at one share.
+SHADING: Final = Condition(
+    name="shading",
+    axis="share of the visible area covered (%)",
+    level="share",
+    form="{:g} %",
+    introduction="""# Shading
 
-    Attributes:
-        share: What was asked for.
-        rows: A row per object and their mean, by method.
-        reached: The share that was covered of each instance that counts; NaN where it has no mask.
-    """
-
-    share: float
-    rows: dict[str, dict[str, PoseRow]]
-    reached: list[float] = field(default_factory=list)
-
-    @property
-    def num_outside(self) -> int:
-        """Instances whose share is further than the tolerance from the asked one, or unknown."""
-        return sum(not abs(one - self.share) <= TOLERANCE for one in self.reached)
-
-    @property
-    def mean_reached(self) -> float | None:
-        """The mean share that was covered; None where none is known."""
-        known = [one for one in self.reached if np.isfinite(one)]
-        return float(np.mean(known)) if known else None
-
-
-def check_methods(methods: Mapping[str, Method]) -> None:
-    """Make sure that every method can be run on other images than it was run on.
-
-    Raises:
-        UserError: One of them is a file of poses.
-    """
-    for name, method in methods.items():
-        if isinstance(method, FileMethod):
-            raise UserError(
-                f"shading with results of {name}, which were made on images without patches",
-                "checkpoints (ckpt_path, baseline)", "leave out shading or results",
-            )  # fmt: skip
+Columns: the share of every object's visible pixels that patches of the image's own background
+cover (paper Table 3). What counts is decided before the shading.""",
+    images="images with patches",
+    per_unit=100,
+)
 
 
 def check_masks(source: Source) -> None:
@@ -88,8 +58,8 @@ def measure_shading(
     shares: Sequence[float],
     seed: int,
     unmasked: Sequence[Report],
-    num_examples: int = _MAX_EXAMPLES,
-) -> tuple[list[ShadedRows], list[Tile]]:
+    num_examples: int = MAX_EXAMPLES,
+) -> tuple[list[Level], list[Tile]]:
     """Measure every method at every share.
 
     The ground truth is that of the image as it came: an instance counts by what is visible of it
@@ -114,10 +84,11 @@ def measure_shading(
         for accumulator, one in zip(accumulators, shaded, strict=True):
             accumulator.add(sample, one, image_id(sample, index))
         num_shown = len(tiles) // (len(shares) + 1)
-        if num_shown < min(num_examples, _MAX_EXAMPLES) and any(map(_counts, sample.instances)):
+        if num_shown < min(num_examples, MAX_EXAMPLES) and any(map(_counts, sample.instances)):
             tiles += _examples(sample, shaded)
-    unshaded = ShadedRows(0.0, {report.name: report.rows for report in unmasked})
-    return [unshaded, *(one.rows() for one in accumulators)], tiles
+    rows = {report.name: report.rows for report in unmasked}
+    unshaded = Level(0.0, rows, {"share_reached": 0.0, "num_outside_tolerance": 0})
+    return [unshaded, *(one.level() for one in accumulators)], tiles
 
 
 class _Accumulator:
@@ -140,10 +111,22 @@ class _Accumulator:
             poses, _ = method.detect(shaded.sample, image)
             self._metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
 
-    def rows(self) -> ShadedRows:
+    def level(self) -> Level:
         """Sum up."""
         rows = {name: metrics.compute() for name, metrics in self._metrics.items()}
-        return ShadedRows(self._share, rows, self._reached)
+        # A share that is not known (NaN) is near no other.
+        outside = [one for one in self._reached if not abs(one - self._share) <= TOLERANCE]
+        known = [one for one in self._reached if np.isfinite(one)]
+        facts = {
+            "share_reached": float(np.mean(known)) if known else None,
+            "num_outside_tolerance": len(outside),
+        }
+        note = (
+            f"At {SHADING.heading(self._share)}, {len(outside)} of {len(self._reached)} instances "
+            f"are not within {100 * TOLERANCE:g} points of it: no mask, or no background to cover "
+            "them with."
+        )
+        return Level(self._share, rows, facts, note if outside else "")
 
 
 def _counts(instance: Instance) -> bool:
@@ -157,7 +140,9 @@ def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
     for one in shaded:
         known = [f"{100 * r:.1f}" for r in sorted(r for r in one.reached if r is not None)]
         covered = " … ".join(dict.fromkeys([*known[:1], *known[-1:]])) or "nothing"
-        tiles.append(Tile(one.sample.image[place], f"{100 * one.share:g} % (reached {covered})"))
+        tiles.append(
+            Tile(one.sample.image[place], f"{SHADING.heading(one.share)} (reached {covered})")
+        )
     return tiles
 
 

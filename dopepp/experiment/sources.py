@@ -12,6 +12,7 @@ from dopepp.data.hybrid import HybridSource
 from dopepp.data.rendered import Split
 from dopepp.data.sample import DescribedSource
 from dopepp.errors import UserError
+from dopepp.experiment.chosen_data import are_renders
 from dopepp.experiment.gates import AUGMENTATIONS, MASKINGS, build_optional
 from dopepp.experiment.labelled import labelled_images, synthetic_companions
 from dopepp.experiment.renders import (
@@ -71,6 +72,23 @@ def held_out_seed(data: Mapping[str, Any]) -> int:
 def build_test_source(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> DescribedSource:
     """Build the test images alone, at their native resolution."""
     return _held_out_source(data, parts, seed, "test")
+
+
+def build_scaled_test_source(
+    data: Mapping[str, Any], parts: Sequence[Part], seed: int, scale: float
+) -> DescribedSource:
+    """Build the scenes of the test images with a camera so many times as near.
+
+    Raises:
+        UserError: They are no renders.
+    """
+    if not are_renders(data):
+        raise UserError(
+            f"scale={scale:g} on the images in data.root={data['root']}",
+            "renders, whose camera can be moved",
+            "leave out scale, or test on renders of these objects with data.test.renderer=raster",
+        )
+    return held_out_renders(data, parts, seed, "test", scale)
 
 
 def build_validation_source(

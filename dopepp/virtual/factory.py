@@ -63,18 +63,25 @@ class Factory:
         self._targets = [make_body(part, is_target=True) for part in parts]
         self._others = [make_body(part, is_target=False) for part in self.negatives]
 
-    def scene(self, epoch: int, index: int) -> Scene:
-        """Return the scene of an image without rendering it."""
+    def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
+        """Return the scene of an image without rendering it; see :func:`random_scene`."""
         rng = np.random.default_rng([self.seed, epoch, index])
-        return random_scene(self.preset, self._targets, self._others, rng, self.backgrounds)
+        return random_scene(self.preset, self._targets, self._others, rng, self.backgrounds, scale)
 
-    def render(self, epoch: int, index: int) -> Rendered:
+    def render(self, epoch: int, index: int, scale: float = 1.0) -> Rendered:
         """Render an image with its ground truth, as the scene's sensor takes it.
 
+        Args:
+            epoch: The epoch.
+            index: The image.
+            scale: How many times as large its parts appear: the camera of the same scene, moved
+                (see :mod:`dopepp.virtual.approach`).
+
         Raises:
-            UserError: The preset cannot show the part (see :func:`random_scene`).
+            UserError: The preset cannot show the part, or the camera cannot stand there (see
+                :func:`random_scene`).
         """
-        rendered = self._render(self.scene(epoch, index))
+        rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -96,15 +96,15 @@ class Table:
             rotation = rotation_vector_to_matrix(tilt * axis) @ rotation
         return np.asarray(rotation), float((hull.vertices @ rotation[2]).min())
 
-    def draw_background(
+    def draw_picture(
         self,
         rng: np.random.Generator,
         backgrounds: Backgrounds,
         K: Float[np.ndarray, "3 3"],
         size: tuple[int, int],
         T_cam_table: Float[np.ndarray, "4 4"],
-    ) -> Image:
-        """Draw a picture that lies on the plane, and another one beyond the plane's end."""
+    ) -> TablePicture:
+        """Draw a picture that lies on the plane and, if its end is in view, one for beyond it."""
         width, height = size
         picture = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
@@ -112,16 +112,48 @@ class Table:
         angle, scale = rng.uniform(0, 2 * np.pi), width / metres
         cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
         picture_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
+        end = _FARTHEST * float(T_cam_table[2, 3])
+        in_view = _beyond(end, K, size, T_cam_table) is not None
+        surroundings = backgrounds.draw(rng, width, height) if in_view else None
+        return TablePicture(picture, picture_table, end, surroundings)
+
+
+@dataclass(frozen=True, eq=False)
+class TablePicture:
+    """What is to be seen on the plane, and beyond its end.
+
+    Attributes:
+        picture: Lies on the plane; beyond its borders it is mirrored.
+        picture_table: Homography from a point (x, y) of the table's frame, metres, to its pixels.
+        end: Depth from which on there is no plane, metres.
+        surroundings: What is there instead, an image of the camera; None where the plane goes on.
+    """
+
+    picture: Image
+    picture_table: Float[np.ndarray, "3 3"]
+    end: float
+    surroundings: Image | None
+
+    def seen(
+        self,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        T_cam_table: Float[np.ndarray, "4 4"],
+    ) -> Image:
+        """Return what a camera sees where nothing lies on the plane."""
         # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
         image_table = K @ T_cam_table[:3, [0, 1, 3]]
         image = cv2.warpPerspective(
-            picture,
-            picture_table @ np.linalg.inv(image_table),
+            self.picture,
+            self.picture_table @ np.linalg.inv(image_table),
             size,
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REFLECT_101,
         )
-        return _with_surroundings(rng, np.asarray(image), backgrounds, K, T_cam_table)
+        beyond = _beyond(self.end, K, size, T_cam_table)
+        if beyond is None or self.surroundings is None:
+            return np.asarray(image)
+        return np.where(beyond[..., None], self.surroundings, image)
 
 
 def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
@@ -138,22 +170,19 @@ def _downwards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.stack([across, np.cross(across, direction), -direction])
 
 
-def _with_surroundings(
-    rng: np.random.Generator,
-    image: Image,
-    backgrounds: Backgrounds,
+def _beyond(
+    end: float,
     K: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
     T_cam_table: Float[np.ndarray, "4 4"],
-) -> Image:
-    """Put another picture where the plane is too far away, or where there is none."""
-    height, width = image.shape[:2]
+) -> Bool[np.ndarray, "height width"] | None:
+    """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
+    width, height = size
     plane = plane_of(T_cam_table)
     # A ray r (with z = 1) meets the plane at depth offset/(normal · r), and 1/depth is linear in
     # the pixel.
     slope = np.array(plane.normal) @ np.linalg.inv(K) / plane.offset
-    least = 1 / (_FARTHEST * T_cam_table[2, 3])
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
-    if across.min() + down.min() >= least:
-        return image
-    beyond = across + down[:, None] < least
-    return np.where(beyond[..., None], backgrounds.draw(rng, width, height), image)
+    if across.min() + down.min() >= 1 / end:
+        return None
+    return np.asarray(across + down[:, None] < 1 / end)

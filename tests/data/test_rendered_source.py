@@ -83,3 +83,17 @@ def test_the_render_path_loads_neither_torch_nor_lightning() -> None:
         "sys.exit(bool({'torch', 'lightning'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_another_scale_is_the_same_test_set_from_elsewhere(factory: Factory) -> None:
+    usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
+    one, other = usual.sample(1), near.sample(1)
+    assert one.key == other.key
+    np.testing.assert_allclose(other.instances[0].keypoints[8], one.instances[0].keypoints[8])
+    assert (one.image != other.image).any()
+    ((described,), (there,)) = usual.describe(), near.describe()
+    # Caches and checkpoints of the usual images stay valid.
+    assert there.identity == {**described.identity, "scale": 0.5}
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="scale"):
+            RenderedSource(factory, 2, scale=scale)

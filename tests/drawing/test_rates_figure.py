@@ -31,6 +31,15 @@ def test_every_panel_has_a_line_and_an_interval_for_every_method() -> None:
     assert figure_image(figure).std() > 0
 
 
+def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured() -> None:
+    rate = np.array([0.1, 0.9, 0.4])
+    lines = {"dopepp": RateCurve(np.array([0.5, 1.0, 2.0]), rate, rate, rate)}
+    (axes,) = rates_figure({"a": lines}, "scale", 1, ratio=True).axes
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["0.5", "1", "2"]
+    left, middle, right = axes.transData.transform([(x, 0) for x in (0.5, 1, 2)])[:, 0]
+    assert middle - left == pytest.approx(right - middle)
+
+
 @pytest.mark.parametrize(("panels", "columns"), [({}, 2), ({"a": {}}, 0)])
 def test_nothing_to_draw_is_refused(panels: dict[str, dict[str, RateCurve]], columns: int) -> None:
     with pytest.raises(ValueError, match=f"got {len(panels)} and {columns}"):

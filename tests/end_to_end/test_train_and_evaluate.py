@@ -138,14 +138,14 @@ def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
 
 
 @pytest.mark.slow
-def test_shading_and_bins_are_measured_of_both_networks(
+def test_shading_scale_and_bins_are_measured_of_both_networks(
     trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
 ) -> None:
     run, _ = trained
     best, last = (run / "checkpoints" / name for name in ("best.ckpt", "last.ckpt"))
     done = call(
         "evaluate.py", f"ckpt_path={best}", f"baseline={last}", "shading=[0.4,0.8]",
-        "by=[distance,size]", "num_bins=2", f"output_dir={tmp_path}",
+        "scale=[0.5,1]", "by=[distance,size]", "num_bins=2", f"output_dir={tmp_path}",
     )  # fmt: skip
     assert done.code == 0, done.err
     folder = find_run(tmp_path)
@@ -153,12 +153,16 @@ def test_shading_and_bins_are_measured_of_both_networks(
     assert [row["method"] for row in shading] == ["dopepp (baseline)"] * 3 + ["dopepp"] * 3
     assert [row["share"] for row in shading] == ["0.0", "0.4", "0.8"] * 2
     assert {row["num_instances"] for row in shading} == {"3"}
+    assert [row["scale"] for row in rows(folder / "scale.csv")] == ["0.5", "1.0"] * 2
     bins = rows(folder / "by_distance.csv")
     assert [row["num_instances"] for row in bins] in (["1", "1", "2", "2"], ["2", "2", "1", "1"])
-    for name in ("shading.png", "shading_examples.png", "by_distance.png", "by_size.png"):
+    for name in (
+        "shading.png", "shading_examples.png", "scale.png", "scale_examples.png",
+        "by_distance.png", "by_size.png",
+    ):  # fmt: skip
         assert cv2.imread(str(folder / name)) is not None, name
     assert "shading: share of the visible area covered" in done.out
-    wrong = ("by=[distance,colour]", "shading=[20]", "tune=true")
+    wrong = ("by=[distance,colour]", "shading=[20]", "scale=[0]", "tune=true")
     for option in wrong:
         others = ["by=size"] if option == "tune=true" else []
         done = call("evaluate.py", f"ckpt_path={best}", option, *others, f"output_dir={tmp_path}")

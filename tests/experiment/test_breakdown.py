@@ -221,7 +221,7 @@ def test_wrong_options_are_told_in_one_line(changes: dict[str, Any], message: st
 def test_options_are_put_in_order() -> None:
     assert not Protocols.of(OPTIONS)
     given = Protocols.of({**OPTIONS, "shading": [0.8, 0, 0.2, 0.2, 1], "by": "size"})
-    assert given == Protocols((0.2, 0.8, 1.0), ("size",), 5)
+    assert given == Protocols((0.2, 0.8, 1.0), by=("size",), num_bins=5)
     assert given
     assert Protocols.of({**OPTIONS, "shading": 0.4}).shading == (0.4,)
 

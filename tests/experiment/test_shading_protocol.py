@@ -12,11 +12,11 @@ import pytest
 
 from dopepp.data.sample import Instance, Sample
 from dopepp.errors import UserError
+from dopepp.experiment.condition_report import record_condition
 from dopepp.experiment.methods import Cost, FileMethod, FilePose, ImageId
 from dopepp.experiment.pass_rates import ADD_01D, ADD_5CM
 from dopepp.experiment.report import measure
-from dopepp.experiment.shading import check_masks, check_methods, measure_shading
-from dopepp.experiment.shading_report import record_shading
+from dopepp.experiment.shading import SHADING, check_masks, measure_shading
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
 
@@ -75,7 +75,7 @@ METHODS = {"dope": Finder(0.7, 0.02), "dopepp": Finder(0.3, 0.005)}
 def run(source: Discs, folder: Path, num_examples: int = 2) -> None:
     reports = measure(METHODS, [source.sample(i) for i in range(NUM_IMAGES)], 0).reports
     measured = measure_shading(METHODS, source, SHARES, 1, reports, num_examples)
-    record_shading(folder, *measured, (ADD_5CM, ADD_01D))
+    record_condition(folder, SHADING, *measured, (ADD_5CM, ADD_01D))
 
 
 def test_every_method_is_measured_at_every_share(
@@ -120,10 +120,10 @@ def test_shares_that_are_not_reached_are_counted_and_said(
 
 
 def test_what_cannot_be_shaded_is_refused_before_anything_is_measured() -> None:
-    check_methods(METHODS)
+    SHADING.check_methods(METHODS)
     check_masks(Discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(Discs(masks=False))
     poses = FileMethod.__new__(FileMethod)
     with pytest.raises(UserError, match="shading with results of posecnn"):
-        check_methods({**METHODS, "posecnn": poses})
+        SHADING.check_methods({**METHODS, "posecnn": poses})
