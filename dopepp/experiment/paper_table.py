@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from dopepp.drawing.png import write_whole
 from dopepp.errors import UserError
-from dopepp.experiment import display
+from dopepp.experiment import cost, display
 from dopepp.experiment.compare.entry import Entry
+from dopepp.experiment.compare.notes import noise
+from dopepp.experiment.compare.table import lines
 from dopepp.experiment.paper_rows import KINDS, LABELS, Figures
 from dopepp.experiment.pass_rates import ADD_5CM, ADD_10CM
 from dopepp.experiment.tables import csv_text, markdown_text
@@ -121,11 +123,13 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
         folder: Where the files go.
     """
     title = ", ".join([table.title, *_recipe(entries)])
-    rows = KINDS[table.kind](table, table.methods(entries), folder)
+    methods = table.methods(entries)
+    rows = KINDS[table.kind](table, methods, folder)
     labels = sum(heading in LABELS for heading in rows[0])
     display.show_table(title, rows, num_labels=labels)
     write_whole(folder / TABLE_FILE, csv_text(rows).encode())
-    notes = [f"- {note}" for note in _notes(table, entries)]
+    found = [*_notes(table, entries), *(_doubts(methods) if table.kind == "poses" else [])]
+    notes = [f"- {note}" for note in found]
     text = "\n".join([f"# {title}", "", markdown_text(rows), *notes])
     write_whole(folder / TEXT_FILE, f"{text}\n".encode())
 
@@ -138,7 +142,7 @@ def _recipe(entries: Sequence[Entry]) -> list[str]:
 
 
 def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
-    notes = list(table.notes)
+    notes = [*table.notes, *([cost.NOTE] if table.kind == "time" else [])]
     if table.kind in _MEASURED:
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
@@ -149,6 +153,11 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
     if not table.paper:
         notes.append("The paper prints no such table.")
     return notes
+
+
+def _doubts(methods: Mapping[str, Entry]) -> list[str]:
+    """Name the differences that may be chance, and how many seeds would tell."""
+    return noise(lines([replace(entry, name=label) for label, entry in methods.items()]))
 
 
 def _starts_untrained(config: Mapping[str, Any]) -> bool:

@@ -38,6 +38,8 @@ class Difference:
         num_differing: Instances on which the methods differ.
         fewest: Differing instances without which no difference is more than chance; see
             :func:`fewest_differing`.
+        seeds_to_tell: About how many seeds would tell such a difference from chance on these
+            instances, see :func:`seeds_to_tell`; None where that is not known.
     """
 
     value: float
@@ -45,6 +47,7 @@ class Difference:
     high: float
     num_differing: int
     fewest: int
+    seeds_to_tell: float | None = None
 
     @property
     def within_noise(self) -> bool:
@@ -115,7 +118,37 @@ def paired_difference(
     tail = (1 - confidence) / 2
     low, high = np.quantile(known, [tail, 1 - tail])
     value = float(figures[0].mean() - figures[1].mean())
-    return Difference(value, float(low), float(high), _num_differing(mine, baseline), fewest)
+    paired = same_seeds and len(figures[0]) > 1 and statistic == "mean"
+    needed = seeds_to_tell(mine, baseline, confidence) if paired else None
+    num_differing = _num_differing(mine, baseline)
+    return Difference(value, float(low), float(high), num_differing, fewest, needed)
+
+
+def seeds_to_tell(
+    mine: Sequence[Float[np.ndarray, "seeds instances"]],
+    baseline: Sequence[Float[np.ndarray, "seeds instances"]],
+    confidence: float = 0.95,
+) -> float:
+    """Return about how many paired seeds would tell a difference in means from chance.
+
+    With S seeds the interval reaches z · √(V + W / S) to both sides: V is the variance of the mean
+    over instances, W that of the difference over seeds, both estimated from the seeds there are.
+
+    Args:
+        mine: Of each object a number per seed and instance; two seeds or more.
+        baseline: Likewise, row by row of the same seeds.
+        confidence: Of the interval.
+
+    Returns:
+        S, infinite where these instances are too few for any number of seeds.
+    """
+    differences = [one - other for one, other in zip(mine, baseline, strict=True)]
+    effects = np.mean([one.mean(axis=1) for one in differences], axis=0)
+    over_instances = sum(one.mean(axis=0).var(ddof=1) / one.shape[1] for one in differences)
+    over_instances /= len(differences) ** 2
+    z = norm.ppf((1 + confidence) / 2)
+    room = (effects.mean() / z) ** 2 - over_instances
+    return math.ceil(effects.var(ddof=1) / room) if room > 0 else math.inf
 
 
 def fewest_differing(confidence: float) -> int:

@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from scipy.stats import bootstrap, norm
 
 from dopepp.errors import UserError
-from dopepp.metrics.bootstrap import STATISTICS, fewest_differing, paired_difference
+from dopepp.metrics.bootstrap import (
+    STATISTICS,
+    fewest_differing,
+    paired_difference,
+    seeds_to_tell,
+)
 
 Z = norm.ppf(0.975)
 
@@ -213,3 +218,36 @@ PASSES = np.array([[0.0, 1.0, 1.0]])
 def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, message) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(UserError, match=message):
         paired_difference(mine, baseline, **options)
+
+
+def test_as_many_seeds_as_it_says_tell_a_difference() -> None:
+    """Trainings of a known spread: with the seeds it asks for, the interval just leaves out 0."""
+    rng = np.random.default_rng(4)
+    images, gain, spread = 4000, 0.02, 0.05
+
+    def trained(num_seeds: int, shift: float) -> np.ndarray:
+        skill = 0.5 + shift + spread * rng.normal(size=(num_seeds, 1))
+        return (rng.random((num_seeds, images)) < skill).astype(float)
+
+    asked = seeds_to_tell([trained(400, gain)], [trained(400, 0.0)])
+    # W is the variance of a difference of two trainings; V and the draws of images are small here.
+    assert asked == pytest.approx(2 * (Z * spread / gain) ** 2, rel=0.35)
+    seeds = int(asked)
+    found = [
+        paired_difference([trained(seeds, gain)], [trained(seeds, 0.0)], num_resamples=500)
+        for _ in range(40)
+    ]
+    told = np.mean([one is not None and not one.within_noise for one in found])
+    assert 0.25 < told < 0.8  # about every second time, as the interval's end then lies at 0
+
+
+def test_too_few_images_are_not_made_up_for_by_seeds() -> None:
+    mine, other = np.zeros((3, 10)), np.zeros((3, 10))
+    mine[:, 0] = 1
+    assert seeds_to_tell([mine], [other]) == np.inf
+    found = paired_difference([mine], [other])
+    assert found is not None
+    assert found.seeds_to_tell == np.inf
+    alone = paired_difference([mine[:1]], [other[:1]])
+    assert alone is not None
+    assert alone.seeds_to_tell is None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from dopepp.experiment.compare.differences import comparable
 from dopepp.experiment.compare.entry import Entry
 from dopepp.experiment.compare.table import Line
+from dopepp.metrics.bootstrap import Difference
 from dopepp.metrics.row import COLUMNS
 
 
@@ -18,7 +20,7 @@ def notes(entries: Sequence[Entry], table: Sequence[Line]) -> list[str]:
         others = [entry for entry in entries if entry.reports and entry is not baseline]
         compared = [entry for entry in others if comparable(entry, baseline)]
         if compared:
-            found += [_how(baseline, compared), *_noise(table), *_unpaired(baseline, compared)]
+            found += [_how(baseline, compared), *noise(table), *_unpaired(baseline, compared)]
         found += _not_compared(baseline, others)
     return found + _narrowed(entries)
 
@@ -39,13 +41,13 @@ def _how(baseline: Entry, compared: Sequence[Entry]) -> str:
     return f"{text} and over the seeds of the trainings."
 
 
-def _noise(table: Sequence[Line]) -> list[str]:
+def noise(table: Sequence[Line]) -> list[str]:
     """Name, for every method and object, the differences that may be chance."""
     several = len({line.object for line in table if line.differences}) > 1
     found = []
     for line in table:
         unsure = [
-            column.heading
+            f"{column.heading}{_needed(one)}"
             for column in COLUMNS
             if (one := line.differences.get(column.field)) is not None and one.within_noise
         ]
@@ -60,6 +62,15 @@ def _noise(table: Sequence[Line]) -> list[str]:
             "than noise."
         )
     return found
+
+
+def _needed(difference: Difference) -> str:
+    """Say at how many seeds a difference of this size would be more than noise."""
+    if difference.seeds_to_tell is None or difference.value == 0:
+        return ""
+    if math.isinf(difference.seeds_to_tell):
+        return " (more images would be needed to tell)"
+    return f" (about {difference.seeds_to_tell:,.0f} seeds would tell)"
 
 
 def _unpaired(baseline: Entry, compared: Sequence[Entry]) -> list[str]:
