@@ -59,7 +59,6 @@ def build_system(
         fingerprint: Of the data, for the checkpoint.
         images: What the images are, by split, for the checkpoint.
     """
-    loss = LOSSES.build(config["model"]["loss"])
     network, description = build_untrained(config, parts)
     description = replace(
         description,
@@ -75,7 +74,7 @@ def build_system(
         _start_from(network, Path(config["init_from"]))
     return PoseSystem(
         network,
-        loss,
+        LOSSES.build(config["model"]["loss"]),
         parts,
         map_geometry(config["maps"], network.stride),
         parse_recovery(description.recovery),
@@ -96,6 +95,8 @@ def build_untrained(config: Mapping[str, Any], parts: list[Part]) -> tuple[PoseN
         UserError: A choice or a threshold is wrong.
     """
     model = config["model"]
+    for name, value in config["maps"].items():  # before the loss, which reads one of them
+        check_number(f"maps.{name}", value, _MIN_CELLS, _MAX_THRESHOLD)
     spec = {
         **{name: model[name] for name in ("backbone", "attention", "head")},
         "activation": LOSSES.build(model["loss"]).activation,
@@ -117,13 +118,7 @@ def build_untrained(config: Mapping[str, Any], parts: list[Part]) -> tuple[PoseN
 
 
 def map_geometry(maps: Mapping[str, Any], stride: int) -> MapGeometry:
-    """Return how target maps are drawn, from the config's ``maps``.
-
-    Raises:
-        UserError: A peak or a disc is too narrow, too wide, or no number.
-    """
-    for name, value in maps.items():
-        check_number(f"maps.{name}", value, _MIN_CELLS, _MAX_THRESHOLD)
+    """Return how target maps are drawn, from the config's ``maps``."""
     return MapGeometry(stride, maps["sigma"], maps["field_radius"])
 
 

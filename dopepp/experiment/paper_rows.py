@@ -76,7 +76,7 @@ def pose_rows(table: Layout, methods: Mapping[str, Entry], folder: Path) -> list
         objects = list(dict.fromkeys(name for one in table.paper.values() for name in one))
     others = [name for name in (*table.recomputed, *table.paper) if name not in methods]
     rows = [
-        _pose_row(table, label, name, methods.get(label), measured[0] if measured else None)
+        _pose_row(table, label, name, methods.get(label), measured, objects)
         for name in objects
         for label in [*methods, *dict.fromkeys(others)]
         if label in methods or _known(table, label, name)
@@ -94,17 +94,25 @@ def _known(table: Layout, label: str, name: str) -> bool:
 
 
 def _pose_row(
-    table: Layout, label: str, name: str, entry: Entry | None, baseline: Entry | None
+    table: Layout,
+    label: str,
+    name: str,
+    entry: Entry | None,
+    measured: Sequence[Entry],
+    objects: Sequence[str],
 ) -> Row:
-    """Return one method's row on one object."""
-    printed = table.paper.get(label, {}).get(name, {})
+    """Return one method's row on one object; the paper's mean stands beside one of its objects."""
+    figures = table.paper.get(label, {})
+    is_other_mean = name == MEAN and set(figures) != set(objects)
+    printed = {} if is_other_mean else figures.get(name, {})
     if entry is None:
         own = table.recomputed.get(label, {}).get(name, {})
         return _cells(table, Line(label, name), printed, own)
     if not entry.reports or name not in entry.objects:
         failure = entry.failure or "not measured on it"
         return _cells(table, Line(f"{label}: {failure}", name), printed)
-    known = {} if baseline is None or baseline is entry else differences(entry, baseline, name)
+    is_baseline = entry is measured[0]
+    known = {} if is_baseline else differences(entry, measured[0], name)
     return _cells(table, Line(label, name, entry, entry.row(name), known), printed)
 
 

@@ -95,9 +95,9 @@ def sweep_of(output_dir: Path) -> Path:
 
 
 def test_every_job_is_a_run_and_the_comparison_one_more(
-    command: Runner, tiny: tuple[str, ...], tmp_path: Path
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path
 ) -> None:
-    done = command(
+    done = call(
         "train.py", "-m", *tiny, "model=dope,dopepp", "logger=wandb", f"output_dir={tmp_path}"
     )
     assert done.code == 0, done.err[-3000:]
@@ -118,11 +118,12 @@ def test_every_job_is_a_run_and_the_comparison_one_more(
         assert run.summary["reference/best constant pose/pivconnector/add_01d"] == pytest.approx(
             measured["references"]["best constant pose"]["pivconnector"]["add_01d"]
         )
-        pictures = {
-            one.name.split("_")[0]
-            for one in (sweep / job).glob("wandb/offline-run-*/files/media/images/test/*")
-        }
-        assert pictures == {"overlay", "auc"}
+        for kind, names in {
+            "test": {"overlay", "auc"},
+            "val": {"overlay", "auc", "belief"},
+        }.items():
+            folder = f"wandb/offline-run-*/files/media/images/{kind}"
+            assert {one.name.split("_")[0] for one in (sweep / job).glob(f"{folder}/*")} == names
     comparison = only(sweep)
     assert (comparison.name, comparison.job_type) == ("comparison", "comparison")
     assert (comparison.group, comparison.exit_code) == (sweep.name, 0)

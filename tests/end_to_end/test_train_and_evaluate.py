@@ -215,19 +215,6 @@ def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
 
 
 @pytest.mark.slow
-def test_weights_and_biases_stays_offline(
-    command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
-    done = command("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}")
-    assert done.code == 0, done.err[-3000:]
-    run = find_run(tmp_path)
-    assert list(run.glob("wandb/offline-run-*/*.wandb"))
-    assert {path.name.split("_")[0] for path in run.glob("wandb/*/files/media/images/val/*")} == {
-        "auc", "overlay", "belief",
-    }  # fmt: skip
-    assert rows(run / "metrics.csv")
-
-
 @pytest.mark.ddp
 def test_two_processes_make_one_run_and_one_report(
     command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path

@@ -23,6 +23,7 @@ from dopepp.experiment.gates import (
 )
 from dopepp.experiment.objects import build_parts
 from dopepp.experiment.sources import build_datamodule
+from dopepp.experiment.tracking import tracked
 from dopepp.models.gate import Gate
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
@@ -59,7 +60,8 @@ def build_all(config: dict[str, Any], run_dir: Path) -> None:
     parts = build_parts(config["data"])
     build_datamodule(config["data"], parts, seed=0)
     build_system(config, parts, "")
-    build_trainer(config, run_dir)
+    with tracked(config, run_dir) as trackers:
+        build_trainer(config, run_dir, trackers=trackers)
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,11 @@ def test_one_network_a_part_is_one_method_with_a_mean(tmp_path: Path) -> None:
                 job(tmp_path / str(number), overrides, values, part)
                 number += 1
     labels = {"data/masking=none": "without", "data/masking=random": "with"}
-    end(tmp_path, {"title": "Table 2", "labels": labels})
+    printed = {
+        "without": {"bolt": {"pass": 84.05}, "nut": {"pass": 86.35}, "mean": {"pass": 85.2}},
+        "with": {"bolt": {"pass": 92.35}, "screw": {"pass": 91.75}, "mean": {"pass": 92.05}},
+    }
+    end(tmp_path, {"title": "Table 2", "labels": labels, "paper": printed})
     rows = read_table(tmp_path)
     found = {(row["method"], row["object"]): row for row in rows}
     assert list(found)[:6] == [
@@ -132,6 +136,9 @@ def test_one_network_a_part_is_one_method_with_a_mean(tmp_path: Path) -> None:
     assert found["with", "mean"]["Δ ADD-0.1d %"].startswith("+30.0 [")
     assert found["with", "nut"]["Δ ADD-0.1d %"].startswith("+10.0 [")
     assert ("best constant pose", "mean") in found
+    assert found["without", "mean"]["the paper: ADD<5cm %"] == "85.2"
+    assert found["with", "mean"]["the paper: ADD<5cm %"] == ""  # a mean of other parts
+    assert found["with", "bolt"]["the paper: ADD<5cm %"] == "92.35"
     with (tmp_path / "compare.csv").open(newline="") as stream:
         compared = list(csv.DictReader(stream))
     assert {row["seeds"] for row in compared if row["method"].startswith("x ")} == {"1, 2"}

@@ -151,7 +151,7 @@ def test_two_commands_do_not_search_one_study(call_fast: Call, tmp_path: Path) -
     [
         (["search.num_trials=0"], "search.num_trials=0"),
         (["search.num_parallel=x"], "search.num_parallel='x'"),
-        (["experiment=table6_dope_vs_dopepp"], "sweeps over model itself"),
+        (["experiment=table6_dope_vs_dopepp"], "sweeps over model, data.parts itself"),
         (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
         (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
         (["search.space=['optimizer.lr=1']"], "which is one value"),
