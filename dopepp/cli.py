@@ -160,7 +160,7 @@ def render(
     ray_address: Annotated[
         str | None, typer.Option(help="of a running Ray cluster; a local one if left out")
     ] = None,
-    renderer: Annotated[str, typer.Option(help="raster, photoreal or gl")] = "raster",
+    renderer: Annotated[str, typer.Option(help="raster or photoreal")] = "raster",
     backgrounds: Annotated[
         str, typer.Option(help="procedural, skimage, or a folder of photos")
     ] = "procedural",

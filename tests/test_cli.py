@@ -121,7 +121,7 @@ def test_render_previews_and_stops(tmp_path: Path) -> None:
         (["-n", "5", "--set", "horizontal_fov_deg=1"], "got horizontal_fov_deg=1.0 of quickstart"),
         (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: paper, "),
         (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
-        (["-n", "5", "--renderer", "blender"], "got renderer 'blender'; allowed: raster, "),
+        (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
         (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),
         (["-n", "5", "--workers", "0"], "got --workers 0; allowed: 1 to 1024"),
         (["-n", "5", "--engine", "slurm"], "got --engine slurm; allowed: local, ray"),
