@@ -1,12 +1,11 @@
-"""The renderers side by side: CPU time an image, and how far their labels agree.
+"""Mitsuba's variants beside the rasteriser: CPU time an image, and how far their labels agree.
 
-    python benchmarks/renderers.py [--images 6] [--size 640 480] [--admit-software-gl]
+    python benchmarks/renderers.py [--images 6] [--size 640 480]
 
-Every renderer draws the same random scenes, in one run. Times are process time (all threads of the
-process, waiting left out) and wall time; the first image, which compiles kernels and uploads
-meshes, is left out of both. On a GPU the wall time counts. Depth is compared at all pixels (within
-1 mm), masks as instance numbers. Mitsuba's variant is fixed for the life of a process, so each of
-them runs in a process of its own, with the rasteriser beside it.
+All draw the same random scenes, in one run. Times are process time (all threads of the process,
+waiting left out) and wall time; the first image, which compiles kernels, is left out of both.
+Depth is compared at all pixels (within 1 mm), masks as instance numbers. The variant is fixed for
+the life of a process, so each runs in one of its own, with the rasteriser beside it.
 """
 
 from __future__ import annotations
@@ -24,14 +23,12 @@ import numpy as np
 from dopepp.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.virtual import PRESETS, Factory, Rendered, Scene, render
-from dopepp.virtual.gl_context import SOFTWARE_SETTING
 from dopepp.virtual.photoreal_variant import VARIANT_SETTING, VARIANTS
 from dopepp.virtual.renderers import find_renderer
 
 SCENES = ("paper", "table")
 LIMIT_M = 1e-3
 SEED = 11
-ROWS = ("gl", *VARIANTS)
 
 
 def timed(
@@ -47,7 +44,7 @@ def timed(
 
 def compare(name: str, preset: str, size: tuple[int, int], num_images: int) -> list[str]:
     """Return one row of the table."""
-    renderer = find_renderer("gl" if name == "gl" else "photoreal")
+    renderer = find_renderer("photoreal")
     parts = [make() for make in BUILTIN.values()]
     factory = Factory(parts, PRESETS[preset].resized(*size), SEED)
     scenes = [factory.scene(0, index) for index in range(num_images + 1)]
@@ -67,8 +64,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", type=int, default=6, help="images per row")
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), help="width and height")
-    parser.add_argument("--admit-software-gl", action="store_true", help="measure llvmpipe, too")
-    parser.add_argument("--only", choices=ROWS, help="this renderer's rows, without a header")
+    parser.add_argument("--only", choices=VARIANTS, help="this variant's rows, without a header")
     arguments = parser.parse_args()
     if arguments.only is not None:
         cv2.setNumThreads(1)
@@ -80,17 +76,13 @@ def main() -> None:
             print(f"{arguments.only}: not measured: {error}")
         return
     header = [
-        "renderer", "preset", "size", "CPU-s", "wall-s", "rasteriser CPU-ms", "ratio",
+        "variant", "preset", "size", "CPU-s", "wall-s", "rasteriser CPU-ms", "ratio",
         "depth within 1 mm (worst image)", "same mask (worst image)",
     ]  # fmt: skip
     print("| " + " | ".join(header) + " |")
     print("| " + " | ".join("---" for _ in header) + " |", flush=True)
-    for name in ROWS:
-        settings = {"OMP_NUM_THREADS": "1"}
-        if name in VARIANTS:
-            settings[VARIANT_SETTING] = name
-        elif arguments.admit_software_gl:
-            settings[SOFTWARE_SETTING] = "1"
+    for name in VARIANTS:
+        settings = {"OMP_NUM_THREADS": "1", VARIANT_SETTING: name}
         command = [sys.executable, __file__, "--only", name, "--images", str(arguments.images)]
         command += ["--size", *map(str, arguments.size)]
         subprocess.run(command, env={**os.environ, **settings}, check=True)

@@ -92,7 +92,7 @@ def predict(
     ] = None,
     depth_scale: Annotated[float, typer.Option(help="metres per unit of --depth")] = 0.001,
 ) -> None:
-    """Print the poses on one picture as JSON, a line per detection."""
+    """Print the poses on one picture as JSON, a line per detection; why, where there is none."""
     from dopepp.drawing.overlay import YELLOW, Wireframe
     from dopepp.drawing.overlay import overlay as draw
     from dopepp.drawing.pictures import read_rgb
@@ -117,6 +117,8 @@ def predict(
         if verify:
             meshes = meshes_of(estimator.parts, parts or (), unit)
             agreements = [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
+    if not found:
+        typer.echo("nothing found: " + "; ".join(estimator.explain(picture, K)), err=True)
     for number, one in enumerate(found):
         record = {
             "object": one.object,
@@ -160,7 +162,7 @@ def render(
     ray_address: Annotated[
         str | None, typer.Option(help="of a running Ray cluster; a local one if left out")
     ] = None,
-    renderer: Annotated[str, typer.Option(help="raster, photoreal or gl")] = "raster",
+    renderer: Annotated[str, typer.Option(help="raster or photoreal")] = "raster",
     backgrounds: Annotated[
         str, typer.Option(help="procedural, skimage, or a folder of photos")
     ] = "procedural",

@@ -27,15 +27,16 @@ SPEC = {
 K = ["--K", "100", "100", "31.5", "31.5"]
 
 
-@pytest.fixture
-def checkpoint(tmp_path: Path) -> Path:
-    network = build_network(SPEC)
-    path = tmp_path / "best.ckpt"
-    content = Checkpoint(
-        SPEC, network.state_dict(), [pivconnector()], (64, 64), 8, 1.0, {"peak_threshold": 1e-4}
-    )
+def write_checkpoint(path: Path, **recovery: float) -> Path:
+    weights = build_network(SPEC).state_dict()
+    content = Checkpoint(SPEC, weights, [pivconnector()], (64, 64), 8, 1.0, recovery)
     write_atomic(content.to_file(), path)
     return path
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    return write_checkpoint(tmp_path / "best.ckpt", peak_threshold=1e-4)
 
 
 @pytest.fixture
@@ -57,6 +58,14 @@ def test_predict_prints_json_lines_and_draws(
         assert record["object"] == "pivconnector"
         assert np.shape(record["T_cam_obj"]) == (4, 4)
     assert cv2.imread(str(drawn)).shape[2] == 3
+
+
+def test_predict_says_in_one_line_why_there_is_nothing(picture: Path, tmp_path: Path) -> None:
+    path = write_checkpoint(tmp_path / "silent.ckpt", centroid_threshold=1.0)
+    done = CliRunner().invoke(app, ["predict", str(path), str(picture), *K])
+    assert (done.exit_code, done.stdout) == (0, "")
+    assert "pivconnector: no centroid" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_wrong_file_is_one_line_and_code_2(picture: Path) -> None:
@@ -121,7 +130,7 @@ def test_render_previews_and_stops(tmp_path: Path) -> None:
         (["-n", "5", "--set", "horizontal_fov_deg=1"], "got horizontal_fov_deg=1.0 of quickstart"),
         (["-n", "5", "--preset", "moon"], "got preset 'moon'; allowed: paper, "),
         (["-n", "5", "--format", "coco"], "got format 'coco'; allowed: bop, ndds, webdataset"),
-        (["-n", "5", "--renderer", "blender"], "got renderer 'blender'; allowed: raster, "),
+        (["-n", "5", "--renderer", "gl"], "got renderer 'gl'; allowed: raster, photoreal"),
         (["-n", "5", "--shard", "3/2"], "got shard '3/2'; allowed: i/n with 0 <= i < n"),
         (["-n", "5", "--workers", "0"], "got --workers 0; allowed: 1 to 1024"),
         (["-n", "5", "--engine", "slurm"], "got --engine slurm; allowed: local, ray"),

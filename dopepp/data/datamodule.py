@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -129,11 +129,6 @@ class PoseDataModule(LightningDataModule):
             num_workers=self.num_workers,
             pin_memory=torch.cuda.is_available(),
         )
-
-    def test_samples(self) -> Iterator[Sample]:
-        """Yield the test images at native resolution, in order."""
-        for index in range(len(self.test_source)):
-            yield self.test_source.sample(index, 0)
 
     def check_objects(self) -> None:
         """Fail when an object to learn is in no training source.

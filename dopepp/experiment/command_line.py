@@ -38,7 +38,6 @@ _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
 
-DONE: Final = 0
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
 

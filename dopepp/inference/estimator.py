@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,9 +21,11 @@ from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import RecoveryOptions, recover
+from dopepp.recovery.recover import RecoveryOptions, explain, recover
 
 _log = logging.getLogger(__name__)
+
+Decoded = TypeVar("Decoded")
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -107,21 +110,37 @@ class PoseEstimator:
             image = cv2.undistort(image, K, coefficients)
             depth = None if depth is None else undistorted_depth(depth, K, coefficients)
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
-        belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
-        found = recover(
-            belief,
-            field,
-            self.cuboids,
-            letterbox.camera(K),
-            self.network.stride,
-            [part.name for part in self.parts],
-            **vars(self.recovery),
-        )
+        found = self._decode(recover, image, K, letterbox)
         cuboids = {part.name: part.cuboid for part in self.parts}
         detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
         if self.refiner is None or depth is None:
             return detections
         return [_refined(self.refiner, one, cuboids[one.object], depth, K) for one in detections]
+
+    def explain(
+        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"]
+    ) -> list[str]:
+        """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
+
+        Raises:
+            UserError: The image is no RGB picture, or K cannot belong to it.
+        """
+        image, K = _checked(image, K)
+        letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
+        return self._decode(explain, image, K, letterbox)
+
+    def _decode(
+        self,
+        decoder: Callable[..., list[Decoded]],
+        image: UInt8[np.ndarray, "height width 3"],
+        K: Float[np.ndarray, "3 3"],
+        letterbox: Letterbox,
+    ) -> list[Decoded]:
+        """Give an image's maps to :func:`recover` or :func:`explain`."""
+        belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
+        names = [part.name for part in self.parts]
+        K, stride = letterbox.camera(K), self.network.stride
+        return decoder(belief, field, self.cuboids, K, stride, names, **vars(self.recovery))
 
     def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""

@@ -30,10 +30,6 @@ class MapGeometry:
         """Turn input pixels into cell coordinates (cell centres are whole numbers)."""
         return (pixels - (self.stride - 1) / 2) / self.stride
 
-    def to_pixels(self, cells: Tensor) -> Tensor:
-        """Turn cell coordinates into input pixels."""
-        return cells * self.stride + (self.stride - 1) / 2
-
 
 def encode(
     keypoints: Float[Tensor, "batch instances 9 2"],

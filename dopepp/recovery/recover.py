@@ -67,7 +67,7 @@ def recover_batch(
         UserError: An option is out of range.
     """
     decoded = _decode(belief, field, cuboids, K, stride, names, options)
-    return [[one for one in image if isinstance(one, Detection)] for image in decoded]
+    return [detections for detections, _ in decoded]
 
 
 def explain(
@@ -81,8 +81,8 @@ def explain(
 ) -> list[str]:
     """Say what :func:`recover` leaves out of these maps and why, one line an object or centroid."""
     image = np.asarray(K)[None]
-    (decoded,) = _decode(belief[None], field[None], cuboids, image, stride, names, options)
-    return [one for one in decoded if isinstance(one, str)]
+    ((_, reasons),) = _decode(belief[None], field[None], cuboids, image, stride, names, options)
+    return reasons
 
 
 def _decode(
@@ -93,8 +93,8 @@ def _decode(
     stride: int,
     names: Sequence[str] | None,
     options: Mapping[str, float],
-) -> list[list[Detection | str]]:
-    """Return each image's detections, best first, and the reasons for those that are none."""
+) -> list[tuple[list[Detection], list[str]]]:
+    """Return each image's detections, best first, and a reason for each that is none."""
     chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
     _check_shapes(belief, field, len(cuboids), K)
@@ -102,17 +102,20 @@ def _decode(
     if len(labels) != len(cuboids):
         raise ValueError(f"{len(cuboids)} objects need as many names, got {labels}")
     if not labels:
-        return [[] for _ in K]
+        return [([], []) for _ in K]
     geometry = MapGeometry(stride, chosen.sigma)
     peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
     cells = (belief.shape[-1], belief.shape[-2])
     batch = []
     for image, camera in enumerate(K):
-        found: list[Detection | str] = []
+        detections: list[Detection] = []
+        reasons: list[str] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
             own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            found += _recover_object(own, cuboid, camera, name, chosen, stride)
-        batch.append(sorted(found, key=lambda one: -getattr(one, "score", -1.0)))
+            found, missed = _recover_object(own, cuboid, camera, name, chosen, stride, cells)
+            detections += found
+            reasons += missed
+        batch.append((sorted(detections, key=lambda one: -one.score), reasons))
     return batch
 
 
@@ -123,24 +126,27 @@ def _recover_object(
     name: str,
     options: RecoveryOptions,
     stride: int,
-) -> list[Detection | str]:
+    cells: tuple[int, int],
+) -> tuple[list[Detection], list[str]]:
     """Recover all instances of one object; a reason for each that is none."""
     if not len(peaks.centroid):
-        return [f"{name}: no centroid's belief reaches {options.centroid_threshold:g}"]
-    found: list[Detection | str] = []
+        return [], [f"{name}: no centroid's belief reaches {options.centroid_threshold:g}"]
+    detections: list[Detection] = []
+    reasons: list[str] = []
     for group, result in pose_instances(peaks, cuboid, K, options, float(stride)):
         detection = make_detection(group, result, cuboid, K, name)
         x, y = group.position[CENTROID]
-        where = f"{name} at pixel ({x:.0f}, {y:.0f})"
+        size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
+        where = f"{name} at pixel ({x:.0f}, {y:.0f}) of {size}"
         if detection is None:
-            found.append(f"{where}: {result.reason}")
+            reasons.append(f"{where}: {result.reason}")
             continue
         detection = calibrated(detection, cuboid, K, options)
         if detection.score < options.min_score:
-            found.append(f"{where}: score {detection.score:.3f} below {options.min_score:g}")
+            reasons.append(f"{where}: score {detection.score:.3f} below {options.min_score:g}")
         else:
-            found.append(detection)
-    return found
+            detections.append(detection)
+    return detections, reasons
 
 
 def _check_shapes(

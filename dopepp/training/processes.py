@@ -7,7 +7,6 @@ Here every process watches: the first one its children, the children their paren
 
 from __future__ import annotations
 
-import logging
 import os
 import subprocess
 import sys
@@ -23,8 +22,6 @@ from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from dopepp.errors import RunError
-
-_log = logging.getLogger(__name__)
 
 _STARTED_BY: Final = "DOPEPP_STARTED_BY"
 """Environment variable that tells a process which one of the run has started it."""

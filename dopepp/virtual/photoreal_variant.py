@@ -1,9 +1,9 @@
 """Mitsuba, imported once a process in the fastest variant that runs on this machine.
 
 ``llvm_ad_rgb`` compiles its kernels with the system's libLLVM and is several times faster than
-``scalar_rgb``, which needs nothing. But a libLLVM that Mitsuba cannot work with (15 and older, as
-in Debian 12) ends the whole process. So each library is first tried in a process of its own, and
-the outcome is kept in the user's cache folder for as long as library and Mitsuba stay the same.
+``scalar_rgb``, which needs nothing. A libLLVM that Mitsuba cannot work with (15 and older, as in
+Debian 12) ends the whole process, so each is first tried in a process of its own, and the outcome
+is kept in the user's cache folder for as long as library and Mitsuba stay the same.
 
 Environment variables:
     ``DOPEPP_MITSUBA_VARIANT``: ``llvm_ad_rgb`` or ``scalar_rgb`` instead of the automatic choice.
@@ -37,22 +37,13 @@ VARIANT_SETTING: Final = "DOPEPP_MITSUBA_VARIANT"
 LIBRARY_SETTING: Final = "DRJIT_LIBLLVM_PATH"
 THREADS_SETTING: Final = "DOPEPP_RENDER_THREADS"
 
-_PLACES: Final = (
-    "/usr/lib/*-linux-gnu/libLLVM*.so*",
-    "/usr/lib/llvm-*/lib/libLLVM*.so*",
-    "/usr/lib64/libLLVM*.so*",
-    "/usr/lib64/llvm*/lib*/libLLVM*.so*",
-    "/usr/lib/libLLVM*.so*",
-    "/usr/local/lib/libLLVM*.so*",
+PLACES: Final = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so.*",
+    "/usr/lib64/libLLVM*.so.*",
+    "/usr/lib/libLLVM*.so.*",
     "/opt/homebrew/opt/llvm/lib/libLLVM.dylib",
-    "/usr/local/opt/llvm/lib/libLLVM.dylib",
 )
-"""Where Linux distributions and Homebrew put libLLVM."""
-
-_MAX_LIBRARIES: Final = 4
-"""Libraries that are tried, the newest first; each may take seconds."""
-
-_LEAST_LIBRARY_BYTES: Final = 1_000_000
+"""Where Debian, Fedora, Arch and Homebrew put libLLVM; the environment names one elsewhere."""
 
 _PROBE_SECONDS: Final = 60.0
 """A library that takes longer is passed over this time, and tried again the next."""
@@ -159,22 +150,13 @@ def candidates() -> list[Path]:
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
-    rustup = Path(os.environ.get("RUSTUP_HOME", Path.home() / ".rustup"))
-    found = [path for place in _PLACES for path in Path("/").glob(place[1:])]
-    found += Path(sys.prefix).glob("lib/libLLVM*.so*")
-    found += rustup.glob("toolchains/*/lib/libLLVM*.so*")
-    versions = {}
-    for path in {path.resolve() for path in found}:
-        # Some of the files are a line of text that points the linker to the library.
-        if path.stat().st_size >= _LEAST_LIBRARY_BYTES:
-            versions[path] = _major(path)
-    return sorted(versions, key=lambda path: (-versions[path], str(path)))[:_MAX_LIBRARIES]
+    found = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
+    return sorted(found, key=lambda path: (_version(path), path), reverse=True)
 
 
-def _major(path: Path) -> int:
-    """Return the version in a library's name: libLLVM-17.so, libLLVM.so.19.1; 0 without."""
-    number = re.search(r"libLLVM[-.](?:so\.)?(\d+)", path.name)
-    return int(number[1]) if number else 0
+def _version(library: Path) -> list[int]:
+    """Return the version in a library's name: libLLVM-17.so.1, libLLVM.so.19.1."""
+    return [int(number) for number in re.findall(r"\d+", library.name)]
 
 
 def is_usable(library: Path) -> bool:

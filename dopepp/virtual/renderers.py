@@ -18,7 +18,6 @@ Renderer = Callable[[Scene], Rendered]
 RENDERERS: Final = {
     "raster": "dopepp.virtual.rasteriser",
     "photoreal": "dopepp.virtual.photoreal",
-    "gl": "dopepp.virtual.gl",
 }
 """Module of each renderer."""
 

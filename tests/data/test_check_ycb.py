@@ -53,7 +53,8 @@ def test_a_good_folder_is_clean(ycb: Any) -> None:
 def test_the_real_frames_are_clean(ycb_root: Path) -> None:
     report = check_dataset(ycb_root)
     assert (report.layout, report.num_images, found(report)) == ("YCB-Video", 9, [])
-    assert report.notes == ["keyframe.txt lists 2,948 frames that are not on disk"]
+    (note,) = report.notes
+    assert note.startswith("keyframe.txt lists 2,948 frames")
 
 
 def poses(**changes: Any) -> Callable[[Any], None]:
@@ -174,10 +175,9 @@ def test_unlabelled_objects_and_absent_models_are_no_defects(ycb: Any) -> None:
     ycb.write_list("val", ["0000/000009"])
     report = check_dataset(ycb.root)
     assert found(report) == []
-    assert report.notes == [
-        "val.txt lists 1 frames that are not on disk",
-        "models/004_mug/points.xyz is missing: its boxes are not checked",
-    ]
+    absent, missing = report.notes
+    assert absent.startswith("val.txt lists 1 frames")
+    assert missing.startswith("models/004_mug/points.xyz is missing")
 
 
 # --- the report and the layouts --------------------------------------------------------------
@@ -207,12 +207,9 @@ def test_report_lines_are_capped_and_counted(tmp_path: Path) -> None:
     assert not report.ok
 
 
-def test_progress_is_told(ycb: Any, caplog: pytest.LogCaptureFixture) -> None:
-    seen: list[int] = []
-    check_dataset(ycb.root, seen.append)
-    assert seen == [1, 2, 3]
+def test_progress_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
-        report = CheckReport(ycb.root, "NDDS")
+        report = CheckReport(tmp_path, "NDDS")
         for _ in range(1000):
             report.count_image()
     assert "1000 images checked, 0 defects" in caplog.text

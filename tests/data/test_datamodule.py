@@ -107,7 +107,7 @@ def test_validation_is_untouched_and_test_is_native(build: Any, fake_source: Any
             expected = fake_source(5).sample(int(key.split("/")[1]), 0).image
             np.testing.assert_array_equal(image[:, :48].permute(1, 2, 0).numpy(), expected)
     assert keys == [f"0/{i}" for i in range(5)]
-    assert [sample.size for sample in datamodule.test_samples()] == [(96, 72)] * 3
+    assert [datamodule.test_source.sample(i, 0).size for i in range(3)] == [(96, 72)] * 3
 
 
 @pytest.mark.parametrize("shuffle", [True, False])

@@ -358,15 +358,16 @@ def test_without_a_terminal_lines_go_to_the_log(
     with caplog.at_level("INFO"), ProgressDisplay(Console(file=StringIO())) as progress:
         for done in (20, 20, 100, 110):
             progress(done, 1300)
-    assert caplog.messages == ["100 of 1,300 images, 2.0/s, 10 min left"]
+    (message,) = caplog.messages
+    assert "100 of 1,300" in message
+    assert "10 min" in message
 
 
 def test_a_report_says_what_it_cost() -> None:
-    report = Report(100, 50, 0, 10.0, 1.0, 0.5)
-    assert str(report) == (
-        "50 of 100 images rendered in 10 s: 5.0 images/s, "
-        "30.0 CPU-ms an image (rendering 20.0, writing 10.0)"
-    )
+    said = str(Report(100, 50, 0, 10.0, 1.0, 0.5))
+    assert "50 of 100" in said
+    assert "5.0 images/s" in said
+    assert "30.0 CPU-ms" in said
 
 
 def test_writers_agree_on_the_names() -> None:

@@ -1,4 +1,4 @@
-"""Contact sheets and map panels: every picture where it belongs."""
+"""Contact sheets: every picture where it belongs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dopepp.drawing.maps import map_panel
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.drawing.text import text_coverage
 
@@ -60,31 +59,3 @@ def test_text_fits_its_line_and_is_as_wide_as_its_letters() -> None:
     assert letters.max() > 0.9
     assert letters[0].max() < 0.1  # nothing is cut off above or below
     assert letters[-1].max() < 0.1
-
-
-def test_a_belief_lies_over_the_pixels_its_cell_covers() -> None:
-    image = plain(GREY, 160, 96)
-    belief = np.zeros((9, 12, 20), np.float32)
-    belief[7, 4, 11] = 1
-    panel = map_panel(image, belief, tile_width=160)
-    assert panel.shape == (3 * (96 + 18) + 4 * 6, 3 * 160 + 4 * 6, 3)
-    # Corner 7 is the second tile of the third row.
-    top, left = 6 + 2 * (96 + 18 + 6), 6 + 160 + 6
-    tile = panel[top : top + 96, left : left + 160].astype(int)
-    hot = np.argwhere(np.abs(tile - 54).max(axis=2) > 100)  # 54 = the dimmed grey
-    np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
-    assert (panel[6:102, 6:166] == 54).all()  # corner 0 believes nothing
-
-
-def test_padding_of_the_maps_is_cut_off_and_bad_values_are_clipped() -> None:
-    belief = np.full((9, 12, 20), np.nan, np.float32)
-    belief[0] = 7.0
-    belief[1] = -np.inf
-    panel = map_panel(plain(GREY, 150, 90), belief, tile_width=150)
-    assert panel.shape == (3 * (90 + 18) + 24, 3 * 150 + 24, 3)
-
-
-@pytest.mark.parametrize("shape", [(8, 12, 20), (9, 11, 40), (9, 40, 19), (12, 20)])
-def test_maps_that_do_not_cover_the_image_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="do not cover a 96×160 image"):
-        map_panel(plain(GREY, 160, 96), np.zeros(shape, np.float32))

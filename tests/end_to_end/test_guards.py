@@ -70,8 +70,9 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(
     done = call("train.py", f"resume={run}", *again)
     assert done.code == 1
     line = done.err.rstrip("\n").rpartition("\n")[2]
-    assert "loss and gradient not finite in step 4 (3 steps in a row): the run ends" in line
-    assert f"its batch is in {run / 'nonfinite'}; go on with resume={run}" in line
+    assert "not finite in step 4 (3 steps in a row)" in line
+    assert str(run / "nonfinite") in line
+    assert line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
     for name in ("best.ckpt", "last.ckpt"):
         content = torch.load(run / "checkpoints" / name, weights_only=True)
@@ -112,7 +113,7 @@ def test_an_evaluation_says_when_the_images_are_no_longer_those(
 
     monkeypatch.setattr(Factory, "render", darker)
     (line,) = warnings()
-    assert line.endswith("though their configuration is the same: pixels of the first image")
+    assert line.endswith("pixels of the first image")
     # Another test set is what its user asks for.
     assert warnings("virtual.preset=table") == []
     # … and in training these are other data.

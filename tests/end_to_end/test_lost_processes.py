@@ -98,7 +98,7 @@ def test_a_run_goes_on_without_weights_and_biases(
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-4000:]
-    assert done.stderr.count("a logger failed and is off for the rest of the run") == 1
+    assert done.stderr.count("a logger failed") == 1
     assert time.monotonic() - started < 300
     table = (find_run(tmp_path) / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in table] == ["step", "0", "1"]

@@ -151,7 +151,7 @@ def test_a_service_that_dies_in_the_middle_ends_nothing(
         out, err = process.communicate(timeout=200)
     assert killed.returncode == 0
     assert process.returncode == 0, err[-3000:]
-    assert "a logger failed and is off for the rest of the run" in err
+    assert "a logger failed" in err
     sweep = sweep_of(tmp_path)
     assert all((sweep / job / "metrics.json").is_file() for job in "01")
     assert "comparison" in out

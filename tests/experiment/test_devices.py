@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from dopepp.errors import RunError, UserError
-from dopepp.experiment.command_line import _refuse_parallel_multirun
 from dopepp.experiment.devices import num_processes
 
 
@@ -42,18 +41,11 @@ def test_how_many_processes_there_will_be(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert num_processes(options) == count
-    config = {"trainer": options}
-    if count == 1:
-        _refuse_parallel_multirun(config)
-    else:
-        with pytest.raises(UserError, match=r"in a multirun.*run the whole sweep again"):
-            _refuse_parallel_multirun(config)
 
 
 def test_processes_that_torchrun_has_started_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(UserError, match="in a multirun"):
-        _refuse_parallel_multirun({"trainer": {"devices": 1}})
+    assert num_processes({"devices": 1}) == 2
 
 
 @pytest.mark.parametrize(

@@ -132,10 +132,9 @@ def test_holes_are_counted_in_one_line(tmp_path: Path, caplog: pytest.LogCapture
     (tmp_path / "a.stl").write_bytes(export_stl(ball))
     with caplog.at_level(logging.INFO):
         loaded = read_mesh(tmp_path / "a.stl", "mm")
-    assert [record.message for record in caplog.records] == [
-        f"{tmp_path / 'a.stl'} is not watertight, taken as it is: 3 open edges, "
-        "0 edges of over two triangles"
-    ]
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / 'a.stl'} is not watertight")
+    assert "3 open edges" in message
     assert len(loaded.faces) == 319
 
 

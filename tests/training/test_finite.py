@@ -235,10 +235,8 @@ def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(
     with pytest.raises(RunError) as error:
         Run(system, batches, tmp_path, max_in_a_row=2)
     folder = tmp_path / FOLDER
-    assert str(error.value) == (
-        "loss and gradient not finite in step 2 (2 steps in a row): the run ends; "
-        f"its batch is in {folder}"
-    )
+    assert "loss and gradient not finite in step 2 (2 steps in a row)" in str(error.value)
+    assert str(error.value).endswith(str(folder))
     dumped = torch.load(folder / "step_2_rank_0.pt", weights_only=True)
     assert (dumped["step"], dumped["epoch"]) == (2, 0)
     assert np.isnan(dumped["loss"])

@@ -17,7 +17,7 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.part import Part
 from dopepp.training.symmetry import FACING, SymmetryHandling, SymmetryOptions
-from dopepp.training.system import PoseSystem
+from dopepp.training.system import PoseSystem, draw_maps
 
 SystemMaker = Callable[..., PoseSystem]
 K = camera_matrix(110.0, 110.0, 63.5, 63.5)
@@ -158,7 +158,8 @@ def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system: PoseS
     poses = np.stack([make_transform(R, np.array([0, 0, 0.3])) for R in turned])
     batch = make_batch(poses, PLATE)
     found = plate_system.symmetry.equivalents(batch)
-    first, second = (plate_system._draw(batch, found.keypoints[:, :, n]) for n in (0, 1))
+    geometry = plate_system.geometry
+    first, second = (draw_maps(batch, found.keypoints[:, :, n], 1, geometry) for n in (0, 1))
     assert not torch.allclose(first[0], second[0])
     for says in (first, second):
         stages = [(says[0].clamp(min=1e-9).log(), says[1])]
@@ -185,7 +186,7 @@ def test_instances_on_one_image_choose_each_for_itself(plate_system: PoseSystem)
     choices = plate_system.symmetry.equivalents(both).keypoints
     for wanted in ((0, 0), (0, 1), (1, 0), (1, 1)):
         keypoints = torch.stack([choices[:, n, choice] for n, choice in enumerate(wanted)], dim=1)
-        belief, field = plate_system._draw(both, keypoints)
+        belief, field = draw_maps(both, keypoints, 1, plate_system.geometry)
         stages = [(belief.clamp(min=1e-9).log(), field)]
         assert torch.equal(plate_system.targets(both, stages)[0], belief)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -16,11 +15,26 @@ from dopepp.errors import UserError
 from dopepp.virtual import photoreal_variant as variant
 
 _RENDER = """
-import logging
-logging.basicConfig(level=logging.INFO)
+import logging, os
+from dopepp.errors import UserError
 from dopepp.virtual.photoreal_variant import mitsuba
-print("variant", mitsuba().variant())
+logging.basicConfig(level=logging.INFO)
+try:
+    print("variant", mitsuba().variant(), flush=True)
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+    else:
+        mitsuba()
+except UserError as error:
+    print(error, flush=True)
+os._exit(0)
 """
+
+
+@pytest.fixture(autouse=True)
+def mitsuba_is_installed() -> None:
+    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
 
 
 @pytest.fixture
@@ -35,49 +49,36 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> list[list[str]]:
-    """Let the probe run other code in its process; return the list of commands that were run."""
+    """Let other code than the trial run in its process; return the list of commands so far."""
     commands: list[list[str]] = []
     run = subprocess.run
 
     def record(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
         commands.append(command)
-        return run(command, **options)
+        return run([sys.executable, "-c", code], **options)
 
-    monkeypatch.setattr(variant, "_PROBE", code)
     monkeypatch.setattr(subprocess, "run", record)
     return commands
-
-
-@pytest.fixture(autouse=True)
-def mitsuba_is_installed() -> None:
-    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
 
 
 @pytest.mark.parametrize(
     "code", ["import os; os.abort()", "raise SystemExit(1)", "print('LLVM ERROR')"]
 )
-def test_a_library_that_ends_the_process_is_passed_over(
-    library: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    code: str,
+def test_a_library_that_ends_the_process_is_not_usable(
+    library: Path, monkeypatch: pytest.MonkeyPatch, code: str
 ) -> None:
-    commands = stand_in(monkeypatch, code)
-    with caplog.at_level(logging.INFO):
-        assert variant._chosen_library() is None
-    assert f"{library} does not work with Mitsuba" in caplog.text
-    assert commands[0][0] == sys.executable
+    stand_in(monkeypatch, code)
+    assert not variant.is_usable(library)
 
 
 def test_the_outcome_is_remembered_until_the_library_changes(
     library: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     commands = stand_in(monkeypatch, "print('mean', 0.5)")
-    assert variant._chosen_library() == library
-    assert variant._chosen_library() == library
+    assert [variant.is_usable(library) for _ in range(2)] == [True, True]
     assert len(commands) == 1
     os.utime(library, (1, 1))
-    assert variant._chosen_library() == library
+    assert variant.is_usable(library)
     assert len(commands) == 2
 
 
@@ -89,44 +90,21 @@ def test_a_damaged_memory_is_written_anew(
     cache.parent.mkdir(parents=True)
     for damage in ("[" * 100_000, "{", "[1]", '{"a": "b"}', ""):
         cache.write_text(damage)
-        assert variant._chosen_library() == library
+        assert variant.is_usable(library)
         assert list(json.loads(cache.read_text()).values()) == [True]
 
 
-def test_a_probe_without_an_end_is_tried_again_later(
-    library: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    commands = stand_in(monkeypatch, "import time; time.sleep(60)")
-    monkeypatch.setattr(variant, "_PROBE_SECONDS", 0.3)
-    assert variant._chosen_library() is None
-    assert f"{library} could not be tried" in caplog.text
-    assert variant._chosen_library() is None
-    assert len(commands) == 2
-
-
-def test_an_unusable_library_cannot_be_insisted_on(
+def test_a_trial_without_an_end_is_made_again_later(
     library: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stand_in(monkeypatch, "import os; os.abort()")
-    monkeypatch.setenv(variant.VARIANT_SETTING, "llvm_ad_rgb")
-    with pytest.raises(UserError, match=r"DOPEPP_MITSUBA_VARIANT=llvm_ad_rgb with .*libLLVM-15"):
-        variant._chosen_library()
+    def hang(command: list[str], timeout: float, **_: Any) -> None:
+        raise subprocess.TimeoutExpired(command, timeout)
 
-
-def test_the_scalar_variant_tries_no_library(
-    library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert library.exists()
-    commands = stand_in(monkeypatch, "print('mean', 0.5)")
-    monkeypatch.setenv(variant.VARIANT_SETTING, "scalar_rgb")
-    assert variant._chosen_library() is None
-    assert not commands
-
-
-def test_a_wrong_variant(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(variant.VARIANT_SETTING, "cuda_ad_rgb")
-    with pytest.raises(UserError, match=r"DOPEPP_MITSUBA_VARIANT='cuda_ad_rgb'.*llvm_ad_rgb"):
-        variant._chosen_library()
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "run", hang)
+        assert not variant.is_usable(library)
+    stand_in(monkeypatch, "print('mean', 0.5)")
+    assert variant.is_usable(library)
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "many", ""])
@@ -141,35 +119,52 @@ def test_threads_are_set(monkeypatch: pytest.MonkeyPatch) -> None:
     assert variant.num_threads() == 3
 
 
-def test_names_give_versions_and_linker_scripts_are_no_libraries(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_newest_library_comes_first(
+    library: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.delenv(variant.LIBRARY_SETTING, raising=False)
-    monkeypatch.setattr(variant, "_PLACES", (f"{tmp_path}/libLLVM*.so*",))
-    monkeypatch.setattr(sys, "prefix", str(tmp_path / "nothing"))
-    monkeypatch.setenv("RUSTUP_HOME", str(tmp_path / "nothing"))
-    for name in ("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM-17.so", "libLLVM.so"):
-        (tmp_path / name).write_bytes(b"\0" * 2_000_000)
-    (tmp_path / "libLLVM-22.so").write_text("INPUT(libLLVM.so.22.1)")
+    assert variant.candidates() == [library]
+    monkeypatch.delenv(variant.LIBRARY_SETTING)
+    monkeypatch.setattr(variant, "PLACES", (f"{tmp_path}/libLLVM*.so.*",))
+    (tmp_path / "libLLVM.so.19.1").touch()
+    (tmp_path / "libLLVM-9.so.1").touch()
+    (tmp_path / "libLLVM-15.0.7.so.1").symlink_to(library)
+    (tmp_path / "libLLVM-22.so").touch()  # without a number at its end: text for the linker
     names = [path.name for path in variant.candidates()]
-    assert names == ["libLLVM.so.19.1", "libLLVM-17.so", "libLLVM-14.so.1", "libLLVM.so"]
+    assert names == ["libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
 
 
 @pytest.mark.render
-def test_a_real_process_survives_a_library_that_is_none(library: Path) -> None:
+@pytest.mark.parametrize(
+    ("setting", "answers"),
+    [
+        (None, ["variant scalar_rgb", "spawn"]),  # a fork lacks the threads of its parent
+        ("llvm_ad_rgb", ["DOPEPP_MITSUBA_VARIANT=llvm_ad_rgb", "libLLVM-15"]),
+        ("cuda_ad_rgb", ["DOPEPP_MITSUBA_VARIANT='cuda_ad_rgb'", "llvm_ad_rgb, scalar_rgb"]),
+    ],
+)
+def test_a_real_process_survives_a_library_that_is_none(
+    library: Path, setting: str | None, answers: list[str]
+) -> None:
+    wish = {} if setting is None else {variant.VARIANT_SETTING: setting}
     done = subprocess.run(
-        [sys.executable, "-c", _RENDER], capture_output=True, text=True, check=False,
-        env={**os.environ, variant.THREADS_SETTING: "1"},
+        [sys.executable, "-c", _RENDER], capture_output=True, text=True, check=False, timeout=120,
+        env={**os.environ, variant.THREADS_SETTING: "1", **wish},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "variant scalar_rgb" in done.stdout
-    assert f"{library} does not work with Mitsuba" in done.stderr
+    for answer in answers:
+        assert answer in done.stdout
+    assert (f"{library} does not work with Mitsuba" in done.stderr) == (setting != "cuda_ad_rgb")
 
 
 @pytest.mark.render
-def test_a_process_forked_after_the_first_image_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
+def test_the_scalar_variant_tries_no_library(
+    library: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(variant, "_start", lambda: os.getpid() + 1)
-    with pytest.raises(UserError, match=r"forked from one.*get_context\('spawn'\)"):
-        variant.mitsuba()
+    monkeypatch.setenv(variant.VARIANT_SETTING, "scalar_rgb")
+    code = "from dopepp.virtual.photoreal_variant import mitsuba; print(mitsuba().variant())"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout == "scalar_rgb\n"
+    assert library.exists()
+    assert not (tmp_path / "cache").exists()

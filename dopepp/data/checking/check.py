@@ -58,12 +58,11 @@ LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], N
 """How each layout is told, in this order, and checked."""
 
 
-def check_dataset(root: Path, progress: Callable[[int], None] | None = None) -> CheckReport:
+def check_dataset(root: Path) -> CheckReport:
     """Check a data set of any known layout; what is found is reported, never raised.
 
     Args:
         root: Its folder.
-        progress: Called with the number of images checked so far; without it the log tells.
 
     Raises:
         UserError: The folder is missing or holds no known layout.
@@ -77,7 +76,7 @@ def check_dataset(root: Path, progress: Callable[[int], None] | None = None) -> 
         raise UserError(f"{root}, which is no folder", known, "give the data set's folder")
     for layout, (is_layout, check) in LAYOUTS.items():
         if is_layout(root):
-            report = CheckReport(root, layout, progress=progress)
+            report = CheckReport(root, layout)
             check(report)
             return report
     raise UserError(f"{root}, a folder of no known layout", known, "give the data set's folder")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -58,7 +57,6 @@ class CheckReport:
     num_defects: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
-    progress: Callable[[int], None] | None = field(default=None, repr=False, compare=False)
 
     @property
     def ok(self) -> bool:
@@ -79,11 +77,9 @@ class CheckReport:
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count an image and tell whoever waits for it."""
+        """Count an image; the log tells how far it is."""
         self.num_images += 1
-        if self.progress is not None:
-            self.progress(self.num_images)
-        elif self.num_images % _LOG_EVERY == 0:
+        if self.num_images % _LOG_EVERY == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
 
     def _relative(self, path: Path | str) -> str:

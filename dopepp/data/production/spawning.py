@@ -1,7 +1,7 @@
 """Start a worker process.
 
-Workers are spawned, not forked: an EGL context and Mitsuba's thread pool do not survive a fork, and
-a spawned process starts alike on every system. It costs each of them about a second, once.
+Workers are spawned, not forked: Mitsuba's thread pool does not survive a fork, and a spawned
+process starts alike on every system. It costs each of them about a second, once.
 """
 
 from __future__ import annotations

@@ -21,7 +21,6 @@ from dopepp.metrics.functional.rates import (
     average_recall,
     pass_rate,
 )
-from dopepp.metrics.functional.visible_surface import vsd
 
 __all__ = [
     "BOP_MSPD_THRESHOLDS",
@@ -40,6 +39,5 @@ __all__ = [
     "reprojection_error",
     "rotation_error_deg",
     "translation_error",
-    "vsd",
     "wilson_interval",
 ]
