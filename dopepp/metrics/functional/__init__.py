@@ -21,6 +21,7 @@ from dopepp.metrics.functional.rates import (
     average_recall,
     pass_rate,
 )
+from dopepp.metrics.functional.visible_surface import vsd
 
 __all__ = [
     "BOP_MSPD_THRESHOLDS",
@@ -39,5 +40,6 @@ __all__ = [
     "reprojection_error",
     "rotation_error_deg",
     "translation_error",
+    "vsd",
     "wilson_interval",
 ]

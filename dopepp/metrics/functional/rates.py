@@ -15,7 +15,7 @@ from dopepp.metrics.functional.inputs import nan_is_miss, to_float64
 AucMethod = Literal["exact", "voc"]
 
 BOP_THRESHOLDS: Final = tuple(round(0.05 * k, 2) for k in range(1, 11))
-"""0.05 to 0.5, times the diameter: of MSSD (BOP)."""
+"""0.05 to 0.5: of VSD's error and, times the diameter, of VSD's tolerance and of MSSD (BOP)."""
 
 BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
 """5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
@@ -67,7 +67,8 @@ def average_recall(errors: Float[Tensor, "n"], thresholds: Sequence[float]) -> f
     """Mean of the pass rates at several thresholds: BOP's AR of one error function.
 
     AR_MSSD takes :data:`BOP_THRESHOLDS` times the diameter, AR_MSPD
-    :data:`BOP_MSPD_THRESHOLDS` times width/640.
+    :data:`BOP_MSPD_THRESHOLDS` times width/640. AR_VSD is the mean over VSD's tolerances of the
+    average recall at :data:`BOP_THRESHOLDS`. A data set's AR is the mean of the three.
 
     Args:
         errors: One error per instance that is to be found; a miss is infinite.

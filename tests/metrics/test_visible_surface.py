@@ -1,4 +1,4 @@
-"""Average precision and recall against their definitions."""
+"""VSD against a loop over pixels; average precision and recall against their definitions."""
 
 from __future__ import annotations
 
@@ -16,9 +16,61 @@ from dopepp.metrics.functional import (
     average_precision,
     average_recall,
     pass_rate,
+    vsd,
 )
 
 Array = NDArray[np.float64]
+K = np.array([[100.0, 0, 7], [0, 110, 6], [0, 0, 1]])
+
+
+def loop_vsd(est: Array, gt: Array, test: Array, tau: float, delta: float) -> float:
+    cost, union = 0, 0
+    for v in range(est.shape[0]):
+        for u in range(est.shape[1]):
+            ray = np.sqrt(((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2 + 1)
+            a, b, c = ray * est[v, u], ray * gt[v, u], ray * test[v, u]
+            in_gt = b > 0 and (c == 0 or b - c <= delta)
+            in_est = a > 0 and (c == 0 or a - c <= delta or in_gt)
+            union += in_gt or in_est
+            if in_gt != in_est or (in_gt and in_est and abs(a - b) >= tau):
+                cost += 1
+    return cost / union if union else 1.0
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 100_000))
+def test_vsd_is_its_definition(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = (3, 11, 13)
+    est, gt, test = (
+        np.where(rng.random(shape) < 0.6, rng.normal(0.8, 0.01, shape), 0.0) for _ in range(3)
+    )
+    est[2], gt[2] = 0.0, 0.0
+    taus = [0.004, 0.01, 0.03]
+    expected = [[loop_vsd(est[n], gt[n], test[n], tau, 0.015) for tau in taus] for n in range(3)]
+    depths = [torch.from_numpy(depth) for depth in (est, gt, test)]
+    camera = torch.from_numpy(K)
+    np.testing.assert_allclose(vsd(*depths, camera, taus), expected, atol=1e-12)
+    shares = [tau / 0.2 for tau in taus]
+    np.testing.assert_allclose(vsd(*depths, camera, shares, diameter=0.2), expected, atol=1e-12)
+
+
+def test_vsd_of_what_nobody_sees_is_one_and_of_the_truth_is_zero() -> None:
+    depth = torch.zeros(1, 8, 8)
+    depth[:, 2:6, 2:6] = 0.5
+    camera = torch.from_numpy(K)
+    assert vsd(depth, depth, torch.zeros(1, 8, 8), camera, [0.01]).tolist() == [[0.0]]
+    before_it = torch.full((1, 8, 8), 0.2)
+    assert vsd(depth, depth, before_it, camera, [0.01]).tolist() == [[1.0]]
+
+
+def test_vsd_refuses_what_means_nothing() -> None:
+    depth, camera = torch.zeros(1, 4, 4), torch.from_numpy(K)
+    for taus, delta in (([], 0.015), ([0.0], 0.015), ([0.01], -1.0)):
+        with pytest.raises(UserError, match="taus"):
+            vsd(depth, depth, depth, camera, taus, delta)
+    with pytest.raises(ValueError, match="one shape"):
+        vsd(depth, depth, torch.zeros(1, 4, 5), camera, [0.01])
 
 
 def loop_average_precision(scores: Array, correct: NDArray[np.bool_], instances: int) -> float:
