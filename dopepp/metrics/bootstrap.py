@@ -10,6 +10,7 @@ To take another statistic, add its function to :data:`STATISTICS`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -131,8 +132,9 @@ def seeds_to_tell(
 ) -> float:
     """Return about how many paired seeds would tell a difference in means from chance.
 
-    With S seeds the interval reaches z · √(V + W / S) to both sides: V is the variance of the mean
-    over instances, W that of the difference over seeds, both estimated from the seeds there are.
+    With S seeds the interval reaches √(z² · V + t₍S₋₁₎² · W / S) to both sides: V is the variance
+    of the mean over instances, W that of the difference over seeds, both estimated from the seeds
+    there are.
 
     Args:
         mine: Of each object a number per seed and instance; two seeds or more.
@@ -140,15 +142,27 @@ def seeds_to_tell(
         confidence: Of the interval.
 
     Returns:
-        S, infinite where these instances are too few for any number of seeds.
+        S, more than there are; infinite where these instances are too few for any number of seeds.
     """
     differences = [one - other for one, other in zip(mine, baseline, strict=True)]
+    if min(one.shape[1] for one in differences) < 2:
+        return math.inf
     effects = np.mean([one.mean(axis=1) for one in differences], axis=0)
     over_instances = sum(one.mean(axis=0).var(ddof=1) / one.shape[1] for one in differences)
-    over_instances /= len(differences) ** 2
-    z = norm.ppf((1 + confidence) / 2)
-    room = (effects.mean() / z) ** 2 - over_instances
-    return math.ceil(effects.var(ddof=1) / room) if room > 0 else math.inf
+    level = (1 + confidence) / 2
+    z = norm.ppf(level)
+    room = effects.mean() ** 2 - z**2 * over_instances / len(differences) ** 2
+    if room <= 0:
+        return math.inf
+    over_seeds = effects.var(ddof=1)
+    # Student's t is above z, so no fewer than these; and it comes down to z soon.
+    fewest = max(len(effects) + 1, math.ceil(z**2 * over_seeds / room))
+    reached = (
+        num
+        for num in itertools.count(fewest)
+        if t.ppf(level, num - 1) ** 2 * over_seeds < room * num
+    )
+    return float(next(reached))
 
 
 def fewest_differing(confidence: float) -> int:

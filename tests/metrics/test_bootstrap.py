@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import bootstrap, norm
+from scipy.stats import bootstrap, norm, t
 
 from dopepp.errors import UserError
 from dopepp.metrics.bootstrap import (
@@ -220,25 +220,34 @@ def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, messa
         paired_difference(mine, baseline, **options)
 
 
-def test_as_many_seeds_as_it_says_tell_a_difference() -> None:
-    """Trainings of a known spread: with the seeds it asks for, the interval just leaves out 0."""
+@settings(deadline=None, max_examples=50)
+@given(
+    gain=st.floats(0.005, 0.1),
+    spread=st.floats(0.001, 0.2),
+    noise=st.floats(0, 0.02),
+    seeds=st.integers(2, 6),
+)
+def test_as_many_seeds_as_it_says_tell_a_difference(
+    gain: float, spread: float, noise: float, seeds: int
+) -> None:
+    """Of a known spread over seeds and images, the interval with so many just leaves out 0."""
     rng = np.random.default_rng(4)
-    images, gain, spread = 1000, 0.04, 0.1
+    over_seeds, over_images = rng.normal(size=seeds), rng.normal(size=50)
+    over_seeds = spread * (over_seeds - over_seeds.mean()) / over_seeds.std(ddof=1)
+    over_images = noise * (over_images - over_images.mean()) / over_images.std(ddof=1)
+    mine = 0.5 + gain + over_seeds[:, None] + over_images
+    asked = seeds_to_tell([mine], [np.full_like(mine, 0.5)])
 
-    def trained(num_seeds: int, shift: float) -> np.ndarray:
-        skill = 0.5 + shift + spread * rng.normal(size=(num_seeds, 1))
-        return (rng.random((num_seeds, images)) < skill).astype(float)
+    def reach(num: float) -> float:
+        of_seeds = t.ppf(0.975, num - 1) ** 2 * spread**2 / num
+        return float(np.sqrt(Z**2 * noise**2 / 50 + of_seeds))
 
-    asked = seeds_to_tell([trained(400, gain)], [trained(400, 0.0)])
-    # W is the variance of a difference of two trainings; V and the draws of images are small here.
-    assert asked == pytest.approx(2 * (Z * spread / gain) ** 2, rel=0.35)
-    seeds = int(asked)
-    found = [
-        paired_difference([trained(seeds, gain)], [trained(seeds, 0.0)], num_resamples=300)
-        for _ in range(24)
-    ]
-    told = np.mean([one is not None and not one.within_noise for one in found])
-    assert 0.25 < told < 0.8  # about every second time, as the interval's end then lies at 0
+    if asked == np.inf:
+        assert Z * noise / np.sqrt(50) >= gain * (1 - 1e-9)
+    else:
+        assert asked > seeds
+        assert reach(asked) < gain * (1 + 1e-9)
+        assert asked == seeds + 1 or reach(asked - 1) >= gain * (1 - 1e-9)
 
 
 def test_too_few_images_are_not_made_up_for_by_seeds() -> None:
