@@ -122,7 +122,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
         entries: The sweep's methods; one without a result is a row that says why.
         folder: Where the files go.
     """
-    title = ", ".join([table.title, *_recipe(entries)])
+    title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     methods = table.methods(entries)
     rows = KINDS[table.kind](table, methods, folder)
     labels = sum(heading in LABELS for heading in rows[0])
