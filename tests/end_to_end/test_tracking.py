@@ -137,6 +137,26 @@ def test_every_job_is_a_run_and_the_comparison_one_more(
     }  # fmt: skip
 
 
+def test_a_resumed_run_goes_on_in_the_same_run(
+    call: Runner, find_run: Callable[[Path], Path], tiny: tuple[str, ...], tmp_path: Path
+) -> None:
+    assert call("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}").code == 0
+    run = find_run(tmp_path)
+    done = call("train.py", f"resume={run}", "trainer.max_epochs=2", "resume_anyway=true")
+    assert done.code == 0, done.err[-3000:]
+    paths = sorted(run.glob("wandb/offline-run-*/*.wandb"))
+    assert len(paths) == 2
+    assert paths[0].name == paths[1].name  # it is called after the run's id
+    before, after = map(Tracked.read, paths)
+    assert before.name == after.name
+    assert before.group == after.group == ""
+    first, second = (
+        {one["trainer/global_step"] for one in run.history if "train/loss" in one}
+        for run in (before, after)
+    )
+    assert max(first) < min(second)
+
+
 def test_a_service_that_dies_in_the_middle_ends_nothing(
     start: Callable[..., subprocess.Popen[str]], tiny: tuple[str, ...], tmp_path: Path
 ) -> None:
