@@ -1,6 +1,6 @@
 """Mesh files (STL, OBJ, PLY) and YCB-Video models, in metres, checked before they are used.
 
-To add a format, write a reader that returns a :data:`~dopepp.parts.measure.RawMesh` and raises for
+To add a format, write a reader that returns a :class:`~dopepp.parts.measure.RawMesh` and raises for
 a damaged file, and one line in :data:`READERS`.
 """
 
@@ -70,7 +70,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
             "reduce its triangles, or write it as a binary file",
         )
     try:
-        vertices, faces, uv, texture = reader(path)
+        vertices, faces, uv, texture, _ = reader(path)
     except UserError:
         raise
     except ValueError as error:

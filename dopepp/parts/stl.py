@@ -37,7 +37,7 @@ def read_stl(path: Path) -> RawMesh:
     if len(data) == start + num_triangles * _STL_TRIANGLE.itemsize and num_triangles:
         corners = np.frombuffer(data, _STL_TRIANGLE, offset=start)["corners"].reshape(-1, 3)
         faces = np.arange(len(corners)).reshape(-1, 3)
-        return *_welded(corners.astype(np.float64), faces), None, None
+        return RawMesh(*_welded(corners.astype(np.float64), faces))
     if b"\0" in data:  # never in text
         raise ValueError(
             f"{len(data)} bytes where its header promises {num_triangles} triangles, "
@@ -48,7 +48,7 @@ def read_stl(path: Path) -> RawMesh:
     begun = sum(1 for _ in _FACET.finditer(data))
     if begun != len(faces):
         raise ValueError(f"{begun} facets begun and {len(faces)} ended")
-    return *_welded(vertices, faces), None, None
+    return RawMesh(*_welded(vertices, faces))
 
 
 def _welded(
