@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.errors import UserError
+from dopepp.parts.library import read_stl
 from dopepp.parts.measure import face_areas
 from dopepp.parts.obj import read_obj
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
 from dopepp.parts.ply import read_ply
-from dopepp.parts.stl import read_stl
 from dopepp.parts.topology import find_topology, opposed_faces, turn_over
 
 logger = logging.getLogger(__name__)

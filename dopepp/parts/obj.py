@@ -1,8 +1,10 @@
 """A strict Wavefront OBJ reader: positions, faces, texture coordinates, one texture.
 
-A reader of its own, because a damaged line must be an error that names it, and a missing texture
-too. Normals, groups, smoothing, lines, colours and all maps but ``map_Kd`` are left out: a part's
-look is its shape and its texture.
+trimesh does not read them, as a damaged line must be an error that names it: trimesh leaves out
+faces that are cut short or written with tabs, takes index 0 for a vertex and relative ones from
+the file's end, loses a texture without a word, and splits vertices where normals differ, so that
+the mesh would be another one (``tests/parts/test_library.py``). Normals, groups, smoothing, lines,
+colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its texture.
 """
 
 from __future__ import annotations

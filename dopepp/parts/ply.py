@@ -1,7 +1,9 @@
 """A strict PLY reader: text and both byte orders, polygons, any further elements and properties.
 
-A reader of its own, because PLY files in the wild mix triangles with larger polygons, and because a
-header's promises must be held against the file's length before anything is allocated.
+trimesh does not read them, as only who reads a file's every list can tell that it is whole:
+trimesh refuses a binary file of triangles and quads, or takes it for others where their sizes
+happen to agree, and of a text that ends too early it makes a smaller mesh
+(``tests/parts/test_library.py``).
 """
 
 from __future__ import annotations
