@@ -1,8 +1,8 @@
-"""STL files: checked to be whole, then read by trimesh.
+"""STL and 3MF files: checked to be whole and harmless, then read by trimesh.
 
-trimesh takes a file that ends too early for a smaller mesh; ``tests/parts/test_library.py`` holds
-the cases. To add a format that trimesh reads, check its file first and hand it to
-:func:`read_scene`.
+trimesh takes a file that ends too early for a smaller mesh, and spends what memory and time a file
+asks for. ``tests/parts/test_library.py`` and ``tests/security/test_hostile_scenes.py`` hold the
+cases. To add a format that trimesh reads, check its file first and hand it to :func:`read_scene`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,30 @@ from __future__ import annotations
 import io
 import re
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 
+from dopepp.errors import UserError
 from dopepp.parts.measure import RawMesh, weld
+
+MAX_UNPACKED_BYTES: Final = 50_000_000
+"""Of the text in a 3MF file: trimesh takes 17 times as much memory."""
+
+MAX_RATIO: Final = 30
+"""Bytes that a byte of a 3MF file unpacks to, over five megabytes: models have 5 to 15."""
+
+MAX_PIECES: Final = 1000
+"""Meshes that make up one part: far above any part's bodies, and a bound on time."""
 
 MAX_TRIANGLES: Final = 5_000_000
 """Of all pieces, each counted as often as it is shown."""
+
+UNITS_3MF: Final = {"millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "inch"}
+"""Ours by 3MF's name, which also has feet and micrometres."""
 
 _STL_HEADER: Final = 84
 _STL_TRIANGLE: Final = 50
@@ -110,3 +124,67 @@ def read_stl(path: Path) -> RawMesh:
             f"vertex {corner % 3 + 1}"
         )
     return RawMesh(*weld(vertices, faces))
+
+
+def read_3mf(path: Path) -> RawMesh:
+    """Read what a 3MF file's build shows, in the unit that it states.
+
+    Raises:
+        UserError: The unit is not one of ours.
+        ValueError: The file is no whole archive, unpacks to too much, declares a document type,
+            shows objects of other files, or ones that are not above their users.
+    """
+    size = path.stat().st_size
+    _check_size(size)
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+        _check_size(unpacked, max(MAX_UNPACKED_BYTES // 10, MAX_RATIO * size))
+        names = [name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()]
+        if len(names) != 1:
+            raise ValueError(f"{len(names)} 3D/3dmodel.model where one must be")
+        model = archive.read(names[0])
+    if b"<!DOCTYPE" in model.replace(b"\0", b""):  # also in UTF-16
+        raise ValueError("a document type, which 3MF forbids")
+    num_pieces = _count_pieces(model)
+    mesh, num_read = read_scene(path.read_bytes(), "3mf")
+    if num_read != num_pieces:  # trimesh gives up on crowded assemblies
+        raise ValueError(f"{num_pieces} objects shown, {num_read} read")
+    unit = str(mesh.unit).removesuffix("s")  # it calls the default one "millimeters"
+    if unit not in UNITS_3MF:
+        raise UserError(
+            f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF), "export it in millimetres"
+        )
+    return mesh._replace(unit=UNITS_3MF[unit])
+
+
+def _count_pieces(model: bytes) -> int:
+    """Count the meshes that a 3MF build shows.
+
+    trimesh follows objects that contain themselves, and one that is doubled twenty times over, for
+    hours. Of objects in another file it takes all where one is meant.
+    """
+    from lxml import etree
+
+    pieces: dict[str, int] = {}
+    shown = 0
+    tags = ("{*}object", "{*}item")
+    for _, element in etree.iterparse(io.BytesIO(model), tag=tags, resolve_entities=False):
+        users = [element] if element.tag.endswith("item") else element.findall(".//{*}component")
+        if any(name.endswith("path") for user in users for name in user.attrib):
+            raise ValueError("objects in other files of the archive")
+        unknown = [user.get("objectid") for user in users if user.get("objectid") not in pieces]
+        if unknown:
+            raise ValueError(f"object {unknown[0]!r} used above its end, or nowhere defined")
+        count = sum(pieces[user.get("objectid")] for user in users)
+        if element.tag.endswith("item"):
+            shown += count
+        else:
+            pieces[element.attrib["id"]] = count or 1
+        if max(len(pieces), shown, count) > MAX_PIECES:
+            raise ValueError(f"over {MAX_PIECES} objects")
+    return shown
+
+
+def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
+    if num_bytes > min(most, MAX_UNPACKED_BYTES):
+        raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {most / 1e6:.0f} MB")

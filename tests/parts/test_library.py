@@ -38,6 +38,8 @@ def ply_faces(*faces: list[int], form: str = "<", lists: str = "B{}i") -> bytes:
     return header + b"end_header\n" + BOX.vertices.astype("<f4").tobytes() + b"".join(rows)
 
 
+OFF = "OFF\n8 6 0\n" + "".join(f"{x} {y} {z}\n" for x, y, z in BOX.vertices.tolist())
+OFF += "".join(f"4 {' '.join(map(str, face))}\n" for face in QUADS)
 TEXT_PLY = export_ply(BOX, encoding="ascii")
 PENTAGON_AND_TRIANGLE = [*QUADS[:2], [0, 4, 5, 1, 0], [2, 3, 7]]
 """As long together as two quads."""
@@ -58,6 +60,9 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
     "hexagon.obj": (HEXAGON + "f 1/1 2/1 3/1\nf 1 2 3 4 5 6\n", 2, 5),
     "library.obj": (obj("usemtl m\nf 1/1 2/2 3/1\n", "mtllib gone.mtl\n"), 1, "does not exist"),
     "cut.stl": (export_stl_ascii(BOX) + export_stl_ascii(BOX)[:900], 12, "begun and 12 ended"),
+    "cut.off": (OFF.rsplit("\n", 2)[0], 10, "13 lines"),
+    "pentagon.off": (OFF.replace("4 1 5 7 3", "5 1 5 7 3 1"), -1, 12),
+    "short.off": (OFF.replace("4 0 1 3 2", "4 0 1 3"), 11, "face 0 of 4 corners"),
 }
 
 
