@@ -138,7 +138,10 @@ def predict(
 @app.command()
 def render(
     parts: Annotated[
-        list[str], typer.Argument(help="mesh files (STL, OBJ, PLY), built-in parts, or NAME=FILE")
+        list[str],
+        typer.Argument(
+            help="mesh files (STL, OBJ, PLY, GLB, 3MF, OFF), built-in parts, or NAME=FILE"
+        ),
     ],
     out: Annotated[Path, typer.Option(help="folder of the data set; with --preview also a .png")],
     num: Annotated[int | None, typer.Option("-n", help="number of images")] = None,
@@ -264,7 +267,9 @@ def compare(
 
 @app.command()
 def symmetries(
-    part: Annotated[str, typer.Argument(help="a mesh file (STL, OBJ, PLY) or a built-in part")],
+    part: Annotated[
+        str, typer.Argument(help="a mesh file (STL, OBJ, PLY, GLB, 3MF, OFF) or a built-in part")
+    ],
     unit: Annotated[str | None, typer.Option(help="of the mesh file: mm, cm, m, inch")] = None,
     tolerance: Annotated[
         float, typer.Option(help="largest miss of the surface, share of the diameter")

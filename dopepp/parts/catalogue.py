@@ -8,7 +8,7 @@ from typing import Final
 
 from dopepp.errors import UserError
 from dopepp.parts.builtin import pivconnector, servoholder
-from dopepp.parts.mesh import ASSUMED_UNIT, READERS, read_mesh
+from dopepp.parts.mesh import READERS, read_in_unit
 from dopepp.parts.part import Part, make_part
 
 BUILTIN: Final[dict[str, Callable[[], Part]]] = {
@@ -22,9 +22,10 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
     Args:
-        path_or_name: ``servoholder``, ``pivconnector``, or the path of an STL, OBJ or PLY file.
-        unit: The file's unit; None takes millimetres and says so in the log. A built-in part has
-            its size without it, so that one unit can go with a list of files and built-in parts.
+        path_or_name: ``servoholder``, ``pivconnector``, or the path of a mesh file.
+        unit: The file's unit; None takes the one it has by its format, or millimetres, which the
+            log says. A built-in part has its size without it, so that one unit can go with a list
+            of files and built-in parts.
 
     Raises:
         UserError: There is no such part or file, or the file cannot be used (see
@@ -40,4 +41,5 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
             f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}",
             "check the spelling",
         )
-    return make_part(path.stem, read_mesh(path, unit), unit=unit or ASSUMED_UNIT)
+    mesh, taken = read_in_unit(path, unit)
+    return make_part(path.stem, mesh, unit=taken)

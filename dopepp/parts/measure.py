@@ -8,20 +8,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
-
-RawMesh = tuple[
-    Float[np.ndarray, "vertices 3"],
-    Int[np.ndarray, "faces 3"],
-    Float[np.ndarray, "vertices 2"] | None,
-    UInt8[np.ndarray, "height width 3"] | None,
-]
-"""What a format's reader returns: vertices in the file's unit, faces, uv and texture."""
 
 NUM_SURFACE_POINTS: Final = 2000
 """ADD points of a CAD part, a fixed number so that the results of two runs compare."""
@@ -34,6 +26,16 @@ _NUM_DIRECTIONS: Final = 2500
 
 SURFACE_SEED: Final = 2000
 """Fixed seed of the surface samples: the same mesh has the same ADD points everywhere."""
+
+
+class RawMesh(NamedTuple):
+    """What a format's reader returns: a file's triangles, in the unit that it states, if any."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "vertices 2"] | None = None
+    texture: UInt8[np.ndarray, "height width 3"] | None = None
+    unit: str | None = None
 
 
 def face_areas(
@@ -164,36 +166,3 @@ def weld(
     index = np.empty(len(ranked), np.int64)
     index[order] = np.cumsum(new) - 1
     return ranked[new], index[faces]
-
-
-def first_folded_polygon(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    polygons: Int[np.ndarray, " faces"],
-) -> int | None:
-    """Return a polygon whose fan of triangles folds over, so that it is not the polygon's area.
-
-    Args:
-        vertices: Positions.
-        faces: The fans' triangles.
-        polygons: The polygon each triangle was cut from.
-
-    Returns:
-        The first such polygon's number in ``polygons``, None where there is none.
-    """
-    polygon_ids, index = np.unique(polygons, return_inverse=True)
-    if len(polygon_ids) == len(faces):
-        return None
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    normals = np.cross(b - a, c - a)
-    totals = np.zeros((len(polygon_ids), 3))
-    np.add.at(totals, index, normals)
-    alignment = np.einsum("fi,fi->f", normals, totals[index])
-    # A triangle that is flat but for rounding may point anywhere.
-    folded = alignment < -1e-9 * np.einsum("pi,pi->p", totals, totals)[index]
-    # A bow tie's two halves cancel out.
-    parts = np.bincount(index, np.einsum("fi,fi->f", normals, normals))
-    cancelled = np.einsum("pi,pi->p", totals, totals) <= 1e-9 * parts
-    tiny = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
-    folded |= (cancelled & (parts > tiny * tiny))[index]
-    return int(polygons[folded.argmax()]) if folded.any() else None

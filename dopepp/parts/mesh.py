@@ -1,6 +1,6 @@
-"""Mesh files (STL, OBJ, PLY) and YCB-Video models, in metres, checked before they are used.
+"""Mesh files and YCB-Video models, in metres, checked before they are used.
 
-To add a format, write a reader that returns a :data:`~dopepp.parts.measure.RawMesh` and raises for
+To add a format, write a reader that returns a :class:`~dopepp.parts.measure.RawMesh` and raises for
 a damaged file, and one line in :data:`READERS`.
 """
 
@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from dopepp.errors import UserError
-from dopepp.parts.measure import face_areas
+from dopepp.parts.gltf import read_glb
+from dopepp.parts.library import read_3mf, read_stl
+from dopepp.parts.measure import RawMesh, face_areas
 from dopepp.parts.obj import read_obj
+from dopepp.parts.off import read_off
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
 from dopepp.parts.ply import read_ply
-from dopepp.parts.stl import read_stl
 from dopepp.parts.topology import find_topology, opposed_faces, turn_over
 
 logger = logging.getLogger(__name__)
@@ -33,27 +36,40 @@ MAX_BYTES: Final = 250_000_000
 MAX_POINTS_BYTES: Final = 20_000_000
 """Of a ``points.xyz``: half a million points."""
 
-READERS: Final = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
+READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
+    ".stl": read_stl,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".glb": read_glb,
+    ".3mf": read_3mf,
+    ".off": read_off,
+}
 """The reader of each suffix."""
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """Read an STL, OBJ or PLY file.
+    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file.
 
     Args:
         path: The file; its suffix tells the format.
-        unit: The file's unit: mm, cm, m or inch. None takes millimetres and says so in the log.
+        unit: The file's unit: mm, cm, m or inch. None takes the one that a 3MF file states, metres
+            for GLB, and millimetres for all others, which the log says.
 
     Returns:
         The mesh in metres: duplicate STL vertices merged, flat triangles dropped, triangles turned
         to face as their neighbours do, uv and texture where an OBJ or PLY names a texture in its
-        own folder. It may have open edges and triangles that intersect each other.
+        own folder or a GLB has one. It may have open edges and triangles that intersect each other.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
             unknown; there is no face with an area; a coordinate is not finite; a texture is
             missing, damaged or outside of the mesh's folder.
     """
+    return read_in_unit(path, unit)[0]
+
+
+def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
+    """Read a file as :func:`read_mesh` does; return the unit that it was read in, too."""
     path = Path(path)
     if unit is not None and unit not in UNITS:
         raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), "state the file's unit")
@@ -70,17 +86,20 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
             "reduce its triangles, or write it as a binary file",
         )
     try:
-        vertices, faces, uv, texture = reader(path)
+        raw = reader(path)
     except UserError:
         raise
     except ValueError as error:
         raise _damaged(path, str(error)) from error
     except Exception as error:  # whatever a parser makes of a damaged file
         raise _damaged(path, f"{type(error).__name__}: {error}") from error
-    mesh = _checked(path, UNITS[unit or ASSUMED_UNIT] * vertices, faces, uv, texture)
-    if unit is None:
+    taken = unit or raw.unit or ASSUMED_UNIT
+    mesh = _checked(path, raw._replace(vertices=UNITS[taken] * raw.vertices))
+    if unit is None and raw.unit is None:
         logger.warning("%s states no unit: taken as %s (unit=… changes it)", path, ASSUMED_UNIT)
-    return mesh
+    elif raw.unit not in (None, taken):
+        logger.warning("%s is in %s by its format: taken as %s, as asked", path, raw.unit, taken)
+    return mesh, taken
 
 
 def _is_file(path: Path) -> bool:
@@ -129,14 +148,9 @@ def _read_points(path: Path) -> Float[np.ndarray, "points 3"]:
     return np.asarray(points, np.float64)
 
 
-def _checked(
-    path: Path,
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    uv: Float[np.ndarray, "vertices 2"] | None,
-    texture: UInt8[np.ndarray, "height width 3"] | None,
-) -> Mesh:
+def _checked(path: Path, raw: RawMesh) -> Mesh:
     """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
+    vertices, faces, uv, texture, _ = raw
     if not len(vertices) or not len(faces):
         raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
     for values in (vertices, uv):

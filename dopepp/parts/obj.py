@@ -1,8 +1,10 @@
 """A strict Wavefront OBJ reader: positions, faces, texture coordinates, one texture.
 
-A reader of its own, because a damaged line must be an error that names it, and a missing texture
-too. Normals, groups, smoothing, lines, colours and all maps but ``map_Kd`` are left out: a part's
-look is its shape and its texture.
+trimesh does not read them, as a damaged line must be an error that names it: trimesh leaves out
+faces that are cut short or written with tabs, takes index 0 for a vertex and relative ones from
+the file's end, loses a texture without a word, and splits vertices where normals differ, so that
+the mesh would be another one (``tests/parts/test_library.py``). Normals, groups, smoothing, lines,
+colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its texture.
 """
 
 from __future__ import annotations
@@ -10,14 +12,14 @@ from __future__ import annotations
 import math
 from array import array
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.errors import UserError
-from dopepp.parts.measure import RawMesh, first_folded_polygon
+from dopepp.parts.measure import RawMesh
+from dopepp.parts.polygons import fans, first_folded_polygon
 from dopepp.parts.texture import companion_path, read_materials, read_text, read_texture
 
 NO_COORDINATE = -1
@@ -26,22 +28,24 @@ NO_COORDINATE = -1
 
 @dataclass
 class ObjFile:
-    """An OBJ file's statements, triangulated, indices from 0.
+    """An OBJ file's statements, indices from 0.
 
     Attributes:
-        positions: x, y, z of each ``v`` line, one after the other.
-        coordinates: u, v of each ``vt`` line, one after the other.
-        triangles: Per triangle the position and coordinate indices of its three corners.
-        polygons: Per triangle the number of the ``f`` line it was cut from.
+        positions: x, y, z of each ``v`` line, one after the other; arrays take a tenth of the
+            memory of lists of lists.
+        coordinates: u, v of each ``vt`` line.
+        corners: Position and coordinate index of each corner of each ``f`` line.
+        counts: Corners of each ``f`` line.
+        lines: Its number in the file.
         materials: Names of the materials that faces use; None for faces before any ``usemtl``.
         libraries: Names of the MTL files.
     """
 
-    # Arrays take a tenth of the memory of lists of lists.
     positions: array[float] = field(default_factory=lambda: array("d"))
     coordinates: array[float] = field(default_factory=lambda: array("d"))
-    triangles: array[int] = field(default_factory=lambda: array("q"))
-    polygons: array[int] = field(default_factory=lambda: array("q"))
+    corners: array[int] = field(default_factory=lambda: array("q"))
+    counts: array[int] = field(default_factory=lambda: array("q"))
+    lines: array[int] = field(default_factory=lambda: array("q"))
     materials: set[str | None] = field(default_factory=set)
     libraries: list[str] = field(default_factory=list)
     _material: str | None = None
@@ -52,34 +56,27 @@ class ObjFile:
         Raises:
             ValueError: The line is damaged.
         """
-        keyword, *words = line.split()
-        if keyword == "v":
-            self.positions.extend(_numbers(words, 3))
-        elif keyword == "vt":
-            self.coordinates.extend(_numbers(words, 2))
-        elif keyword == "f":
-            self._add_face(words, number)
-        elif keyword == "usemtl":
-            self._material = " ".join(words)
-        elif keyword == "mtllib":
-            self.libraries.append(line.strip()[len(keyword) :].strip())
-
-    def _add_face(self, words: list[str], number: int) -> None:
-        """Cut a polygon into a fan of triangles around its first corner."""
-        corners = [self._corner(word) for word in words]
-        if len(corners) < 3:
-            raise ValueError("a face needs at least 3 corners")
-        for second, third in pairwise(corners[1:]):
-            self.triangles.extend((*corners[0], *second, *third))
-        self.polygons.extend([number] * (len(corners) - 2))
-        self.materials.add(self._material)
+        match line.split():
+            case ["v", *words]:
+                self.positions.extend(_numbers(words, 3))
+            case ["vt", *words]:
+                self.coordinates.extend(_numbers(words, 2))
+            case ["f", *words]:
+                if len(words) < 3:
+                    raise ValueError("a face needs at least 3 corners")
+                for word in words:
+                    self.corners.extend(self._corner(word))
+                self.counts.append(len(words))
+                self.lines.append(number)
+                self.materials.add(self._material)
+            case ["usemtl", *words]:
+                self._material = " ".join(words)
+            case ["mtllib", *_]:
+                self.libraries.append(line.strip().removeprefix("mtllib").strip())
 
     def _corner(self, word: str) -> tuple[int, int]:
-        position, _, rest = word.partition("/")
-        coordinate = rest.partition("/")[0]
-        index = NO_COORDINATE
-        if coordinate:
-            index = _index(coordinate, len(self.coordinates) // 2)
+        position, coordinate, *_ = [*word.split("/"), ""]
+        index = _index(coordinate, len(self.coordinates) // 2) if coordinate else NO_COORDINATE
         return _index(position, len(self.positions) // 3), index
 
 
@@ -93,18 +90,19 @@ def read_obj(path: Path) -> RawMesh:
             missing, outside of the folder or damaged, or there is more than one texture.
     """
     obj = _parse(path)
-    corners = np.array(obj.triangles, np.int64).reshape(-1, 3, 2)
+    triangles, polygons = fans(np.array(obj.counts, np.int64))
+    corners = np.array(obj.corners, np.int64).reshape(-1, 2)[triangles]
     positions = np.array(obj.positions, np.float64).reshape(-1, 3)
-    folded = first_folded_polygon(positions, corners[..., 0], np.array(obj.polygons, np.int64))
+    folded = first_folded_polygon(positions, corners[..., 0], polygons)
     if folded is not None:
         raise UserError(
-            f"mesh {path} with a polygon that is not convex in line {folded}",
+            f"mesh {path} with a polygon that is not convex in line {obj.lines[folded]}",
             "triangles and convex polygons",
             "switch on 'triangulate' when exporting the mesh",
         )
     texture = _texture(obj, path)
     if texture is None:
-        return positions, corners[..., 0], None, None
+        return RawMesh(positions, corners[..., 0])
     if (corners[..., 1] == NO_COORDINATE).any():
         raise UserError(
             f"textured mesh {path} with faces without texture coordinates",
@@ -113,14 +111,12 @@ def read_obj(path: Path) -> RawMesh:
         )
     pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
-    return positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture
+    return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
 
 
 def _parse(path: Path) -> ObjFile:
     obj = ObjFile()
     for number, line in enumerate(read_text(path).replace("\\\n", " ").split("\n"), start=1):
-        if not line.strip():
-            continue
         try:
             obj.add(line, number)
         except ValueError as error:
@@ -133,9 +129,9 @@ def _parse(path: Path) -> ObjFile:
 
 
 def _numbers(words: list[str], count: int) -> list[float]:
-    if len(words) < count:
-        raise ValueError(f"needs {count} numbers")
     numbers = [float(word) for word in words[:count]]
+    if len(numbers) < count:
+        raise ValueError(f"needs {count} numbers")
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a coordinate that is not a finite number")
     return numbers

@@ -10,7 +10,6 @@ from scipy.spatial.distance import pdist
 from dopepp.parts import servoholder
 from dopepp.parts.measure import (
     face_areas,
-    first_folded_polygon,
     largest_distance,
     sample_surface,
     weld,
@@ -142,14 +141,3 @@ def test_weld_merges_equal_positions_and_the_two_zeros() -> None:
     assert len(vertices) == 8
     np.testing.assert_array_equal(vertices[faces].reshape(-1, 3), soup)
     assert len(weld(np.array([[0.0, 0, 0], [-0.0, 0, 0]]), np.array([[0, 1, 1]]))[0]) == 1
-
-
-def test_a_fan_over_a_dent_is_folded() -> None:
-    square = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
-    dart = np.array([[2.0, 0, 1], [0.5, 0.5, 1], [0, 2, 1], [0, 0, 1]])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
-    polygons = np.array([3, 3, 8, 8])
-    assert first_folded_polygon(np.vstack([square, dart]), faces, polygons) == 8
-    assert first_folded_polygon(np.vstack([square, square]), faces, polygons) is None
-    bow_tie = square[[0, 2, 1, 3]]
-    assert first_folded_polygon(np.vstack([square, bow_tie]), faces, polygons) == 8

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.off import export_off
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl, export_stl_ascii
 
@@ -20,7 +21,11 @@ FILES = {
     "binary.ply": export_ply(BOX),
     "text.ply": export_ply(BOX, encoding="ascii"),
     "box.obj": trimesh.exchange.obj.export_obj(BOX).encode(),
+    "box.off": export_off(BOX).encode(),
+    "box.glb": BOX.export(file_type="glb"),
+    "box.3mf": BOX.export(file_type="3mf"),
 }
+UNSTATED = [name for name in FILES if name not in ("box.glb", "box.3mf")]
 SQUARE = "v 0 0 0\nv 100 0 0\nv 100 100 0\nv 0 100 0\n"
 TEXTURED = f"mtllib a.mtl\n{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3 4/4\n"
 PLY_HEADER = (
@@ -66,7 +71,7 @@ def test_every_format_and_unit_gives_the_same_box(
     assert solid.volume == pytest.approx(6000 * metres**3, rel=1e-6)  # > 0: outward faces
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", UNSTATED)
 def test_millimetres_are_assumed_and_said(
     tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -102,7 +107,7 @@ def _ends_at_a_number(content: bytes, length: int) -> bool:
     return any(line.startswith(b"f ") and len(line.split()) == 4 for line in whole)
 
 
-@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "3mf"])
 def test_noise_is_refused(tmp_path: Path, suffix: str) -> None:
     path = write(tmp_path, f"noise.{suffix}", np.random.default_rng(0).bytes(3000))
     with pytest.raises(UserError, match="noise"):
@@ -171,7 +176,9 @@ def test_a_path_or_unit_that_cannot_be_is_refused(
     path = write(tmp_path, "box.stl", FILES["binary.stl"])
     with pytest.raises(UserError, match=r"gone\.stl, no such file"):
         read_mesh(tmp_path / "gone.stl")
-    with pytest.raises(UserError, match=r"box\.step; allowed: files ending in \.stl, \.obj, \.ply"):
+    with pytest.raises(
+        UserError, match=r"box\.step; allowed: files ending in \.stl, \.obj, \.ply, \.glb, "
+    ):
         read_mesh(tmp_path / "box.step")
     with pytest.raises(UserError, match=r"unit='feet' .*; allowed: mm, cm, m, inch"):
         read_mesh(path, "feet")

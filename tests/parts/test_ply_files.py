@@ -108,7 +108,7 @@ def test_agrees_with_trimesh(tmp_path: Path, encoding: str) -> None:
     ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
     ball.export(tmp_path / "a.ply", encoding=encoding.replace("binary_little_endian", "binary"))
     expected = trimesh.load(tmp_path / "a.ply", process=False)
-    vertices, faces, _, _ = read_ply(tmp_path / "a.ply")
+    vertices, faces, *_ = read_ply(tmp_path / "a.ply")
     np.testing.assert_allclose(vertices, expected.vertices, rtol=1e-7)
     np.testing.assert_array_equal(faces, expected.faces)
 

@@ -26,6 +26,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from trimesh.exchange.obj import export_obj
+from trimesh.exchange.off import export_off
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl, export_stl_ascii
 
@@ -68,8 +69,9 @@ NAMES: Final = (
     "a.ckpt", "a.safetensors", "a.yaml", "archive.gztar", "archive.tar", "archive.zip",
     "binary.ply", "binary.stl", "bop/camera.json", "bop/models/models_info.json",
     "bop/train_pbr/000000/scene_camera.json", "bop/train_pbr/000000/scene_gt.json",
-    "bop/train_pbr/000000/scene_gt_info.json", "box.obj", "colour.bmp", "colour.jpg",
-    "colour.png", "colour.tga", "colour.tiff", "colour.webp", "deep.png", "m_s-test.csv",
+    "bop/train_pbr/000000/scene_gt_info.json", "box.3mf", "box.glb", "box.obj", "box.off",
+    "colour.bmp", "colour.jpg", "colour.png", "colour.tga", "colour.tiff", "colour.webp",
+    "deep.png", "m_s-test.csv",
     "meta.mat", "ndds/000000.json", "ndds/_camera_settings.json", "ndds/_object_settings.json",
     "overrides.yaml", "palette.png", "print.jpg", "shards/camera.json",
     "shards/models/models_info.json", "shards/train_pbr/shard-000000.tar", "text.ply", "text.stl",
@@ -193,6 +195,9 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
         "binary.stl": export_stl(box),
         "text.stl": export_stl_ascii(box).encode(),
         "box.obj": b"mtllib box.mtl\n" + export_obj(box).encode(),
+        "box.off": export_off(box).encode(),
+        "box.glb": box.export(file_type="glb"),
+        "box.3mf": box.export(file_type="3mf"),
         "binary.ply": export_ply(box),
         "text.ply": export_ply(box, encoding="ascii"),
     }.items():
