@@ -62,7 +62,9 @@ def tiny() -> tuple[str, ...]:
 
 def environment(folder: Path) -> dict[str, str]:
     offline = {"WANDB_MODE": "offline", "WANDB_DIR": str(folder), "WANDB_SILENT": "true"}
-    return {**os.environ, **offline, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    # A service that a run inside this process has started would be used by its children, too.
+    own = {name: value for name, value in os.environ.items() if name != "WANDB_SERVICE"}
+    return {**own, **offline, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 
 def in_process(script: str, *arguments: str) -> Done:
