@@ -6,7 +6,6 @@ it a line in :data:`KINDS`.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from dopepp.experiment.compare.table import Line, interval, with_deviation
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_frame_rates
 from dopepp.experiment.pass_rates import heading
 from dopepp.experiment.shading import SHADING
-from dopepp.experiment.tables import Row
+from dopepp.experiment.tables import Row, read_csv
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
@@ -185,7 +184,7 @@ def _shading(runs: Sequence[Run]) -> dict[str, dict[str, _Rates]]:
     """Return what runs have measured, by object and field; of one network a part, the mean, too."""
     found: dict[str, dict[str, _Rates]] = {}
     for run in runs:
-        for row in _read_csv(run.folder / SHADING.table_file):
+        for row in read_csv(run.folder / SHADING.table_file):
             for field in (key for key in row if key in _COLUMNS and row[key]):
                 by_share = found.setdefault(row["object"], {}).setdefault(field, {})
                 seeds = by_share.setdefault(float(row["share"]), {})
@@ -209,13 +208,6 @@ def _mean_rates(parts: Sequence[dict[str, _Rates]]) -> dict[str, _Rates]:
                 pair = float(np.mean([rate for rate, _ in known])), sum(num for _, num in known)
                 mean.setdefault(field, {}).setdefault(share, {})[seed] = pair
     return mean
-
-
-def _read_csv(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def _mean(rates: _Rates, share: float) -> str:

@@ -8,7 +8,6 @@ to do changes a run; see :class:`~dopepp.training.loggers.GuardedLogger`.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -26,6 +25,7 @@ from dopepp.experiment.compare.write import CURVES_FILE, TABLE_FILE
 from dopepp.experiment.gates import LOGGERS
 from dopepp.experiment.paper_table import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.report import Report
+from dopepp.experiment.tables import read_csv
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS, PoseRow
 from dopepp.models.gate import TARGET
@@ -128,19 +128,12 @@ def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
     with _open(nodes, folder, _COMPARISON, folder.resolve().name, _COMPARISON) as trackers:
         for tracker in trackers:
             for file in (TABLE_FILE, PAPER_TABLE_FILE):
-                rows = _read_csv(folder / file)
+                rows = read_csv(folder / file)
                 if rows:
                     text = (folder / file).with_suffix(".md").read_text()
                     tracker.log_table(Path(file).stem, rows, text)
             names = (CURVES_FILE, PICTURES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
             _send_pictures(tracker, {Path(one).stem: folder / one for one in names})
-
-
-def _read_csv(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
