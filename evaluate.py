@@ -4,13 +4,13 @@ import hydra
 from omegaconf import DictConfig
 
 from dopepp.experiment.command_line import entry, run_job
-from dopepp.experiment.protocols import SHORT_NAMES
+from dopepp.experiment.reports.protocols import SHORT_NAMES
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     """Run one evaluation."""
-    from dopepp.experiment.evaluation import evaluate
+    from dopepp.experiment.evaluate import evaluate
 
     run_job(config, evaluate)
 

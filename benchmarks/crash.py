@@ -27,7 +27,7 @@ from pathlib import Path
 
 import torch
 
-import dopepp.experiment.run  # noqa: F401 -- the libraries, once
+import dopepp.experiment.train  # noqa: F401 -- the libraries, once
 
 ROOT = Path(__file__).parents[1]
 STEPS_PER_EPOCH = 8

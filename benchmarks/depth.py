@@ -22,16 +22,16 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from dopepp.data.ycb_layout import read_classes
-from dopepp.data.ycb_video import YcbVideoSource
+from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refine import DepthRefiner
-from dopepp.parts.builtin import pivconnector, servoholder
-from dopepp.parts.mesh import ycb_part
+from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual.body import make_body
-from dopepp.virtual.rasteriser import render
+from dopepp.virtual.arrange.body import make_body
+from dopepp.virtual.renderers.raster.rasteriser import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 
 SIZE = (640, 480)

@@ -12,10 +12,9 @@ from typing import Any
 
 import torch
 
-from dopepp.experiment.hardware import choose_precision, keep_freed_memory
-from dopepp.models.cost import network_cost
+from dopepp.experiment.build.hardware import choose_precision, keep_freed_memory
 from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.network import PoseNetwork
+from dopepp.models.network import PoseNetwork, network_cost
 from dopepp.models.spec import build_network
 
 BATCH, SIZE, WIDTH = 32, 128, 0.25

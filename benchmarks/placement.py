@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Factory, OffsetPlacement
 

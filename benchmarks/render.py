@@ -28,7 +28,7 @@ from manifold3d import Manifold
 from manifold3d import Mesh as ManifoldMesh
 
 from dopepp.geometry.camera import project, resize_camera, transform
-from dopepp.parts.builtin import pivconnector
+from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual import PRESETS, Factory, Preset, Scene, make_surface, render
 from dopepp.virtual.sensor import capture
@@ -51,7 +51,7 @@ Blender Cycles, 16 samples a pixel, 16,200 at 640×480."""
 
 FIRST_IMAGE = """\
 import sys
-from dopepp.parts.builtin import pivconnector
+from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
 Factory([pivconnector()], PRESETS["paper"].resized(640, 480), seed=0).render(0, 0)
 assert "torch" not in sys.modules, "rendering has imported torch"

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 _STOPPED = 1
 _DEFECTS = 1
@@ -44,7 +44,7 @@ def _configure() -> None:
 
 
 @contextmanager
-def _mistakes_told() -> Iterator[None]:
+def report_errors() -> Iterator[None]:
     """End the command with one line for a user's mistake."""
     try:
         yield
@@ -56,10 +56,10 @@ def _mistakes_told() -> Iterator[None]:
 @contextmanager
 def _resumable() -> Iterator[None]:
     """End the command with one line when it is interrupted or cannot go on, too."""
-    from dopepp.data.production.stopping import Interruption, StoppedError, interruptible
+    from dopepp.core.interrupts import Interruption, StoppedError, interruptible
 
     try:
-        with _mistakes_told(), interruptible():
+        with report_errors(), interruptible():
             yield
     except StoppedError as error:
         typer.echo(str(error), err=True)
@@ -93,16 +93,16 @@ def predict(
     depth_scale: Annotated[float, typer.Option(help="metres per unit of --depth")] = 0.001,
 ) -> None:
     """Print the poses on one picture as JSON, a line per detection; why, where there is none."""
+    from dopepp.core.files import write_png
     from dopepp.drawing.overlay import YELLOW, Wireframe
     from dopepp.drawing.overlay import overlay as draw
     from dopepp.drawing.pictures import read_rgb
-    from dopepp.drawing.png import write_png
     from dopepp.geometry.camera import camera_matrix
-    from dopepp.inference.depth_image import read_depth
     from dopepp.inference.estimator import PoseEstimator
+    from dopepp.inference.refinement.view import read_depth
     from dopepp.virtual.agreement import agreement, meshes_of
 
-    with _mistakes_told():
+    with report_errors():
         picture, K = read_rgb(image), camera_matrix(*intrinsics)
         if (refine is None) != (depth is None):
             raise UserError(
@@ -182,8 +182,8 @@ def render(
     Exit codes: 0 done; 1 stopped (disk full, a worker died); 2 wrong input; 130, 143 interrupted.
     """
     with _resumable():
-        from dopepp.data.production.job import make_job
-        from dopepp.data.production.order import Order, carry_out, write_preview
+        from dopepp.data.jobs.job import make_job
+        from dopepp.data.jobs.render_dataset import RenderRequest, run, write_preview
 
         job = make_job(
             parts, unit=unit, preset=preset, changes=changes or (), size=size, seed=seed,
@@ -192,8 +192,8 @@ def render(
         if preview:
             typer.echo(write_preview(job, out))
         else:
-            order = Order(out, num, shard, workers, engine, ray_address)
-            typer.echo(carry_out(job, order))
+            order = RenderRequest(out, num, shard, workers, engine, ray_address)
+            typer.echo(run(job, order))
 
 
 @app.command()
@@ -205,9 +205,9 @@ def check(
 
     Exit codes: 0 nothing is wrong; 1 something is; 2 there is no data set.
     """
-    from dopepp.data.checking.check import check_dataset
+    from dopepp.data.check import check_dataset
 
-    with _mistakes_told():
+    with report_errors():
         report = check_dataset(folder)
     typer.echo("\n".join(report.lines(most)))
     if not report.ok:
@@ -259,9 +259,9 @@ def compare(
 
     Runs that differ in their seed only are one method. Failed and unfinished runs are rows.
     """
-    from dopepp.experiment.compare.compare import compare_paths
+    from dopepp.experiment.reports.compare.compare import compare_paths
 
-    with _mistakes_told():
+    with report_errors():
         typer.echo(compare_paths(runs, out, baseline, pictures, table))
 
 
@@ -278,7 +278,7 @@ def symmetries(
     """Find a part's symmetries and print its entry of BOP's models_info.json."""
     from dopepp.data.part_symmetries import describe_symmetries
 
-    with _mistakes_told():
+    with report_errors():
         typer.echo(describe_symmetries(part, unit, tolerance))
 
 
@@ -292,8 +292,8 @@ def release(
     out: Annotated[Path, typer.Option(help="folder of both files")] = Path(),
 ) -> None:
     """Write a checkpoint as NAME.safetensors, small and without local paths, and a model card."""
-    from dopepp.experiment.release import release as write
+    from dopepp.experiment.runs.release import release as write
 
-    with _mistakes_told():
+    with report_errors():
         for path in write(checkpoint, results, name, out):
             typer.echo(f"{path}, {path.stat().st_size:,} bytes")

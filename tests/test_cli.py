@@ -13,9 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from dopepp.cli import app
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
-from dopepp.parts.builtin import pivconnector
+from dopepp.parts.catalogue import pivconnector
 
 SPEC = {
     "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
@@ -269,9 +269,9 @@ def test_neither_render_nor_check_imports_torch(layout: str, tmp_path: Path) -> 
 import sys
 from typer.testing import CliRunner
 from dopepp.cli import app
-from dopepp.data.production.job import make_job
-from dopepp.data.production.order import write_preview
-from dopepp.data.production.work import Task, Work, Worker
+from dopepp.data.jobs.job import make_job
+from dopepp.data.jobs.render_dataset import write_preview
+from dopepp.data.jobs.work import Task, Work, Worker
 from pathlib import Path
 import pickle
 out = {str(tmp_path / "out")!r}
@@ -281,7 +281,7 @@ done = CliRunner().invoke(app, arguments)
 assert done.exit_code == 0, done.output
 job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
 worker = Worker(pickle.dumps(Work(job.factory, {layout!r}, Path(out))))
-for task in (Task(0, range(2)), Task(0, range(2), seals=True)):
+for task in (Task(0, range(2)), Task(0, range(2), finalizes=True)):
     assert worker.perform(task).error is None
 write_preview(job, Path(out))
 done = CliRunner().invoke(app, ["check", out])

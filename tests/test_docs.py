@@ -15,8 +15,8 @@ import typer.main
 import yaml
 
 from dopepp.cli import app
-from dopepp.experiment.protocols import SHORT_NAMES
-from dopepp.virtual.presets import PRESETS
+from dopepp.experiment.reports.protocols import SHORT_NAMES
+from dopepp.virtual.presets.preset import PRESETS
 
 ROOT: Final = Path(__file__).parents[1]
 CONF: Final = ROOT / "conf"

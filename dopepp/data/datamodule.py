@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import torch
 from lightning.pytorch import LightningDataModule
 
-from dopepp.data.augment import Photometric
-from dopepp.data.draws import Purpose, item_rng
+from dopepp.core.errors import UserError
 from dopepp.data.loader import EpochSampler, PoseLoader, SampleDataset
-from dopepp.data.masking import RandomMask
-from dopepp.data.resize import letterbox_sample, pad_sample, resize_sample
+from dopepp.data.rng import Purpose, item_rng
 from dopepp.data.sample import DescribedSource, Sample
-from dopepp.errors import UserError
+from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.masking import RandomMask
+from dopepp.data.transforms.resize import letterbox_sample, pad_sample, resize_sample
 from dopepp.virtual.backgrounds import Backgrounds
 
 

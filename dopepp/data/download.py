@@ -1,26 +1,177 @@
 """Data sets from the network, by an explicit command only.
 
-To add a data set, add a :class:`Source` to :data:`SOURCES`, with a checksum from a second place
-than the file's own server.
+To add a data set, add a :class:`DownloadSource` to :data:`SOURCES`, its checksum from a second
+place than the file's own server.
+
+One file from the network: of a known size and checksum, resumable, whole or not at all.
 """
 
 from __future__ import annotations
 
+import hashlib
+import http.client
 import logging
+import urllib.error
+import urllib.request
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import IO, Final
 from urllib.parse import urlsplit
 
+from dopepp.core.errors import UserError
 from dopepp.data.archive import safe_extract
-from dopepp.data.fetch import Progress, fetch
-from dopepp.errors import UserError
+
+TIMEOUT_S: Final = 30.0
+"""Seconds without a byte after which a connection counts as broken."""
+
+_CHUNK_BYTES: Final = 1 << 20
+
+Progress = Callable[[int, int], None]
+"""Is told the bytes that are there and the bytes in all."""
+
+
+def fetch(
+    url: str, path: Path, num_bytes: int, sha256: str, progress: Progress | None = None
+) -> None:
+    """Download one file; an unfinished one stays beside its place as ``NAME.partial``.
+
+    Args:
+        url: An http or https address; redirections to others are refused, and from https to http.
+        path: Where to; a complete file that is there is kept.
+        num_bytes: The file's exact size; not a byte more is received.
+        sha256: Its checksum, hex.
+        progress: Told after every piece.
+
+    Raises:
+        UserError: The network, the server or the disk fails, or size or checksum differ.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        if not path.exists():
+            _receive(url, partial, num_bytes, progress)
+            _verify(partial, url, sha256)
+            partial.replace(path)
+        elif path.stat().st_size != num_bytes:
+            raise UserError(
+                f"{path} of {path.stat().st_size} bytes", f"{num_bytes} bytes", "delete it"
+            )
+        else:
+            _verify(path, url, sha256)
+    except urllib.error.HTTPError as error:
+        raise _failed(url, f"the server answers {error.code} {error.reason}") from error
+    except urllib.error.URLError as error:
+        raise _failed(url, f"no connection: {error.reason}") from error
+    except (http.client.HTTPException, TimeoutError, ConnectionError) as error:
+        raise _failed(url, f"the connection broke: {error or type(error).__name__}") from error
+    except OSError as error:
+        raise UserError(
+            f"{path}, which cannot be written: {error}",
+            f"a folder to write to with {num_bytes} bytes of room",
+            "choose another folder, or make room; what was received stays",
+        ) from error
+
+
+def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None) -> None:
+    """Append what is missing to a partial file."""
+    there = partial.stat().st_size if partial.exists() else 0
+    if there > num_bytes:
+        partial.unlink()
+        there = 0
+    if there == num_bytes:
+        return
+    request = urllib.request.Request(url, headers={"User-Agent": "dopepp"})
+    if there:
+        request.add_header("Range", f"bytes={there}-")
+    with _opener().open(request, timeout=TIMEOUT_S) as response:
+        resumed = response.status == http.client.PARTIAL_CONTENT
+        place = response.headers.get("Content-Range", "")
+        if resumed and not place.startswith(f"bytes {there}-"):
+            raise _failed(url, f"the server goes on at {place!r} instead of byte {there}")
+        there = there if resumed else 0
+        # None where the server does not tell.
+        if response.length is not None and there + response.length != num_bytes:
+            raise _other_file(url, f"{there + response.length} bytes", f"{num_bytes} bytes")
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("ab" if resumed else "wb") as file:
+            while chunk := response.read(_CHUNK_BYTES):
+                there += len(chunk)
+                if there > num_bytes:
+                    break
+                file.write(chunk)
+                if progress is not None:
+                    progress(there, num_bytes)
+    if there > num_bytes:
+        partial.unlink()
+        raise _other_file(url, f"more than {num_bytes} bytes", f"{num_bytes} bytes")
+    if there < num_bytes:
+        raise _failed(url, f"the connection broke after {there} of {num_bytes} bytes")
+
+
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follow redirections, but never from https to what anybody on the way can read and change."""
+
+    def redirect_request(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> urllib.request.Request | None:
+        if req.type == "https" and not newurl.lower().startswith("https:"):
+            raise _failed(req.full_url, f"redirected to {newurl}, which is not https")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _opener() -> urllib.request.OpenerDirector:
+    """Return an opener that knows http and https only: no address leads to a file of this machine.
+
+    Proxies are taken from the environment.
+    """
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.ProxyHandler(),
+        urllib.request.HTTPHandler(),
+        urllib.request.HTTPSHandler(),
+        _Redirects(),
+        urllib.request.HTTPErrorProcessor(),
+        urllib.request.HTTPDefaultErrorHandler(),
+        urllib.request.UnknownHandler(),
+    ):
+        opener.add_handler(handler)
+    return opener
+
+
+def _verify(path: Path, url: str, sha256: str) -> None:
+    """Compare a file's checksum; another file is deleted, so that it is not resumed or kept."""
+    with path.open("rb") as file:
+        actual = hashlib.file_digest(file, "sha256").hexdigest()
+    if actual != sha256:
+        path.unlink()
+        raise _other_file(url, f"a file with SHA-256 {actual}", sha256)
+
+
+def _failed(url: str, reason: str) -> UserError:
+    return UserError(
+        f"{url}: {reason}",
+        "a server that can be reached and has the file",
+        "check the network and run the same command again: it goes on where it stopped",
+    )
+
+
+def _other_file(url: str, got: str, expected: str) -> UserError:
+    return UserError(
+        f"{url}: {got}", expected, "try again; if it stays so, the file on the server has changed"
+    )
+
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Source:
+class DownloadSource:
     """An archive on the network.
 
     Attributes:
@@ -44,7 +195,7 @@ class Source:
 
 
 SOURCES: Final = {
-    "voc2007": Source(
+    "voc2007": DownloadSource(
         url="http://host.robots.ox.ac.uk/pascal/VOC/voc2007/VOCtrainval_06-Nov-2007.tar",
         num_bytes=460_032_000,
         # As TensorFlow Datasets and torchvision's data set prototypes give it.

@@ -16,10 +16,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
+from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch, collate
-from dopepp.data.draws import Purpose, item_rng
+from dopepp.data.rng import Purpose, item_rng
 from dopepp.data.sample import Sample
-from dopepp.errors import UserError
 
 Item = Callable[[int, int], Sample]
 """Makes item ``index`` of ``epoch``: ``item(epoch, index)``."""

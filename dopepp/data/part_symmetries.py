@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from dopepp.data.bop_model_writer import model_info
-from dopepp.data.bop_models import ModelInfo, parse_models
-from dopepp.data.json_file import read_json
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
+from dopepp.core.json import read_json
+from dopepp.data.formats.bop.model_writer import model_info
+from dopepp.data.formats.bop.models import ModelInfo, parse_models
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 from dopepp.parts.symmetry import TOLERANCE, find_symmetries

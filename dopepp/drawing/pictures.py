@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
 """Formats that are nothing but pixels: PIL would hand EPS to another program."""

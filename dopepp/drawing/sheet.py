@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from dopepp.drawing.text import text_coverage
+from dopepp.drawing.overlay import text_coverage
 
 _GAP_PX: Final = 6
 _CAPTION_PX: Final = 18

@@ -25,14 +25,14 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dopepp.data.production.stopping import NO_SPACE, Interruption, interruptible
-from dopepp.errors import RunError, UserError
-from dopepp.experiment import display, record, slurm
-from dopepp.experiment.launch import remote
-from dopepp.experiment.report import Report
-from dopepp.experiment.resume import read_overrides, remember_overrides
-from dopepp.experiment.sweep import compare_jobs
-from dopepp.training.trial import PrunedError
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
+from dopepp.experiment.launch import remote, slurm
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.runs import display, record
+from dopepp.experiment.runs.resume import read_overrides, remember_overrides
+from dopepp.experiment.runs.sweep import compare_jobs
+from dopepp.training.callbacks.trial import PrunedError
 
 _log = logging.getLogger(__name__)
 
@@ -126,7 +126,7 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 
 def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
     """Refuse jobs of several processes, of which each would start as the first one did."""
-    from dopepp.experiment.devices import num_processes
+    from dopepp.experiment.build.hardware import num_processes
 
     options = config.get("trainer", {})
     if num_processes(options) > 1:

@@ -19,19 +19,18 @@ import numpy as np
 import torch
 from torch import nn
 
+from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.data.sample import Sample
-from dopepp.drawing.panels import Line, lines_figure
-from dopepp.drawing.png import figure_image, write_png, write_whole
-from dopepp.experiment import display, record
-from dopepp.experiment.build import build_untrained, map_geometry
-from dopepp.experiment.objects import build_parts
-from dopepp.experiment.readme import write_job_readme
-from dopepp.experiment.sources import build_test_source, held_out_seed
-from dopepp.experiment.tables import Row, csv_text
+from dopepp.drawing.panels import PlotLine, lines_figure
+from dopepp.experiment.build.objects import build_parts
+from dopepp.experiment.build.sources import build_test_source, held_out_seed
+from dopepp.experiment.build.system import build_untrained, map_geometry
+from dopepp.experiment.reports.tables import Row, csv_text
+from dopepp.experiment.runs import display, record
+from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.timing import WARM_UP, FrameTimes, RehearsedEstimator, time_frames
-from dopepp.models.cost import network_cost
-from dopepp.models.gate import check_integer
-from dopepp.models.network import PoseNetwork
+from dopepp.models.network import PoseNetwork, network_cost
+from dopepp.models.registry import check_integer
 from dopepp.parts.part import Part
 
 COST_FILE: Final = "cost.json"
@@ -172,7 +171,9 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
         frames: Times of each frame, by name.
     """
     lines = [
-        Line(f"{name}, {what}", np.cumsum(times.seconds), 1 / seconds[None], f"C{number}", dashed)
+        PlotLine(
+            f"{name}, {what}", np.cumsum(times.seconds), 1 / seconds[None], f"C{number}", dashed
+        )
         for number, (name, times) in enumerate(frames.items())
         for what, seconds, dashed in (
             ("picture to poses", times.seconds, False),

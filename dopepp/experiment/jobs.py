@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.lr_finder import find_learning_rate
-from dopepp.experiment.paper_table import PaperTable
-from dopepp.experiment.run import train
+from dopepp.experiment.reports.paper_table import PaperTable
+from dopepp.experiment.train import train
 
 JOBS: Final[Mapping[str, Callable[[dict[str, Any], Path], object]]] = {
     "train": train,

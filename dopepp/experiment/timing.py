@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float, UInt8
 
 from dopepp.data.batch import collate
-from dopepp.data.resize import pad_sample, resize_sample
 from dopepp.data.sample import Sample
+from dopepp.data.transforms.resize import pad_sample, resize_sample
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry

@@ -17,23 +17,22 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from dopepp.data.rendered import MAX_ITEMS
+from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
-from dopepp.errors import UserError
-from dopepp.experiment.sources import (
+from dopepp.data.sources.rendered import MAX_ITEMS
+from dopepp.experiment.build.sources import (
     build_source_without_objects,
     build_test_source,
     build_validation_source,
 )
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.assignment import assign, match_by_centre
-from dopepp.metrics.errors import symmetries
+from dopepp.metrics.assignment import assign, match_by_centre, symmetries
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
-from dopepp.models.checkpoint import Checkpoint
-from dopepp.models.gate import check_integer, check_number
-from dopepp.models.storage import write_atomic
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint.storage import write_atomic
+from dopepp.models.registry import check_integer, check_number
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import (
     FEATURES,
@@ -48,7 +47,7 @@ from dopepp.recovery.options import RecoveryOptions
 
 
 @dataclass(frozen=True)
-class Silence:
+class FalsePositiveTarget:
     """How silent a network must be where its objects are not.
 
     Attributes:
@@ -61,7 +60,7 @@ class Silence:
     false_positive_rate: float = 0.005
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Silence:
+    def of(cls, config: Mapping[str, Any]) -> FalsePositiveTarget:
         """Read the config's ``num_empty`` and ``false_positive_rate``.
 
         Raises:
@@ -137,7 +136,7 @@ def tune(
     data: Mapping[str, Any],
     parts: Sequence[Part],
     seed: int,
-    silence: Silence,
+    silence: FalsePositiveTarget,
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
@@ -179,14 +178,16 @@ def tune(
 
 
 def choose(
-    shown: Scored, empty: Scored, false_positive_rate: float = Silence.false_positive_rate
+    shown: Scored,
+    empty: Scored,
+    false_positive_rate: float = FalsePositiveTarget.false_positive_rate,
 ) -> dict[str, float]:
     """Choose the weights and the threshold.
 
     Args:
         shown: Detections on images with objects.
         empty: Detections on images without; each is wrong.
-        false_positive_rate: See :class:`Silence`.
+        false_positive_rate: See :class:`FalsePositiveTarget`.
 
     Raises:
         UserError: There is nothing to learn from.

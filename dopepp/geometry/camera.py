@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 
 def transform(

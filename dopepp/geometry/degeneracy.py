@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 
 MIN_POINTS: Final = 4
 

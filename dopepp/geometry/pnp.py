@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.degeneracy import MIN_POINTS, degenerate
 from dopepp.geometry.refine import (
     GATE,

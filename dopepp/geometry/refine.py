@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 
 GATE: Final = 3.0
 """Points beyond this many standard deviations are outliers (99.7 % of a Gaussian lies within)."""

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Letterbox, check_camera, project_keypoints
-from dopepp.inference.depth_image import checked_depth, undistorted_depth
-from dopepp.inference.refine import DepthRefiner
-from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.inference.refinement.view import checked_depth, undistorted_depth
+from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection

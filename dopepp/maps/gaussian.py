@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.refine import solve_damped
 
 FLOOR: Final = 1e-6

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm, t
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 StatisticName = Literal["mean", "median"]
 

@@ -18,11 +18,17 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
+from dopepp.core.errors import UserError
 from dopepp.drawing.curves import accuracy_figure
-from dopepp.errors import UserError
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.assignment import Assignment, PredictedPose, TruePose, assign
-from dopepp.metrics.errors import PoseErrors, symmetries
+from dopepp.metrics.assignment import (
+    Assignment,
+    PoseErrors,
+    PredictedPose,
+    TruePose,
+    assign,
+    symmetries,
+)
 from dopepp.metrics.functional import BOP_MSPD_THRESHOLDS, average_precision, average_recall
 from dopepp.metrics.references import REFERENCES, reference_rows
 from dopepp.metrics.row import PoseRow, finite_median, mean_row, summarise
@@ -62,7 +68,7 @@ class PoseMetrics(Metric):
     full_state_update = False
 
     poses: list[Tensor]
-    strays: list[Tensor]
+    false_positives: list[Tensor]
 
     def __init__(self, parts: Sequence[Part], method: str = "estimate", **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -77,7 +83,7 @@ class PoseMetrics(Metric):
         # Flat, because torchmetrics lets a rank without images send an empty vector.
         self.add_state("poses", default=[], dist_reduce_fx="cat")
         # Object index and score of every false positive.
-        self.add_state("strays", default=[], dist_reduce_fx="cat")
+        self.add_state("false_positives", default=[], dist_reduce_fx="cat")
         self._gathered: dict[str, Gathered] = {}
 
     def update(
@@ -129,20 +135,22 @@ class PoseMetrics(Metric):
                 found.scores[:, None],
             )
             self.poses.append(torch.from_numpy(np.hstack(columns).ravel()).to(self.device))
-        if len(found.stray_scores):
-            pairs = np.insert(found.stray_scores[:, None], 0, index, axis=1)
-            self.strays.append(torch.from_numpy(pairs.ravel()).to(self.device))
+        if len(found.false_positive_scores):
+            pairs = np.insert(found.false_positive_scores[:, None], 0, index, axis=1)
+            self.false_positives.append(torch.from_numpy(pairs.ravel()).to(self.device))
 
     def compute(self) -> dict[str, PoseRow]:
         """Return a row per object, then their :data:`MEAN`; see :mod:`dopepp.metrics.row`.
 
         An object without an instance that counts has None for everything but its counts.
         """
-        poses, strays = _table(self.poses, _WIDTH), _table(self.strays, 2)
+        poses, false_positives = _table(self.poses, _WIDTH), _table(self.false_positives, 2)
         rows = {}
         for index, (name, part) in enumerate(self.parts.items()):
             gathered = Gathered(
-                part, poses[poses[:, 0] == index, 1:], strays[strays[:, 0] == index, 1]
+                part,
+                poses[poses[:, 0] == index, 1:],
+                false_positives[false_positives[:, 0] == index, 1],
             )
             self._gathered[name] = gathered
             rows[name] = gathered.row(part, self.method)
@@ -200,22 +208,29 @@ class Gathered:
         visible_fractions: Visible share of each silhouette, in [0, 1].
         scores: Score of each instance's prediction, (n, 1); NaN for a miss.
         errors: Every error of each instance.
-        strays: Scores of the false positives.
+        false_positives: Scores of the false positives.
     """
 
     def __init__(
-        self, part: Part, table: Float[Tensor, "n 44"], strays: Float[Tensor, "strays"]
+        self,
+        part: Part,
+        table: Float[Tensor, "n 44"],
+        false_positives: Float[Tensor, "false_positives"],
     ) -> None:
         T_est, T_gt, K, width, visible, self.scores = torch.split(
             table, [16, 16, 9, 1, 1, 1], dim=1
         )
-        self.part, self.strays, self.visible_fractions = part, strays, visible[:, 0]
+        self.part, self.false_positives, self.visible_fractions = (
+            part,
+            false_positives,
+            visible[:, 0],
+        )
         self.T_gt, self.K = T_gt.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
         self.errors = PoseErrors.of(part, T_est.reshape(-1, 4, 4), self.T_gt, self.K, width[:, 0])
 
     def row(self, part: Part, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""
-        errors, num_false = self.errors, len(self.strays)
+        errors, num_false = self.errors, len(self.false_positives)
         num_symmetries = len(symmetries(part))
         if len(errors.add) == 0:
             return PoseRow(
@@ -243,7 +258,7 @@ class Gathered:
         right = self.errors.add < threshold
         scores = self.scores[:, 0]
         wrong = ~right & self.errors.add.isfinite()
-        ordered = torch.cat([self.strays, scores[wrong], scores[right]])
+        ordered = torch.cat([self.false_positives, scores[wrong], scores[right]])
         correct = torch.arange(len(ordered)) >= len(ordered) - int(right.sum())
         return average_precision(ordered, correct, len(right))
 

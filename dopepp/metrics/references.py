@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import random_rotation
-from dopepp.metrics.errors import extreme_points, symmetries
+from dopepp.metrics.assignment import extreme_points, symmetries
 from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.row import PoseRow, summarise
 from dopepp.parts.part import Part

@@ -11,16 +11,16 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.models import attention, backbones, heads, losses
-from dopepp.models.activation import find_activation
-from dopepp.models.gate import Gate, check_integer
+from dopepp.models.layers import find_activation
 from dopepp.models.network import PoseNetwork
+from dopepp.models.registry import Registry, check_integer
 
-BACKBONES = Gate.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
-ATTENTIONS = Gate.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
-HEADS = Gate.of_module("head", heads.Head, heads)
-LOSSES = Gate.of_module("loss", losses.MapLoss, losses)  # type: ignore[type-abstract]
+BACKBONES = Registry.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
+ATTENTIONS = Registry.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
+HEADS = Registry.of_module("head", heads.Head, heads)
+LOSSES = Registry.of_module("loss", losses.MapLoss, losses)  # type: ignore[type-abstract]
 
 SPEC_KEYS = ("backbone", "attention", "head", "activation", "num_objects")
 
@@ -30,7 +30,7 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
 
     Args:
         spec: ``{"backbone": node, "attention": node, "head": node, "activation": name,
-            "num_objects": C}``; see :mod:`dopepp.models.gate` for nodes.
+            "num_objects": C}``; see :mod:`dopepp.models.registry` for nodes.
 
     Raises:
         UserError: A key is missing or unknown, a target is not allowed, or an argument is.

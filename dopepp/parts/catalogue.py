@@ -1,15 +1,149 @@
-"""A part by the text a user writes: a built-in part's name or the path of a mesh file."""
+"""A part by the text a user writes: a built-in part's name or the path of a mesh file.
+
+The paper's two parts (§2.1) as CAD: Servoholder, 77×77×7 mm, and PivConnector, 105×52×7 mm.
+
+The paper gives their sizes only; the shapes are this project's. A 4 mm plate carries raised
+features on its front (+z) and recesses in its back (−z), placed so that no rotation maps a part
+onto itself and any side of it shows how the part is turned. All numbers here are millimetres; the
+parts come out in metres with the origin in the centre of the bounding box.
+
+To add a built-in part, write its solid with the shapes below and a function like ``servoholder``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Final
 
-from dopepp.errors import UserError
-from dopepp.parts.builtin import pivconnector, servoholder
-from dopepp.parts.mesh import READERS, read_in_unit
-from dopepp.parts.part import Part, make_part
+import numpy as np
+from manifold3d import CrossSection, JoinType, Manifold, OpType
+
+from dopepp.core.errors import UserError
+from dopepp.parts.mesh.measure import weld
+from dopepp.parts.mesh.read import READERS, read_in_unit
+from dopepp.parts.part import Mesh, Part, make_part
+
+BACK: Final = -3.5
+PLATE: Final = 0.5
+FRONT: Final = 3.5
+"""Heights along z: the back face, the plate's front face, the top of the raised features."""
+
+RECESS: Final = 2.5
+SLOPE: Final = 1.5
+"""Depth of a recess, and how far a feature's walls lean inwards over its height."""
+
+SEGMENTS: Final = 64
+"""Sides of a circle: 0.03 mm of deviation on the largest one."""
+
+TOLERANCE: Final = 1e-3
+"""Edges shorter than this are the cuts' rounding, and would only make degenerate triangles."""
+
+
+@cache
+def servoholder() -> Part:
+    """Return the Servoholder: a plate with a servo's window, a frame, a bush and a chamfer."""
+    plate = _rectangle((-38.5, -38.5), (38.5, 38.5), radius=5)
+    plate -= _polygon((38.5, 16.5), (38.5, 38.5), (16.5, 38.5))
+    plate -= _rectangle((4, -40), (17, -30))
+    frame = _rectangle((-36, 0), (15, 31))
+    bush, posts = _disc((-19, -20), 14), (_disc((24, 9), 6), _disc((20, -22), 6))
+    ribs = (_slot((-10, -29), (14, 5), 5), _slot((32.5, -33), (32.5, 9), 5))
+    window = _rectangle((-31, 5), (10, 26)) + _rectangle((-12, 20), (10, 40))
+    holes = _rectangle((-31, 5), (10, 26)) + _disc((-19, -20), 7) + _slot((22, -11), (22, -3), 5)
+    for screw in ((24, 9), (20, -22), (-33, -33), (-33, 34)):
+        holes += _disc(screw, 2.2)
+    pockets = (_rectangle((-36, -36), (-3, -3), radius=3), _polygon((13, 29), (27, 23), (34, 2)))
+    solid = _prism(plate, BACK, PLATE)
+    solid += _raised(frame, bush, *posts, *ribs) ^ _prism(plate, PLATE, FRONT)
+    solid -= _sunk(*pockets, _slot((-33, 34), (10, 34), 5)) - _prism(_disc((-19, -20), 10))
+    solid -= _prism(holes) + _prism(window, PLATE, FRONT)
+    return make_part("servoholder", _mesh(solid))
+
+
+@cache
+def pivconnector() -> Part:
+    """Return the PivConnector: an arm with a pivot's eye at one end and a fork at the other."""
+    plate = _rectangle((-26.5, -26), (52.5, 26), radius=3) + _disc((-26.5, 0), 26)
+    plate -= _rectangle((30, -3), (54, 11)) + _polygon((52.5, 10), (52.5, 26), (34, 26))
+    plate -= _slot((-2, -27), (14, -27), 10)
+    eye, pad = _disc((-26.5, 0), 19), _rectangle((29, -26), (52.5, -6), radius=3)
+    ribs = (_slot((-12, 9), (24, 18), 5), _slot((-12, -9), (30, -16), 5))
+    bridge = _rectangle((22, -18), (29, 21))
+    holes = _disc((-26.5, 0), 11) + _slot((-1, 0), (14, 2), 7)
+    holes += _disc((41, -16), 4) + _disc((38, 17), 2.2) + _disc((-26.5, 22), 1.8)
+    pockets = (_polygon((2, 24), (32, 24), (26, 8), (-4, 8)), _rectangle((16, -23), (34, -12), 2))
+    groove = _disc((-26.5, 0), 22) ^ _rectangle((-60, -30), (-22, 4))
+    solid = _prism(plate, BACK, PLATE)
+    solid += _raised(eye, pad, bridge, *ribs) ^ _prism(plate, PLATE, FRONT)
+    solid -= _sunk(*pockets, groove) - _prism(_disc((-26.5, 0), 15))
+    solid -= _prism(holes)
+    return make_part("pivconnector", _mesh(solid))
+
+
+def _raised(*sections: CrossSection) -> Manifold:
+    """Return convex features on the plate's front with sloping walls."""
+    return Manifold.batch_boolean([_tapered(s, PLATE, FRONT) for s in sections], OpType.Add)
+
+
+def _sunk(*sections: CrossSection) -> Manifold:
+    """Return the hollows of convex recesses in the back with sloping walls."""
+    recesses = [_tapered(s, BACK, BACK + RECESS) for s in sections]
+    return Manifold.batch_boolean(recesses, OpType.Add)
+
+
+def _tapered(section: CrossSection, foot: float, top: float) -> Manifold:
+    """Extrude a convex section along z while it shrinks by ``SLOPE`` all around.
+
+    Walls of another direction than the plate's make the features visible from straight above.
+    """
+    outlines = ((section, foot), (section.offset(-SLOPE, JoinType.Miter), top))
+    rings = [np.insert(s.to_polygons()[0], 2, z, axis=1) for s, z in outlines]
+    return Manifold.hull_points(np.vstack(rings))
+
+
+def _polygon(*corners: tuple[float, float]) -> CrossSection:
+    """Return a convex polygon: the hull of its corners, in any order."""
+    return CrossSection.hull_points(np.array(corners, np.float64))
+
+
+def _rectangle(
+    lower: tuple[float, float], upper: tuple[float, float], radius: float = 0.0
+) -> CrossSection:
+    """Return an axis-aligned rectangle whose corners are rounded by ``radius``."""
+    (left, bottom), (right, top) = lower, upper
+    xs, ys = (left + radius, right - radius), (bottom + radius, top - radius)
+    if radius == 0:
+        return _polygon(*((x, y) for x in xs for y in ys))
+    return CrossSection.batch_hull([_disc((x, y), radius) for x in xs for y in ys])
+
+
+def _disc(centre: tuple[float, float], radius: float) -> CrossSection:
+    return CrossSection.circle(radius, SEGMENTS).translate(centre)
+
+
+def _slot(start: tuple[float, float], end: tuple[float, float], width: float) -> CrossSection:
+    """Return a band with round ends around the line from ``start`` to ``end``."""
+    return CrossSection.batch_hull([_disc(start, width / 2), _disc(end, width / 2)])
+
+
+def _prism(section: CrossSection, bottom: float = BACK, top: float = FRONT) -> Manifold:
+    """Extrude a section along z between two heights."""
+    return section.extrude(top - bottom).translate((0.0, 0.0, bottom))
+
+
+def _mesh(solid: Manifold) -> Mesh:
+    """Turn a solid in millimetres into triangles in metres."""
+    triangles = solid.as_original().simplify(TOLERANCE).to_mesh64()
+    # Rounding to a nanometre (1e-6 mm) hides the last digits of sin and cos, which differ between
+    # platforms, so that a part has one hash everywhere; vertices that meet by it become one.
+    rounded = np.round(np.asarray(triangles.vert_properties)[:, :3], 6)
+    vertices, faces = weld(rounded, np.asarray(triangles.tri_verts))
+    a, b, c = faces.T
+    proper = (a != b) & (b != c) & (c != a)
+    return Mesh(vertices / 1000, faces[proper].astype(np.int32))
+
 
 BUILTIN: Final[dict[str, Callable[[], Part]]] = {
     "servoholder": servoholder,
@@ -29,7 +163,7 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
 
     Raises:
         UserError: There is no such part or file, or the file cannot be used (see
-            :func:`~dopepp.parts.mesh.read_mesh`).
+            :func:`~dopepp.parts.mesh.read.read_mesh`).
     """
     text = str(path_or_name)
     if text in BUILTIN:

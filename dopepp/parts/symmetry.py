@@ -12,12 +12,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.symmetry import ContinuousSymmetry, exact_group
-from dopepp.parts.measure import largest_distance
+from dopepp.parts.mesh.measure import SurfaceTree, largest_distance
 from dopepp.parts.part import Mesh
-from dopepp.parts.proximity import Surface
 from dopepp.parts.symmetry_candidates import Candidates, is_new, turn
 
 TOLERANCE: Final = 0.01
@@ -85,10 +84,10 @@ class _Shape:
         used = vertices[np.unique(mesh.faces)]
         self.diameter, self.tolerance = largest_distance(used), tolerance
         middle = used.mean(axis=0)
-        scaled = Surface((vertices - middle) / self.diameter, mesh.faces)
+        scaled = SurfaceTree((vertices - middle) / self.diameter, mesh.faces)
         centroid = scaled.areas @ scaled.triangles.mean(axis=1) / scaled.areas.sum()
         self.centre = middle + self.diameter * centroid
-        self.surface = Surface((vertices - self.centre) / self.diameter, mesh.faces)
+        self.surface = SurfaceTree((vertices - self.centre) / self.diameter, mesh.faces)
         corners = _some(self.surface.triangles.reshape(-1, 3))
         centres = _some(self.surface.triangles.mean(axis=1))
         self._few = self.surface.spread(500, seed=3)[0]

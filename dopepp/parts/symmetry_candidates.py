@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.parts.proximity import Surface
+from dopepp.parts.mesh.measure import SurfaceTree
 
 _NUM_DIRECTIONS: Final = 1500
 """Axes over half a sphere: none is farther than 2.6° from one of them."""
@@ -56,7 +56,7 @@ def axis_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     return np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
 
 
-def second_moments(surface: Surface) -> Float[np.ndarray, "3 3"]:
+def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
     """Return the mean of x·xᵀ over the surface, exactly."""
     corners = surface.triangles
     sums = corners.sum(axis=1)
@@ -65,7 +65,7 @@ def second_moments(surface: Surface) -> Float[np.ndarray, "3 3"]:
     return np.asarray(np.tensordot(surface.areas, products / 12, axes=1) / surface.areas.sum())
 
 
-def special_axes(surface: Surface) -> Float[np.ndarray, "axes 3"]:
+def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
     """Return axes that are exact where they are right.
 
     They are the coordinate axes, the principal axes of the moments, the directions of the largest
@@ -85,7 +85,7 @@ def special_axes(surface: Surface) -> Float[np.ndarray, "axes 3"]:
     return np.asarray(axes[lengths > 0.1] / lengths[lengths > 0.1, None])
 
 
-def _main_normals(surface: Surface) -> Float[np.ndarray, "clusters 3"]:
+def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
     """Return the directions with the most area, opposite ones as one."""
     # The largest triangles suffice: flat areas that matter have some among them.
     largest = np.argsort(-surface.areas, kind="stable")[:3000]
@@ -113,7 +113,7 @@ class Candidates:
         surface: The normalised shape.
     """
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: SurfaceTree) -> None:
         self._surface = surface
         self._moments = second_moments(surface)
         self._special = special_axes(surface)

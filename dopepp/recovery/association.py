@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.recovery.consensus import foretell
+from dopepp.recovery.consensus import predict
 
 LEAST_DEVIATION: Final = 0.05
 """Radians by which even a clear vector may be off its centroid's direction."""
@@ -163,11 +163,11 @@ def associate(
         peaks: Of one object.
         evidence: From :func:`direction_evidence`.
         expected: Where poses found before put the corners, pixels; NaN for an instance without
-            a pose. Before there are any, triples of corners foretell the others.
+            a pose. Before there are any, triples of corners predict the others.
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:
-        expected, deviation = foretell(
+        expected, deviation = predict(
             peaks.position, evidence, peaks.centroid, PREDICTION_PX, peaks.area_px
         )
     gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)

@@ -1,7 +1,7 @@
 """Which corners belong together: an affine camera seen through three of them, compiled.
 
 From far enough away, a corner's image is c + A s with the centroid's c, a 2×3 matrix A and the
-corner's signs s, so any three corners no two of which are opposite foretell the other five.
+corner's signs s, so any three corners no two of which are opposite predict the other five.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import CORNER_SIGNS, NUM_CORNERS
 
 CANDIDATES: Final = 3
@@ -38,7 +38,7 @@ WEIGHTS: Final = np.array(
 """Every corner as a sum of the triple's, relative to the centroid; (32, 8, 3)."""
 
 
-def foretell(
+def predict(
     position: Float[np.ndarray, "8 peaks 2"],
     evidence: Float[np.ndarray, "instances 8 peaks"],
     centroids: Float[np.ndarray, "instances 2"],
@@ -82,7 +82,7 @@ def _best_triple(
     area_px: float,
     expected: Array,
 ) -> float:
-    """Write the corners that the best three candidates foretell; returns their deviation."""
+    """Write the corners that the best three candidates predict; returns their deviation."""
     best, best_deviation = -math.inf, deviation_px
     # What speaks so much against a peak that no agreement makes up for it.
     hopeless = -math.log(area_px / (2 * math.pi * deviation_px**2))

@@ -1,11 +1,25 @@
-"""What comes out of recovery: one posed object, with all that a user can check it by."""
+"""What comes out of recovery: one posed object, with all that a user can check it by.
+
+From one object's peaks to its instances: grouping and posing by turns.
+
+From one instance's keypoints to its pose.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+
+from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.pnp import PnPResult, solve_pnp
+from dopepp.maps.peaks import Peaks
+from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
+from dopepp.recovery.options import RecoveryOptions
 
 
 @dataclass(frozen=True)
@@ -35,3 +49,156 @@ class Detection:
     peaks: Float[np.ndarray, "9 2"]
     reprojection_error_px: float
     covariance: Float[np.ndarray, "6 6"]
+
+
+SIGMA_FLOOR_PX: Final = 1.0
+"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
+trained network's maps 1 px did as well as 2 and better than 0.5."""
+
+WIDENINGS: Final = (1.0, 2.0, 4.0)
+"""Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
+
+
+def solve_group(
+    group: KeypointGroup, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
+) -> PnPResult:
+    """Solve PnP with each keypoint weighted by its own covariance.
+
+    A covariance is averaged over its directions. How wide a network's peak is tells how far it is
+    off; its shape does not tell whither: taken at their word, ellipses left ADD-0.1d of a trained
+    network at 76 %, circles gave 85 %. Where shapes are right, circles cost 2 points.
+
+    A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
+    agree on a pose, the deviations are widened and the pose solved again.
+
+    Args:
+        group: The instance's keypoints.
+        cuboid: The object's nine keypoints, metres.
+        K: Camera matrix of the network's input, pixels.
+    """
+    covariance = _averaged(group.covariance_px)
+    found = int(np.isfinite(group.position[:, 0]).sum())
+    best = None
+    for widening in WIDENINGS:
+        result = solve_pnp(cuboid, group.position, K, covariance_px=covariance * widening**2)
+        if best is None or result.inliers.sum() > best.inliers.sum():
+            best = result
+        if 3 * best.inliers.sum() >= 2 * found:
+            break
+    assert best is not None
+    return best
+
+
+def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 2"]:
+    """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
+    variance = covariance.trace(axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2
+    return np.asarray(variance[:, None, None] * np.eye(2))
+
+
+ROUNDS: Final = 3
+"""Most turns of grouping and solving; in crowds one or two change anything."""
+
+BORDER: Final = 1.0
+"""Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
+
+BORDER_DEVIATION: Final = 0.75
+"""Error of such a peak, cells: half a network's belief lies where there are no cells, so the peak
+is pulled inward. Two trained networks' peaks were off by 0.3 to 0.5 cells on average there, by
+0.75 in the root mean square, and by nothing on average two cells further in."""
+
+
+def peaks_of_object(
+    peaks: Peaks, image: int, number: int, threshold: float, cells: tuple[int, int], stride: float
+) -> ObjectPeaks:
+    """Pick the peaks of one object on one image; those at the border are less certain.
+
+    Args:
+        peaks: Of a batch of images.
+        image: Which image.
+        number: Which object.
+        threshold: Belief below which a centroid is no instance.
+        cells: Width and height of the maps.
+        stride: Input pixels per cell.
+    """
+    first = number * NUM_KEYPOINTS
+    corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
+    strong = peaks.score[centroid] >= threshold
+    extent = np.array(cells) * stride
+    return ObjectPeaks(
+        peaks.position[corners],
+        peaks.score[corners],
+        _covariance_px(peaks.position[corners], peaks.covariance_px[corners], extent, stride),
+        peaks.toward[corners],
+        peaks.position[centroid][strong],
+        peaks.score[centroid][strong],
+        peaks.covariance_px[centroid][strong],
+        float(extent.prod()),
+    )
+
+
+def _covariance_px(
+    position: Float[np.ndarray, "8 peaks 2"],
+    covariance: Float[np.ndarray, "8 peaks 2 2"],
+    extent: Float[np.ndarray, "2"],
+    stride: float,
+) -> Float[np.ndarray, "8 peaks 2 2"]:
+    """Add what a peak at the border of the maps does not know; the outermost pixel ends at −½."""
+    inward = np.minimum(position + 0.5, extent - 0.5 - position).min(-1)
+    added = np.where(inward < BORDER * stride, (BORDER_DEVIATION * stride) ** 2, 0.0)
+    return np.asarray(covariance + added[..., None, None] * np.eye(2))
+
+
+def pose_instances(
+    peaks: ObjectPeaks,
+    cuboid: Float[np.ndarray, "9 3"],
+    K: Float[np.ndarray, "3 3"],
+    options: RecoveryOptions,
+    coincident_px: float,
+) -> list[tuple[KeypointGroup, PnPResult]]:
+    """Group keypoints and solve poses by turns, until the poses change no group any more."""
+    max_angle = math.radians(options.max_angle_deg)
+    evidence = direction_evidence(peaks, max_angle, coincident_px)
+    groups = associate(peaks, evidence)
+    results = [solve_group(group, cuboid, K) for group in groups]
+    for _ in range(ROUNDS):
+        if all(result.inliers.all() for result in results):
+            break  # complete instances have nothing to gain from each other
+        expected = np.full((len(groups), NUM_CORNERS, 2), np.nan)
+        for corners, result in zip(expected, results, strict=True):
+            if result.T_cam_obj is not None:
+                corners[:] = project_keypoints(cuboid, result.T_cam_obj, K)[:NUM_CORNERS]
+        before, groups = groups, associate(peaks, evidence, expected)
+        same = [
+            np.array_equal(old.position, new.position, equal_nan=True)
+            for old, new in zip(before, groups, strict=True)
+        ]
+        if all(same):
+            break
+        results = [
+            result if kept else solve_group(group, cuboid, K)
+            for kept, result, group in zip(same, results, groups, strict=True)
+        ]
+    return list(zip(groups, results, strict=True))
+
+
+def make_detection(
+    group: KeypointGroup,
+    result: PnPResult,
+    cuboid: Float[np.ndarray, "9 3"],
+    K: Float[np.ndarray, "3 3"],
+    name: str,
+) -> Detection | None:
+    """Turn one group into a detection where PnP finds a pose."""
+    if result.T_cam_obj is None or result.covariance is None:
+        return None
+    belief = float(np.where(result.inliers, group.score, 0.0).clip(0.0, 1.0).mean())
+    return Detection(
+        object=name,
+        score=belief,
+        belief=belief,
+        T_cam_obj=result.T_cam_obj,
+        keypoints=project_keypoints(cuboid, result.T_cam_obj, K),
+        peaks=np.where(result.inliers[:, None], group.position, np.nan),
+        reprojection_error_px=result.reprojection_error_px,
+        covariance=result.covariance,
+    )

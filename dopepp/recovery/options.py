@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
 """What the score is made of, in this order (:mod:`dopepp.recovery.calibration`)."""

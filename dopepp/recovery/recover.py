@@ -13,8 +13,7 @@ from dopepp.maps.encode import MapGeometry
 from dopepp.maps.peaks import find_peaks
 from dopepp.recovery.association import ObjectPeaks
 from dopepp.recovery.calibration import calibrated
-from dopepp.recovery.detection import Detection
-from dopepp.recovery.instances import make_detection, peaks_of_object, pose_instances
+from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
 from dopepp.recovery.options import RecoveryOptions
 
 __all__ = ["RecoveryOptions", "explain", "recover", "recover_batch"]

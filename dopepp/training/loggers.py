@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from dopepp.drawing.png import write_whole
+from dopepp.core.files import write_whole
 
 _log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
-from dopepp.errors import RunError
+from dopepp.core.errors import RunError
 
 _STARTED_BY: Final = "DOPEPP_STARTED_BY"
 """Environment variable that tells a process which one of the run has started it."""

@@ -29,8 +29,8 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, recover_batch
-from dopepp.training.averaging import go_on_with_trained
-from dopepp.training.finite import check_state
+from dopepp.training.callbacks.averaging import go_on_with_trained
+from dopepp.training.callbacks.finite import check_state
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
 

@@ -1,17 +1,16 @@
 """The virtual-reality factory: from parts to labelled images, without torch and without files."""
 
+from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
-from dopepp.virtual.customise import customised_preset
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.material import Grooves, Material
-from dopepp.virtual.placement import (
+from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
     FillPlacement,
     FreeTurning,
     OffsetPlacement,
 )
-from dopepp.virtual.presets import (
+from dopepp.virtual.presets.preset import (
     PRESETS,
     Distractors,
     Lighting,
@@ -19,12 +18,19 @@ from dopepp.virtual.presets import (
     Preset,
     Sensors,
     Table,
+    customised_preset,
 )
-from dopepp.virtual.randomise import random_scene
-from dopepp.virtual.rasteriser import Silhouette, render, silhouette, visible_fractions
+from dopepp.virtual.renderers.raster.rasteriser import (
+    Silhouette,
+    render,
+    silhouette,
+    visible_fractions,
+)
 from dopepp.virtual.scene import (
     Ambient,
+    Grooves,
     Light,
+    Material,
     Plane,
     Rendered,
     Scene,

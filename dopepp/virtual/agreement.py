@@ -18,12 +18,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import Part
-from dopepp.virtual.raster.projection import project_object
-from dopepp.virtual.raster.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, project_object, rasterise
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 

@@ -1,22 +1,43 @@
-"""The factory: image ``(epoch, index)`` of an endless, reproducible supply."""
+"""The factory: image ``(epoch, index)`` of an endless, reproducible supply.
+
+Which code renders: two versions of it may draw the same scene differently.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.part import Part
+from dopepp.virtual.arrange.body import make_body
+from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
-from dopepp.virtual.body import make_body
-from dopepp.virtual.presets import Preset
-from dopepp.virtual.randomise import random_scene
+from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Rendered, Scene
 from dopepp.virtual.sensor import capture
+
+_PACKAGE: Final = Path(__file__).parents[1]
+_FOLDERS: Final = ("virtual", "parts", "geometry")
+"""The packages that decide a render's pixels and labels."""
+
+
+@cache
+def code_hash() -> str:
+    """Return a SHA-256 of the rendering code; kept renders of other code are not reused."""
+    digest = hashlib.sha256()
+    for folder in _FOLDERS:
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 class Factory:
@@ -75,7 +96,7 @@ class Factory:
             epoch: The epoch.
             index: The image.
             scale: How many times as large its parts appear: the camera of the same scene, moved
-                (see :mod:`dopepp.virtual.approach`).
+                (see :mod:`dopepp.virtual.arrange.random_scene`).
 
         Raises:
             UserError: The preset cannot show the part, or the camera cannot stand there (see

@@ -46,7 +46,7 @@ class JoblibLauncher(_RemoteLauncher):
 
     def runner(self) -> Runner:
         """Return what runs the jobs."""
-        from dopepp.experiment.launch.on_joblib import on_joblib
+        from dopepp.experiment.launch.jobs import on_joblib
 
         return on_joblib(self.n_jobs)
 
@@ -59,7 +59,7 @@ class RayLauncher(_RemoteLauncher):
 
     def runner(self) -> Runner:
         """Return what runs the jobs."""
-        from dopepp.experiment.launch.on_ray import on_ray
+        from dopepp.experiment.launch.jobs import on_ray
 
         return on_ray(self.address, self.num_cpus, self.num_gpus)
 
@@ -76,6 +76,6 @@ class SlurmLauncher(_RemoteLauncher):
 
     def runner(self) -> Runner:
         """Return what runs the jobs."""
-        from dopepp.experiment.launch.on_slurm import on_slurm
+        from dopepp.experiment.launch.slurm import on_slurm
 
         return on_slurm(self.folder, self.cluster, self.max_num_timeout, self.sbatch)

@@ -36,7 +36,7 @@ class OptunaSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> Any:
         """Search until the study has its trials."""
-        from dopepp.experiment.extras import require
+        from dopepp.core.errors import require
 
         require("optuna", "search=optuna", "search")
         from dopepp.experiment.search.loop import search

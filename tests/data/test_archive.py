@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dopepp.core.errors import UserError
 from dopepp.data.archive import Limits, safe_extract
-from dopepp.errors import UserError
 
 Members = Sequence[tuple[str | tarfile.TarInfo, bytes]]
 GOOD: Members = [("set/a.txt", b"hello" * 1000), ("set/deep/b.bin", bytes(range(256))), ("c", b"")]

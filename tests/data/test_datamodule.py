@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from dopepp.data.augment import Photometric
+from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
-from dopepp.data.cache import CachedSource
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.loader import EpochSampler, SampleDataset
-from dopepp.data.masking import RandomMask
-from dopepp.errors import UserError
+from dopepp.data.sources.cache import CachedSource
+from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.masking import RandomMask
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 
 

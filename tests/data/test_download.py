@@ -15,10 +15,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pytest
 
+from dopepp.core.errors import UserError
 from dopepp.data import download as downloads
-from dopepp.data.download import SOURCES, Source, download
-from dopepp.data.fetch import _Redirects, fetch
-from dopepp.errors import UserError
+from dopepp.data.download import SOURCES, DownloadSource, _Redirects, download, fetch
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -196,7 +195,9 @@ def test_a_data_set_is_unpacked_once(
     server.content = make_tar()
     digest = hashlib.sha256(server.content).hexdigest()
     photos = PurePosixPath("set/photos")
-    source = Source(url(server, "tiny.tar"), len(server.content), digest, photos, "free for tests")
+    source = DownloadSource(
+        url(server, "tiny.tar"), len(server.content), digest, photos, "free for tests"
+    )
     monkeypatch.setitem(downloads.SOURCES, "tiny", source)
     with caplog.at_level(logging.INFO):
         folder = download("tiny", tmp_path / "data")

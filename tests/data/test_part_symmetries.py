@@ -9,8 +9,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from dopepp.cli import app
+from dopepp.core.errors import UserError
 from dopepp.data.part_symmetries import choose_symmetries
-from dopepp.errors import UserError
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 

@@ -13,12 +13,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.drawing.curves import (
     accuracy_curve,
     accuracy_figure,
     save_accuracy_curves,
 )
-from dopepp.drawing.png import figure_image, write_png, write_whole
 from dopepp.metrics.functional import auc
 
 ERRORS = st.lists(

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.drawing.panels import Line, grid, lines_figure, message_picture, smoothed
-from dopepp.drawing.png import figure_image
+from dopepp.core.files import figure_image
+from dopepp.drawing.panels import PlotLine, grid, lines_figure, message_picture, smoothed
 
 
-def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> Line:
-    return Line(name, np.arange(values.shape[1], dtype=float), values, colour)
+def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> PlotLine:
+    return PlotLine(name, np.arange(values.shape[1], dtype=float), values, colour)
 
 
 def test_several_runs_are_a_mean_in_a_band() -> None:

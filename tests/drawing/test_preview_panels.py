@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopepp.drawing.preview import AXIS_COLOURS, COLOURS, depth_panel, draw_axes, mask_panel
+from dopepp.drawing.panels import AXIS_COLOURS, COLOURS, depth_panel, draw_axes, mask_panel
 
 GREY = np.full((30, 40, 3), 100, np.uint8)
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopepp.drawing.png import figure_image
-from dopepp.drawing.rates import RateCurve, rates_figure
+from dopepp.core.files import figure_image
+from dopepp.drawing.curves import RateCurve, rates_figure
 
 
 def curve(*rates: float) -> RateCurve:

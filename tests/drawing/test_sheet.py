@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dopepp.drawing.overlay import text_coverage
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.drawing.text import text_coverage
 
 RED, GREY = (200, 10, 10), (90, 90, 90)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_image, read_rgb
-from dopepp.errors import UserError
 
 
 @pytest.fixture

@@ -76,7 +76,7 @@ def in_process(script: str, *arguments: str) -> Done:
         patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
         # What a full-size network costs is measured at this size; the `trained` run does it at
         # the paper's.
-        patch.setattr("dopepp.experiment.run.PAPER_INPUT_SIZE", (64, 64))
+        patch.setattr("dopepp.experiment.train.PAPER_INPUT_SIZE", (64, 64))
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             try:
                 runpy.run_path(str(ROOT / script), run_name="__main__")

@@ -15,7 +15,7 @@ import torch
 import trimesh
 
 from dopepp import PoseEstimator
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 
 Runner = Callable[..., Any]
 

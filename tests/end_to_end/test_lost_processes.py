@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from dopepp.models.checkpoint import load_network
+from dopepp.models.checkpoint.schema import load_network
 
 ROOT = Path(__file__).parents[2]
 _PR_SET_CHILD_SUBREAPER = 36

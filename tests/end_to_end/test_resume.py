@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.resume import read_overrides
-from dopepp.training.checkpoints import newest_checkpoint
+from dopepp.experiment.runs.resume import read_overrides
+from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
 Runner = Callable[..., Any]

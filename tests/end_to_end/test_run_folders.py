@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from dopepp.experiment import record
+from dopepp.experiment.runs import record
 
 Runner = Callable[..., Any]
 

@@ -14,13 +14,13 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dopepp.data.rendered import RenderedSource
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
+from dopepp.data.sources.rendered import RenderedSource
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.references import REFERENCES
-from dopepp.parts.builtin import pivconnector
+from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import PRESETS
+from dopepp.virtual.presets.preset import PRESETS
 
 Runner = Callable[..., Any]
 FindRun = Callable[[Path], Path]

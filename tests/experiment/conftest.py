@@ -56,10 +56,10 @@ import math, os, signal, time
 from pathlib import Path
 from types import SimpleNamespace
 import hydra, torch
-from dopepp.experiment import record
+from dopepp.experiment.runs import record
 from dopepp.experiment.command_line import entry, run_job
-from dopepp.experiment.gates import CALLBACKS
-from dopepp.training.trial import raise_if_pruned
+from dopepp.experiment.build.registries import CALLBACKS
+from dopepp.training.callbacks.trial import raise_if_pruned
 
 EPOCHS = 4
 

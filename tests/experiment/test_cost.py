@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
-from dopepp.errors import UserError
-from dopepp.experiment.build import build_untrained, map_geometry
+from dopepp.experiment.build.objects import build_parts
+from dopepp.experiment.build.sources import build_test_source
+from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.cost import measure_cost, read_frames
 from dopepp.experiment.jobs import do_job
-from dopepp.experiment.objects import build_parts
-from dopepp.experiment.sources import build_test_source
 from dopepp.experiment.timing import WARM_UP, RehearsedEstimator, likely_maps, time_frames
 from dopepp.geometry.camera import transform
 from dopepp.maps.encode import MapGeometry

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from dopepp.errors import UserError
-from dopepp.experiment.chosen_data import chosen_data, trained_on
-from dopepp.experiment.labelled import share_of
+from dopepp.core.errors import UserError
+from dopepp.experiment.build.splits import share_of
+from dopepp.experiment.config.chosen_data import chosen_data, trained_on
 
 STORED: dict[str, Any] = {
     "name": "hybrid",

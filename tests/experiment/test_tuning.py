@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.errors import UserError
 from dopepp.experiment.tuning import (
+    FalsePositiveTarget,
     Scored,
-    Silence,
     choose,
     matched_poses,
     score_images,
@@ -24,7 +24,7 @@ from dopepp.experiment.tuning import (
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import expected_calibration_error
-from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.spec import build_network
 from dopepp.parts import load_part
 from dopepp.parts.part import Part
@@ -52,7 +52,7 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
     correct = np.concatenate([shown.correct, empty.correct])
     assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
     loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
-    assert loud.mean() <= 4 * Silence.false_positive_rate
+    assert loud.mean() <= 4 * FalsePositiveTarget.false_positive_rate
     assert options["min_score"] < 1
 
 
@@ -71,9 +71,9 @@ def test_the_threshold_lets_no_more_pass_than_it_may() -> None:
 )
 def test_impossible_silence_is_refused(change: dict[str, Any]) -> None:
     allowed = {"num_empty": 500, "false_positive_rate": 0.005}
-    assert Silence.of(allowed) == Silence()
+    assert FalsePositiveTarget.of(allowed) == FalsePositiveTarget()
     with pytest.raises(UserError, match=next(iter(change))):
-        Silence.of(allowed | change)
+        FalsePositiveTarget.of(allowed | change)
 
 
 def test_silence_needs_no_threshold() -> None:

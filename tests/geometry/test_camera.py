@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
     Letterbox,
     camera_matrix,

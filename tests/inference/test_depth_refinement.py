@@ -10,19 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.depth_image import checked_depth, read_depth, undistorted_depth
-from dopepp.inference.depth_view import lay_over, view_around
-from dopepp.inference.outline import outline_terms
-from dopepp.inference.prior import make_prior
-from dopepp.inference.refine import DepthRefiner
-from dopepp.inference.visible import surface_points, visible
-from dopepp.parts.builtin import pivconnector
+from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.inference.refinement.fit import make_prior, outline_terms
+from dopepp.inference.refinement.view import (
+    checked_depth,
+    lay_over,
+    read_depth,
+    undistorted_depth,
+    view_around,
+)
+from dopepp.inference.refinement.visible import surface_points, visible
+from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual.body import make_body
-from dopepp.virtual.rasteriser import render
+from dopepp.virtual.arrange.body import make_body
+from dopepp.virtual.renderers.raster.rasteriser import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 
 pytest.importorskip("small_gicp")

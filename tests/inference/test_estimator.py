@@ -12,7 +12,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp import PoseEstimator
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
     Letterbox,
     camera_matrix,
@@ -24,7 +24,7 @@ from dopepp.geometry.rotation import random_rotation
 from dopepp.inference import estimator as module
 from dopepp.inference.estimator import letterboxed, parse_recovery
 from dopepp.maps import MapGeometry, encode
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.part import Part, make_part
 
@@ -285,7 +285,7 @@ def test_an_unknown_name_of_the_package() -> None:
 
 def test_refines_with_depth_where_it_is_given(tmp_path: Path) -> None:
     pytest.importorskip("small_gicp")
-    from dopepp.parts.builtin import pivconnector, servoholder
+    from dopepp.parts.catalogue import pivconnector, servoholder
     from dopepp.virtual import Scene, SceneObject, make_surface, render
 
     checkpoint = Checkpoint(

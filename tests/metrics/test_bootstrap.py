@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, norm, t
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.metrics.bootstrap import (
     STATISTICS,
     fewest_differing,

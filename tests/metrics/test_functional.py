@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.metrics.functional import (
     add,
     add_s,

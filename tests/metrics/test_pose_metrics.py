@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
-from dopepp.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import (
     add,

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.metrics.functional import (
     BOP_MSPD_THRESHOLDS,
     BOP_THRESHOLDS,

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.signal import correlate2d
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.models.attention import CBAM, SE, Identity
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.models.backbones import DSC, VGG19, VGG19Original
 
 # torchvision's vgg19: index of each convolution under `features` and its channels.

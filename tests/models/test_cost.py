@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from dopepp.models.cost import network_cost
+from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
 
 

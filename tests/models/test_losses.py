@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.errors import UserError
-from dopepp.models.activation import find_activation
+from dopepp.core.errors import UserError
+from dopepp.models.layers import find_activation
 from dopepp.models.losses import MapMSE, SpatialCrossEntropy
 
 SIGMA = 1.5

@@ -7,10 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-from dopepp.errors import UserError
-from dopepp.models.activation import find_activation
+from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale
-from dopepp.models.layers import conv_block, scaled_channels
+from dopepp.models.layers import conv_block, find_activation, scaled_channels
 from dopepp.models.spec import build_network
 
 

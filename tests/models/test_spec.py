@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import nn
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.models import backbones
-from dopepp.models.gate import Gate
 from dopepp.models.losses import MapMSE, SpatialCrossEntropy
 from dopepp.models.network import PoseNetwork
+from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES, architecture, build_network
 
-OPTIMIZERS = Gate("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
+OPTIMIZERS = Registry("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
 DSC = "dopepp.models.backbones.DSC"
 
 
@@ -97,7 +97,7 @@ def test_a_refused_target_is_not_even_imported(make_spec):
     """In a process of its own: importing the module would be visible in sys.modules."""
     code = """
 import sys
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.models.spec import BACKBONES
 for module in ("antigravity", "this"):
     try:
@@ -143,7 +143,7 @@ def tiny_module(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_a_registered_class_can_be_built(make_spec, tiny_module):
-    gate = Gate("backbone", backbones.Backbone)
+    gate = Registry("backbone", backbones.Backbone)
     with pytest.raises(UserError, match="allowed: nothing"):
         gate.build({"_target_": f"{tiny_module}.Tiny", "channels": 8})
     gate.register(f"{tiny_module}.Tiny")
@@ -270,7 +270,7 @@ class Logger:
 def test_keywords_that_a_class_hands_on(monkeypatch, tiny_module):
     monkeypatch.setattr(Logger, "__module__", tiny_module)
     sys.modules[tiny_module].Logger = Logger
-    gate = Gate("logger", Logger, [f"{tiny_module}.Logger"])
+    gate = Registry("logger", Logger, [f"{tiny_module}.Logger"])
     node = {"_target_": f"{tiny_module}.Logger", "project": "parts"}
     assert gate.build(node, path="here").more == {"project": "parts"}
     with pytest.raises(UserError, match="argument 'path'"):
@@ -304,7 +304,7 @@ def test_the_documented_backbone_works(monkeypatch, make_spec):
     monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
     monkeypatch.setattr(backbones, "Strided", None, raising=False)
     exec(code, vars(backbones))
-    gate = Gate.of_module("backbone", backbones.Backbone, backbones)
+    gate = Registry.of_module("backbone", backbones.Backbone, backbones)
     assert "dopepp.models.backbones.Strided" in gate.targets
     backbone = gate.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
     assert backbone(torch.zeros(1, 3, 64, 32)).shape == (1, backbone.out_channels, 8, 4)

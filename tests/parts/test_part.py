@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts import Mesh, make_part, servoholder
 

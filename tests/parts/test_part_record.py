@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts import Part, make_part, servoholder
-from dopepp.parts.record import FIELDS, MAX_POINTS
+from dopepp.parts.part import FIELDS, MAX_POINTS
 
 
 def symmetric_part() -> Part:

@@ -9,9 +9,9 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.parts import load_part, ycb_part
-from dopepp.parts.decimate import decimate
+from dopepp.parts.mesh.decimate import decimate
 
 TEXTURED = (
     "003_cracker_box",

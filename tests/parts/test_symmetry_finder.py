@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from trimesh.creation import box, cone, cylinder, icosphere
 from trimesh.transformations import translation_matrix
 
-from dopepp.errors import UserError
-from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.core.errors import UserError
+from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh
 from dopepp.parts.symmetry import find_symmetries
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.geometry.cuboid import CORNER_SIGNS
 from dopepp.recovery.association import ObjectPeaks, associate, direction_evidence
-from dopepp.recovery.consensus import foretell
+from dopepp.recovery.consensus import predict
 
 WIDE = math.radians(45)
 
@@ -97,11 +97,11 @@ def test_three_corners_foretell_the_others() -> None:
     corners, centroids = crowd(np.random.default_rng(1), 1)
     evidence = np.full((1, 8, 1), -np.inf)
     evidence[0, [0, 1, 2]] = 0.0
-    expected, deviation = foretell(corners, evidence, centroids, 4.0, 160_000.0)
+    expected, deviation = predict(corners, evidence, centroids, 4.0, 160_000.0)
     assert_allclose(expected[0], corners[:, 0], atol=1e-9)
     assert deviation[0] > 4
     evidence[0, 2] = -np.inf
-    assert np.isnan(foretell(corners, evidence, centroids, 4.0, 160_000.0)[0]).all()
+    assert np.isnan(predict(corners, evidence, centroids, 4.0, 160_000.0)[0]).all()
 
 
 def test_a_pose_found_before_decides() -> None:

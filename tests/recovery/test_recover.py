@@ -8,14 +8,14 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, project_keypoints, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.pnp import solve_pnp
 from dopepp.maps import MapGeometry, encode
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery import Detection, RecoveryOptions, explain, recover, recover_batch
-from dopepp.recovery.instances import BORDER_DEVIATION, peaks_of_object
+from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
 
 Make = Callable[..., Any]
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]

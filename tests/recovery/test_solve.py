@@ -6,7 +6,7 @@ import numpy as np
 
 from dopepp.geometry.camera import project_keypoints, transform
 from dopepp.recovery.association import KeypointGroup
-from dopepp.recovery.solve import solve_group
+from dopepp.recovery.detection import solve_group
 
 Pose = Callable[..., np.ndarray]
 

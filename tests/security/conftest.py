@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopepp.errors import UserError
-from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.core.errors import UserError
+from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.part import Mesh, make_part
 

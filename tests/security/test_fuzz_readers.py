@@ -30,25 +30,30 @@ from trimesh.exchange.off import export_off
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl, export_stl_ascii
 
+from dopepp.core.errors import UserError
+from dopepp.core.yaml import read_yaml
 from dopepp.data.archive import Limits, safe_extract
-from dopepp.data.bop import BopSource
-from dopepp.data.bop_images import decode_depth, decode_mask, decode_rgb, encode_png
-from dopepp.data.bop_masks import encode_runs
-from dopepp.data.bop_models import bop_parts
-from dopepp.data.bop_results import read_results
-from dopepp.data.checking.check import check_dataset
-from dopepp.data.ndds import NddsSource
-from dopepp.data.ndds_writer import NddsWriter
+from dopepp.data.check import check_dataset
+from dopepp.data.formats.bop.images import (
+    decode_depth,
+    decode_mask,
+    decode_rgb,
+    encode_png,
+    encode_runs,
+)
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.results import read_results
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.ndds.writer import NddsWriter
+from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.data.sample import Instance, Sample
-from dopepp.data.webdataset import WebdatasetSource
-from dopepp.data.ycb_meta import read_meta
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
-from dopepp.errors import UserError
-from dopepp.experiment.yaml_file import read_yaml
 from dopepp.geometry.camera import camera_matrix, project_keypoints
-from dopepp.models import safetensors_file
-from dopepp.models.checkpoint import load_network
-from dopepp.parts.mesh import read_mesh
+from dopepp.models.checkpoint import released as safetensors_file
+from dopepp.models.checkpoint.schema import load_network
+from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Mesh, make_part
 
 QUICK: Final = 6
@@ -311,7 +316,7 @@ def _datasets(root: Path) -> dict[str, Target]:
     writer.prepare()
     for index in range(2):
         writer.write(index, Sample(np.full((24, 32, 3), 90, np.uint8), K, [instance], depth / 1000))
-    writer.seal(0, range(2))
+    writer.finalize(0, range(2))
 
     readers: dict[str, Callable[[Path], object]] = {
         "bop": lambda folder: read_all(BopSource(folder, bop_parts(folder), "train_pbr")),

@@ -22,16 +22,16 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from dopepp.cli import app
+from dopepp.core.errors import UserError
 from dopepp.data.archive import safe_extract
-from dopepp.data.bop_images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.bop_models import read_models
-from dopepp.data.bop_results import read_results
-from dopepp.data.webdataset_tar import index_shard
-from dopepp.data.ycb_meta import read_meta
+from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
+from dopepp.data.formats.bop.models import read_models
+from dopepp.data.formats.bop.results import read_results
+from dopepp.data.formats.webdataset.tar import index_shard
+from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
-from dopepp.errors import UserError
 from dopepp.parts import read_mesh
-from dopepp.parts.mesh import ycb_part
+from dopepp.parts.mesh.read import ycb_part
 
 pytestmark = pytest.mark.timeout(60)
 

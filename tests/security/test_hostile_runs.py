@@ -19,8 +19,8 @@ import torch
 from typer.testing import CliRunner
 
 from dopepp.cli import app
-from dopepp.experiment.resume import read_overrides
-from dopepp.experiment.yaml_file import read_yaml
+from dopepp.core.yaml import read_yaml
+from dopepp.experiment.runs.resume import read_overrides
 
 pytestmark = pytest.mark.timeout(120)
 

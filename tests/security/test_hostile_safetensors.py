@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dopepp.models.safetensors_file import DTYPES, MAX_HEADER_BYTES, read, write
+from dopepp.models.checkpoint.released import DTYPES, MAX_HEADER_BYTES, read, write
 
 pytestmark = pytest.mark.timeout(60)
 

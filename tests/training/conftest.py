@@ -11,17 +11,17 @@ import torch
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.rendered import RenderedSource, Split
+from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.spec import build_network
-from dopepp.parts.builtin import pivconnector
+from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
 from dopepp.recovery.recover import RecoveryOptions
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import PRESETS
+from dopepp.virtual.presets.preset import PRESETS
 
 INPUT_SIZE = (128, 128)
 SystemMaker = Callable[..., PoseSystem]

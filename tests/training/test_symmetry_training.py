@@ -10,8 +10,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from dopepp.core.errors import UserError
 from dopepp.data.batch import PADDING, Batch
-from dopepp.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.symmetry import symmetry_group

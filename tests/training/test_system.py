@@ -15,8 +15,8 @@ from dopepp.data.batch import PADDING, Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Part
+from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
-from dopepp.training.saving import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 SystemMaker = Callable[..., PoseSystem]

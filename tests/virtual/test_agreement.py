@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 from dopepp.virtual.agreement import agreement, meshes_of
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets import PRESETS
+from dopepp.virtual.presets.preset import PRESETS
 
 
 def test_falls_with_the_error_of_the_pose() -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_picture
-from dopepp.errors import UserError
 from dopepp.virtual.backgrounds import (
     PhotoBackgrounds,
     ProceduralBackgrounds,
@@ -178,7 +178,7 @@ def test_pickling_leaves_the_decoded_photos_behind(tmp_path: Path) -> None:
 
 def test_memory_for_photos_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_photos(tmp_path, 9, 100)
-    monkeypatch.setattr("dopepp.virtual.photos._KEPT_BYTES", 3 * 100 * 120 * 3)
+    monkeypatch.setattr("dopepp.virtual.backgrounds.photos._KEPT_BYTES", 3 * 100 * 120 * 3)
     backgrounds = PhotoBackgrounds(tmp_path)
     for seed in range(50):
         draw(backgrounds, seed)

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp.errors import UserError
-from dopepp.parts.builtin import pivconnector, servoholder
+from dopepp.core.errors import UserError
+from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 from dopepp.virtual import (
     PRESETS,
@@ -24,7 +24,7 @@ from dopepp.virtual import (
     Rendered,
     render,
 )
-from dopepp.virtual.presets import Distractors, Preset, Sensors
+from dopepp.virtual.presets.preset import Distractors, Preset, Sensors
 from dopepp.virtual.sensor import capture
 
 DIGEST = """

@@ -11,7 +11,7 @@ import pytest
 from scipy.io import loadmat
 
 from dopepp.geometry.camera import make_transform
-from dopepp.parts.mesh import ycb_part
+from dopepp.parts.mesh.read import ycb_part
 from dopepp.virtual import Material, Rendered, Scene, SceneObject, make_surface, render
 
 CLASSES = {2: "003_cracker_box", 4: "005_tomato_soup_can", 5: "006_mustard_bottle"}

@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.virtual.scene import Sensor
-from dopepp.virtual.sensor import add_noise, capture, compress, defocus, motion_blur
-from dopepp.virtual.sensors import Sensors
+from dopepp.virtual.sensor import Sensors, add_noise, capture, compress, defocus, motion_blur
 
 
 @pytest.fixture(scope="module")

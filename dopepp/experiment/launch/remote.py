@@ -17,8 +17,8 @@ from typing import Any, Final
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from dopepp.experiment import display, record
-from dopepp.experiment.yaml_file import read_yaml
+from dopepp.core.yaml import read_yaml
+from dopepp.experiment.runs import display, record
 
 LOG_FILE: Final = "job.log"
 _OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"

@@ -19,12 +19,21 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from dopepp.errors import UserError
-from dopepp.experiment import display
-from dopepp.experiment.search.space import Space, chosen, examples, overrides, read_space
-from dopepp.experiment.search.study import alone, facts_of, open_study, outcome
-from dopepp.models.gate import check_integer
-from dopepp.training.trial import MOST
+from dopepp.core.errors import UserError
+from dopepp.experiment.runs import display
+from dopepp.experiment.search.study import (
+    Space,
+    alone,
+    chosen,
+    examples,
+    facts_of,
+    open_study,
+    outcome,
+    overrides,
+    read_space,
+)
+from dopepp.models.registry import check_integer
+from dopepp.training.callbacks.trial import MOST
 
 _MAX_PARALLEL = 10_000
 

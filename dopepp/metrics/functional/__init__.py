@@ -8,18 +8,26 @@ To add an error, write one function of this form, its formula in ``docs/metrics.
 against an independent implementation.
 """
 
-from dopepp.metrics.functional.calibration import expected_calibration_error
-from dopepp.metrics.functional.confidence import wilson_interval
-from dopepp.metrics.functional.distances import add, add_s, mssd
-from dopepp.metrics.functional.matching import MATCH_DISTANCE, average_precision, match
-from dopepp.metrics.functional.offsets import rotation_error_deg, translation_error
-from dopepp.metrics.functional.projections import mspd, reprojection_error
+from dopepp.metrics.functional.distances import (
+    add,
+    add_s,
+    mspd,
+    mssd,
+    reprojection_error,
+    rotation_error_deg,
+    translation_error,
+)
 from dopepp.metrics.functional.rates import (
     BOP_MSPD_THRESHOLDS,
     BOP_THRESHOLDS,
+    MATCH_DISTANCE,
     auc,
+    average_precision,
     average_recall,
+    expected_calibration_error,
+    match,
     pass_rate,
+    wilson_interval,
 )
 from dopepp.metrics.functional.visible_surface import vsd
 

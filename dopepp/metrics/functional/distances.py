@@ -1,4 +1,9 @@
-"""Distances between the surfaces of an object at two poses: ADD, ADD-S, MSSD; metres."""
+"""Distances between the surfaces of an object at two poses: ADD, ADD-S, MSSD; metres.
+
+Distances between the images of an object at two poses; pixels.
+
+How far a pose is off in orientation and in position.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.metrics.functional.inputs import check_poses, check_symmetries, chunks, nan_is_miss
+from dopepp.metrics.functional.inputs import (
+    check_cameras,
+    check_poses,
+    check_symmetries,
+    chunks,
+    nan_is_miss,
+    to_float64,
+)
 from dopepp.metrics.functional.nearest import NearestPoints
 from dopepp.metrics.functional.symmetric import least_farthest
 
@@ -131,3 +143,122 @@ def _lengths(
         translation[..., None], rotation, points.T.expand(len(rotation), *points.T.shape)
     )
     return offsets.square_().sum(dim=1).sqrt_()
+
+
+def reprojection_error(
+    R_est: Float[Tensor, "n 3 3"],
+    t_est: Float[Tensor, "n 3"],
+    R_gt: Float[Tensor, "n 3 3"],
+    t_gt: Float[Tensor, "n 3"],
+    points: Float[Tensor, "v 3"],
+    K: Float[Tensor, "*n 3 3"],
+) -> Float[Tensor, "n"]:
+    """Average pixel distance between the points' projections at both poses.
+
+    One K serves all poses, or each has its own. A point at or behind the camera in either pose
+    makes the error infinite.
+
+    Raises:
+        ValueError: A shape is wrong or there are no points.
+    """
+    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
+    K = check_cameras(K, len(R_est))
+    errors = t_est.new_empty(len(t_est))
+    for chunk in chunks(len(t_est), len(points)):
+        estimated = _project(R_est[chunk], t_est[chunk], points, K[chunk])
+        true = _project(R_gt[chunk], t_gt[chunk], points, K[chunk])
+        errors[chunk] = (estimated - true).norm(dim=2).mean(dim=1)
+    return nan_is_miss(errors)
+
+
+def mspd(
+    R_est: Float[Tensor, "n 3 3"],
+    t_est: Float[Tensor, "n 3"],
+    R_gt: Float[Tensor, "n 3 3"],
+    t_gt: Float[Tensor, "n 3"],
+    points: Float[Tensor, "v 3"],
+    K: Float[Tensor, "*n 3 3"],
+    symmetries: Float[Tensor, "s 4 4"] | None = None,
+) -> Float[Tensor, "n"]:
+    """Maximum symmetry-aware projection distance, pixels (MSPD; BOP 2019).
+
+    min over S of max over x of ‖π(R̂x + t̂) − π(R(Sx) + t)‖. A point at or behind the camera makes
+    it infinite.
+
+    Args:
+        R_est: Estimated rotations.
+        t_est: Estimated translations, metres.
+        R_gt: True rotations.
+        t_gt: True translations, metres.
+        points: Object frame, metres.
+        K: One camera matrix, or one for every pose; pixels.
+        symmetries: As of :func:`dopepp.metrics.functional.mssd`.
+
+    Raises:
+        ValueError: A shape is wrong or there are no points.
+    """
+    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
+    K = check_cameras(K, len(R_est))
+    group = check_symmetries(symmetries, t_est)
+    # Pixels are the first two of K·x over x's depth, whatever the last row of K holds.
+    to_pixels = K.clone()
+    to_pixels[:, 2] = K.new_tensor([0.0, 0.0, 1.0])
+    estimated, true = (
+        (to_pixels @ R, (to_pixels @ t[..., None])[..., 0])
+        for R, t in ((R_est, t_est), (R_gt, t_gt))
+    )
+    return least_farthest(estimated, true, points, group, perspective=True)
+
+
+def _project(
+    R: Float[Tensor, "n 3 3"], t: Float[Tensor, "n 3"], points: Tensor, K: Float[Tensor, "n 3 3"]
+) -> Float[Tensor, "n v 2"]:
+    """Project points at poses to pixels; NaN at or behind the camera."""
+    cam = points @ R.mT + t[:, None]
+    depth = cam[..., 2:]
+    rays = torch.where(depth > 0, cam / depth, torch.nan)
+    return (rays @ K.mT)[..., :2]
+
+
+def rotation_error_deg(
+    R_est: Float[Tensor, "n 3 3"],
+    R_gt: Float[Tensor, "n 3 3"],
+    symmetries: Float[Tensor, "s 4 4"] | None = None,
+) -> Float[Tensor, "n"]:
+    """Angle of the rotation between two orientations, degrees in [0, 180].
+
+    ``atan2(|axial vector|, trace − 1)`` keeps its digits near 0° and 180°, where arccos loses half.
+
+    Args:
+        R_est: Estimated rotations.
+        R_gt: True rotations.
+        symmetries: Where given, the smallest angle to R_gt·S of these transforms; taken as they
+            are, so put the identity among them. (S, 3, 3) are rotations.
+
+    Raises:
+        ValueError: A shape is wrong.
+    """
+    R_est, R_gt = to_float64(R_est), to_float64(R_gt)
+    if R_est.shape != R_gt.shape or R_est.shape[1:] != (3, 3):
+        shapes = f"{tuple(R_est.shape)} and {tuple(R_gt.shape)}"
+        raise ValueError(f"rotations must be (N, 3, 3) and (N, 3, 3), got {shapes}")
+    turns, _ = check_symmetries(symmetries, R_est)
+    errors = torch.full_like(R_est[:, 0, 0], torch.inf)
+    for turn in turns:
+        errors = torch.fmin(errors, _angles_deg(R_est @ (R_gt @ turn).mT))
+    return errors
+
+
+def _angles_deg(Q: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
+    axial = torch.stack(
+        [Q[:, 2, 1] - Q[:, 1, 2], Q[:, 0, 2] - Q[:, 2, 0], Q[:, 1, 0] - Q[:, 0, 1]], dim=1
+    )
+    trace = Q.diagonal(dim1=1, dim2=2).sum(dim=1)
+    return torch.rad2deg(torch.atan2(axial.norm(dim=1), trace - 1))
+
+
+def translation_error(
+    t_est: Float[Tensor, "n 3"], t_gt: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n"]:
+    """Distance between the two positions of the object's origin, metres."""
+    return nan_is_miss((to_float64(t_est) - to_float64(t_gt)).norm(dim=1))

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 
 _LEAF: Final = 16
 """Most points of a leaf: fastest of 4, 8, 16 and 32 at 2,000 and 10,000 points."""

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.compiled import Array, compiled
+from dopepp.core.compiled import Array, compiled
 from dopepp.metrics.functional.inputs import chunks, nan_is_miss
 
 _NUM_PROBES: Final = 8

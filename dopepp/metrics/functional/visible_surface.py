@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dopepp.errors import UserError
+from dopepp.core.errors import UserError
 from dopepp.metrics.functional.inputs import check_cameras, to_float64
 
 VISIBILITY_TOLERANCE: Final = 0.015

@@ -1,0 +1,158 @@
+"""Strict JSON: what anybody may have written, read within bounds or refused in one line.
+
+``json.loads`` accepts ``NaN`` and ``1e999``, keeps the last of two values under one key, and dies
+of deep nesting; here each of these is a :class:`~dopepp.core.errors.UserError`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+
+MAX_BYTES: Final = 64_000_000
+"""About 10,000 images of a BOP scene with ten objects each; parsed, JSON takes up to 20 times its
+size in memory."""
+
+MAX_DEPTH: Final = 64
+"""Far beyond any format here (at most six), and low enough for every recursive function."""
+
+_STRING: Final = r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)'
+"""A string literal, or one that the end cuts off: so every quote is looked at once."""
+
+_STRING_BYTES: Final = re.compile(_STRING.encode(), re.DOTALL)
+_EXPONENT: Final = re.compile(rb"[eE]\+?0*[1-9]\d\d")
+_LONG_DIGITS: Final = 300
+"""What a number beyond float64's range has, one or the other: three digits of exponent, or many."""
+
+_FLOAT: Final = r"-?\d+(?:\.\d+(?:[eE]\+?\d+)?|[eE]\+?\d+)"
+_NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DOTALL)
+
+
+def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
+    """Read a JSON file.
+
+    Args:
+        path: The file.
+        max_bytes: A larger file is refused before it is read.
+
+    Returns:
+        Dicts, lists, strings, finite numbers, booleans and None.
+
+    Raises:
+        UserError: The file is missing or too large, or what :func:`parse_json` refuses.
+    """
+    path = Path(path)
+    allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
+    if not path.is_file():
+        raise UserError(f"{path}, no such file", allowed, "check the path or restore the file")
+    try:
+        with path.open("rb") as file:
+            content = file.read(max_bytes + 1)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}", allowed, "restore the file") from error
+    if len(content) > max_bytes:
+        size = path.stat().st_size / 1e6
+        raise UserError(f"{path} of {size:,.3g} MB", allowed, "check what this file is")
+    return parse_json(content, str(path))
+
+
+def parse_json(text: str | bytes, where: str) -> object:
+    """Parse JSON text.
+
+    Args:
+        text: UTF-8, with or without a byte order mark. Its size is the caller's to bound.
+        where: The file it comes from, for the error.
+
+    Raises:
+        UserError: It is no UTF-8, no JSON, has a key twice in one object, is nested more than 64
+            deep, or has a number that is not finite.
+    """
+    content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    bare = _STRING_BYTES.sub(b"", content)
+    if _depth(bare) > MAX_DEPTH:
+        raise _bad(where, f"brackets nested more than {MAX_DEPTH} deep")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise _bad(where, f"byte {error.start} is no UTF-8") from error
+    try:
+        return json.loads(
+            text,
+            object_pairs_hook=_object,
+            # Looking at every number takes longer than all the rest.
+            parse_float=_finite if _may_overflow(bare) else None,
+            parse_constant=_constant,
+        )
+    except json.JSONDecodeError as error:
+        got = f"line {error.lineno}, column {error.colno}: {error.msg}"
+        raise _bad(where, got) from error
+    except _NotFiniteError as error:
+        raise _bad(where, f"{_position(text)}{str(error)!r:.40}, no finite number") from error
+    except ValueError as error:  # a key twice; an integer of thousands of digits
+        raise _bad(where, str(error)) from error
+
+
+class _NotFiniteError(ValueError):
+    """A number such as ``NaN`` or ``1e999``."""
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"key {twice!r:.80} twice in one object")
+    return fields
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise _NotFiniteError(text)
+    return number
+
+
+def _constant(text: str) -> NoReturn:
+    raise _NotFiniteError(text)
+
+
+def _position(text: str) -> str:
+    """Say where the first number stands that is not finite."""
+    for match in _NOT_FINITE.finditer(text):
+        if match[1] or (match[2] and math.isinf(float(match[2]))):
+            line = text.count("\n", 0, match.start()) + 1
+            column = match.start() - text.rfind("\n", 0, match.start())
+            return f"line {line}, column {column}: "
+    return ""
+
+
+def _depth(bare: bytes) -> int:
+    """Return how deep the brackets of a text without strings are nested."""
+    code = np.frombuffer(bare, np.uint8)
+    opened = (code == ord("[")) | (code == ord("{"))
+    closed = (code == ord("]")) | (code == ord("}"))
+    steps = (opened.view(np.int8) - closed.view(np.int8))[opened | closed]
+    return int(np.cumsum(steps, dtype=np.int64).max(initial=0))
+
+
+def _may_overflow(bare: bytes) -> bool:
+    """Tell whether a text without strings may have a number beyond float64's range."""
+    code = np.frombuffer(bare, np.uint8)
+    others = np.flatnonzero((code < ord("0")) | (code > ord("9")))
+    runs = np.diff(others, prepend=-1, append=len(code))
+    return bool(runs.max(initial=0) > _LONG_DIGITS) or _EXPONENT.search(bare) is not None
+
+
+def _bad(where: str, got: str) -> UserError:
+    return UserError(
+        f"{where}: {got}",
+        "UTF-8 JSON with finite numbers and each key once",
+        "correct the file or write it again",
+    )

@@ -1,0 +1,82 @@
+"""Find a folder's layout and check it.
+
+To add a layout, write ``check_NAME(report)`` in a module beside this one and a line in ``LAYOUTS``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.check import check_bop, scene_folders
+from dopepp.data.formats.ndds.check import check_ndds
+from dopepp.data.formats.ndds.files import OBJECT_SETTINGS
+from dopepp.data.formats.problems import CheckReport
+from dopepp.data.formats.webdataset.check import check_webdataset, shard_paths
+from dopepp.data.formats.ycb_video.check import check_ycb
+
+
+def _is_ycb(root: Path) -> bool:
+    return (root / "image_sets").is_dir() and (root / "data").is_dir()
+
+
+def _is_webdataset(root: Path) -> bool:
+    return next(iter(shard_paths(root)), None) is not None
+
+
+def _is_bop(root: Path) -> bool:
+    return next(iter(scene_folders(root)), None) is not None
+
+
+def _is_ndds(root: Path) -> bool:
+    """Tell by the settings file or by an annotation beside an image of its name."""
+    for folder, names in _folders(root):
+        present = set(names)
+        if OBJECT_SETTINGS in present:
+            return True
+        for name in names:
+            stem = name.removesuffix(".json")
+            if stem != name and any(stem + suffix in present for suffix in (".png", ".jpg")):
+                return (folder / name).is_file()
+    return False
+
+
+def _folders(root: Path) -> Iterator[tuple[Path, list[str]]]:
+    for folder, _, names in os.walk(root):
+        yield Path(folder), names
+
+
+LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
+    "YCB-Video": (_is_ycb, check_ycb),
+    "BOP-WebDataset": (_is_webdataset, check_webdataset),
+    "BOP": (_is_bop, check_bop),
+    "NDDS": (_is_ndds, check_ndds),
+}
+"""How each layout is told, in this order, and checked."""
+
+
+def check_dataset(root: Path) -> CheckReport:
+    """Check a data set of any known layout; what is found is reported, never raised.
+
+    Args:
+        root: Its folder.
+
+    Raises:
+        UserError: The folder is missing or holds no known layout.
+    """
+    root = Path(root)
+    known = (
+        "a YCB-Video folder (data/, image_sets/), a BOP data set, split or scene (scene_gt.json), "
+        "BOP-WebDataset shards (*.tar), or an NDDS or FAT folder (000000.json beside 000000.png)"
+    )
+    if not root.is_dir():
+        raise UserError(f"{root}, which is no folder", known, "give the data set's folder")
+    for layout, (is_layout, check) in LAYOUTS.items():
+        if is_layout(root):
+            report = CheckReport(root, layout)
+            check(report)
+            return report
+    raise UserError(f"{root}, a folder of no known layout", known, "give the data set's folder")

@@ -1,0 +1,1 @@
+"""BOP's scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered data set."""

@@ -1,0 +1,254 @@
+"""BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
+
+``SPLIT/NNNNNN/`` are scenes with ``scene_camera.json``, ``scene_gt.json``, ``scene_gt_info.json``
+and the folders ``rgb`` (or ``gray``), ``depth`` and ``mask_visib``. Lengths are millimetres there.
+
+Which of a data set's images a source takes: a share of them, or an evaluation's targets.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import read_json
+from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
+from dopepp.data.formats.bop.models import parts_by_id
+from dopepp.data.formats.bop.records import ESTIMATED, make_instance
+from dopepp.data.formats.bop.scene import SceneFolder, read_scene, scene_folders
+from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.drawing.pictures import read_content
+from dopepp.geometry.camera import check_camera
+from dopepp.parts.part import Part
+
+
+def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
+    """Return which of ``num_items`` items a share given in fractions is.
+
+    Both bounds are rounded alike, so shares that meet in a fraction neither overlap nor leave out.
+
+    Raises:
+        ValueError: The fractions are not ascending in [0, 1].
+        UserError: No item falls into the share.
+    """
+    first, last = part_of
+    if not 0 <= first < last <= 1:
+        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
+    chosen = slice(round(first * num_items), round(last * num_items))
+    if chosen.start == chosen.stop:
+        raise UserError(
+            f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images",
+            "a folder with more images", "give every split a folder of its own",
+        )  # fmt: skip
+    return chosen
+
+
+def read_targets(path: Path) -> set[tuple[int, int]]:
+    """Return (scene, image) of every target of a file like ``test_targets_bop19.json``.
+
+    Raises:
+        UserError: The file is missing or damaged, or a target lacks a number.
+    """
+    records = read_json(path)
+    if not isinstance(records, list) or not records:
+        raise UserError(f"{path}", "a list of targets", "download the file again")
+    images = set()
+    for number, record in enumerate(records):
+        fields = record if isinstance(record, dict) else {}
+        pair = fields.get("scene_id"), fields.get("im_id")
+        if type(pair[0]) is not int or type(pair[1]) is not int:
+            raise UserError(
+                f"{path}: target {number} with scene_id and im_id {pair}", "two whole numbers",
+                "download the file again",
+            )  # fmt: skip
+        images.add((pair[0], pair[1]))
+    return images
+
+
+_log = logging.getLogger(__name__)
+
+_DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
+
+
+class BopSource:
+    """The images of a split, by scene and number.
+
+    Opening reads the scenes' JSON files and checks every record; images are read one by one. An
+    image without ground truth has no instances. Objects that are none of the parts, and objects
+    behind the camera (rendered sets pose them too), are left out and counted. The visible fraction
+    is ``visib_fract`` of ``scene_gt_info.json``; without it, see
+    :func:`~dopepp.data.formats.bop.records.make_instance`.
+
+    Args:
+        root: The data set's folder, with ``models/`` beside the split.
+        parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
+        split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
+        targets: File in ``root`` that selects images, e.g. ``test_targets_bop19.json``.
+        part_of: Consecutive share of the images to take, as (first, last) fractions: disjoint
+            shares of one folder serve training, validation and test.
+        read_depth: Whether samples carry depth; training does not need it.
+
+    Raises:
+        UserError: The folder or a file in it is wrong, or no image is left.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        parts: Sequence[Part],
+        split: str,
+        targets: str | None = None,
+        part_of: tuple[float, float] = (0.0, 1.0),
+        read_depth: bool = True,
+    ) -> None:
+        self.root, self.split, self.name = Path(root), split, f"bop/{split}"
+        self._parts = parts_by_id(self.root, parts)
+        self._read_depth = read_depth
+        folders = scene_folders(_split_dir(self.root, split))
+        if not folders:
+            raise UserError(
+                f"{self.root / split}, which has no scene", "folders 000000, 000001, …",
+                "unpack the data set's images into it",
+            )  # fmt: skip
+        self._scenes = [read_scene(folder, set(self._parts)) for folder in folders]
+        items = self._present(None if targets is None else read_targets(self.root / targets))
+        self._items = items[share(len(items), part_of, self.name)]
+        self._report_left_out()
+
+    def _present(self, targets: set[tuple[int, int]] | None) -> Int[np.ndarray, "items 2"]:
+        """Return (scene, row) of the images that are selected and on disk, in order."""
+        listed = [
+            (number, row)
+            for number, scene in enumerate(self._scenes)
+            for row, image in enumerate(scene.image_ids.tolist())
+            if targets is None or (int(scene.folder.name), image) in targets
+        ]
+        present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
+        num_wanted = len(listed) if targets is None else len(targets)
+        if not present:
+            raise UserError(
+                f"no image under {self.root / self.split} ({num_wanted:,} listed)",
+                "at least one listed image in rgb/ or gray/", "unpack the data set fully",
+            )  # fmt: skip
+        if len(present) < num_wanted:
+            _log.warning(
+                "%s: %s of %s listed images are absent",
+                self.name, f"{num_wanted - len(present):,}", f"{num_wanted:,}",
+            )  # fmt: skip
+        return np.array(present, np.int64)
+
+    def _report_left_out(self) -> None:
+        other = sum(scene.num_other for scene in self._scenes)
+        behind = sum(scene.num_behind for scene in self._scenes)
+        if other or behind:
+            _log.info(
+                "%s: left out %s objects that are none of the parts and %s behind the camera",
+                self.name, f"{other:,}", f"{behind:,}",
+            )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Return how many images there are."""
+        return len(self._items)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Read an image; the epoch does not matter.
+
+        Raises:
+            UserError: A file is missing or damaged, sizes differ, or K is impossible.
+        """
+        number, row = self._items[index]
+        scene = self._scenes[number]
+        path = scene.folder / scene.files[row]
+        image = decode_rgb(read_content(path), str(path))
+        shape: tuple[int, int] = image.shape[:2]
+        where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
+        K = check_camera(scene.K[row], (shape[1], shape[0]), where)
+        instances = [self._instance(scene, k, path.stem, K, shape) for k in scene.objects(int(row))]
+        depth = self._depth(scene, int(row), path.stem, shape) if self._read_depth else None
+        key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
+        return Sample(image, K, instances, depth, self.name, key)
+
+    def _instance(
+        self,
+        scene: SceneFolder,
+        k: int,
+        stem: str,
+        K: Float[np.ndarray, "3 3"],
+        shape: tuple[int, int],
+    ) -> Instance:
+        path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
+        mask: Bool[np.ndarray, "height width"] | None = None
+        if path.exists():
+            mask = decode_mask(read_content(path), str(path), shape)
+        poses = scene.poses
+        part = self._parts[int(poses.obj_ids[k])]
+        fraction = float(poses.visible_fractions[k])
+        return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
+
+    def _depth(
+        self, scene: SceneFolder, row: int, stem: str, shape: tuple[int, int]
+    ) -> Float[np.ndarray, "height width"] | None:
+        """Read the depth image; None in a scene without any."""
+        if not (scene.folder / "depth").is_dir():
+            return None
+        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in _DEPTH_SUFFIXES]
+        path = next((path for path in paths if path.exists()), paths[0])
+        scale = float(scene.depth_scales[row])
+        return decode_depth(read_content(path), str(path), scale, shape)
+
+    def contains(self, label: str) -> bool:
+        """Tell whether an image holds this object."""
+        return bool(self._count_instances().get(label))
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the hash of the annotation, the objects and how visible fractions are known."""
+        digest = hashlib.sha256()
+        unknown = 0
+        for number, row in self._items.tolist():
+            scene = self._scenes[number]
+            objects = scene.objects(row)
+            chosen = slice(objects.start, objects.stop)
+            digest.update(f"{scene.folder.name}/{scene.image_ids[row]}".encode())
+            for array in (scene.K[row], scene.poses.T_cam_obj[chosen], scene.poses.obj_ids[chosen]):
+                digest.update(np.ascontiguousarray(array).tobytes())
+            unknown += int(np.isnan(scene.poses.visible_fractions[chosen]).sum())
+        identity: dict[str, object] = {
+            "annotation": digest.hexdigest(),
+            "objects": {part.name: part.mesh_hash for part in self._parts.values()},
+            "left_out": {
+                "other_objects": sum(scene.num_other for scene in self._scenes),
+                "behind_the_camera": sum(scene.num_behind for scene in self._scenes),
+            },
+            "visible_fractions": "scene_gt_info.json" if not unknown else ESTIMATED,
+        }
+        return [SourceInfo(self.name, len(self), identity, self._count_instances())]
+
+    def _count_instances(self) -> dict[str, int]:
+        counts = {part.name: 0 for part in self._parts.values()}
+        for number in np.unique(self._items[:, 0]):
+            scene = self._scenes[number]
+            rows = self._items[self._items[:, 0] == number, 1]
+            owners = np.repeat(np.arange(len(scene.image_ids)), np.diff(scene.first))
+            ids = scene.poses.obj_ids[np.isin(owners, rows)]
+            for object_id, part in self._parts.items():
+                counts[part.name] += int((ids == object_id).sum())
+        return counts
+
+
+def _split_dir(root: Path, split: str) -> Path:
+    folder = root / split
+    if not folder.is_dir():
+        found = sorted(path.parent.parent.name for path in root.glob("*/*/scene_camera.json"))
+        raise UserError(
+            f"{folder}, which is no folder",
+            f"one of {sorted(set(found))}" if found else "a BOP data set's folder with its splits",
+            "correct data.root or data.image_sets",
+        )
+    return folder

@@ -1,0 +1,1 @@
+"""NDDS and FAT: JSON annotations beside images."""

@@ -1,0 +1,285 @@
+"""How an NDDS data set writes its poses: found by reprojecting the cuboid, because names mislead.
+
+In the wild, ``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT)
+or metres (nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's; and
+the pose is that of the mesh or of a frame that ``fixed_model_transform`` turns the mesh into (FAT).
+Each combination is a hypothesis. It predicts where the part's cuboid appears, and the right one
+puts it on ``projected_cuboid``. To allow for one more habit, add it to
+:mod:`dopepp.data.formats.ndds.conventions`.
+
+A pose as an NDDS file writes it, under any of the conventions that occur in the wild.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.ndds.fields import NddsObject, bad
+from dopepp.geometry.camera import make_transform, project, transform
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import quaternion_to_matrix
+from dopepp.parts.part import Part
+
+Quaternion = Literal["xyzw", "wxyz"]
+Unit = Literal["cm", "m", "mm"]
+CameraAxes = Literal["opencv", "opengl"]
+Frame = Literal["mesh", "mesh, front x", "centred", "fixed", "fixed, centred"]
+
+METRES: Final[dict[Unit, float]] = {"cm": 0.01, "m": 1.0, "mm": 0.001}
+QUATERNIONS: Final[tuple[Quaternion, ...]] = ("xyzw", "wxyz")
+CAMERAS: Final[tuple[CameraAxes, ...]] = ("opencv", "opengl")
+FRAMES: Final[tuple[Frame, ...]] = ("mesh", "mesh, front x", "centred", "fixed", "fixed, centred")
+"""Whose pose it is: ``mesh``: the mesh's. ``mesh, front x``: the mesh's, but corners are listed as
+seen along its x axis with z up (nvisii). ``centred``: of the mesh moved so that its box's centre is
+at ``cuboid_centroid``, or at ``location`` without one. ``fixed``: of the mesh transformed by
+``fixed_model_transform``. ``fixed, centred``: of the mesh rotated by it, then centred."""
+
+_FRONT_X: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Rotation of a mesh with x forward, y left, z up into NDDS axes (x right, y down, z forward)."""
+
+_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Convention:
+    """One way to write poses; the defaults are NDDS's own."""
+
+    quaternion: Quaternion = "xyzw"
+    unit: Unit = "cm"
+    camera: CameraAxes = "opencv"
+    frame: Frame = "mesh"
+
+    def __str__(self) -> str:
+        """Say it in one phrase."""
+        return (
+            f"quaternion {','.join(self.quaternion)}, lengths in {self.unit}, "
+            f"{self.camera} camera axes, frame: {self.frame}"
+        )
+
+
+CONVENTIONS: Final = tuple(
+    Convention(quaternion, unit, camera, frame)
+    for frame in FRAMES
+    for camera in CAMERAS
+    for unit in METRES
+    for quaternion in QUATERNIONS
+)
+"""All hypotheses, the documented ones first: of two that fit alike, the first one counts."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """An object of the data set whose part is known.
+
+    Attributes:
+        item: What the annotation says.
+        part: The part.
+        K: The image's camera matrix, pixels.
+        fixed: The class's ``fixed_model_transform``, rigid, translation in the file's unit; None
+            where there is none.
+        path: The annotation, for errors.
+    """
+
+    item: NddsObject
+    part: Part
+    K: Float[np.ndarray, "3 3"]
+    fixed: Float[np.ndarray, "4 4"] | None
+    path: Path
+
+    def T_cam_obj(self, convention: Convention) -> Float[np.ndarray, "4 4"] | None:  # noqa: N802
+        """Return the pose of the part's mesh, metres, or None where the convention cannot apply."""
+        fixed = convention.frame.startswith("fixed")
+        if fixed and self.fixed is None:
+            return None
+        order = 1 if convention.quaternion == "xyzw" else 0
+        rotation = quaternion_to_matrix(np.roll(self.item.quaternion, order))
+        scale = METRES[convention.unit]
+        location = self.item.location * scale
+        if self.fixed is not None and fixed:
+            rotation_file, offset = rotation, self.fixed[:3, 3] * scale
+            rotation = rotation_file @ self.fixed[:3, :3]
+            location = location + rotation_file @ offset
+        if convention.frame.endswith("centred"):
+            centroid = self.item.location if self.item.centroid is None else self.item.centroid
+            location = centroid * scale - rotation @ self._corners(convention).mean(axis=0)
+        axes = _OPENGL if convention.camera == "opengl" else np.eye(3)
+        return make_transform(axes @ rotation, axes @ location)
+
+    def predicted_px(self, convention: Convention) -> Float[np.ndarray, "8 2"] | None:
+        """Return where the convention puts the file's corners, NaN behind the camera."""
+        T_cam_obj = self.T_cam_obj(convention)
+        if T_cam_obj is None:
+            return None
+        return project(transform(T_cam_obj, self._corners(convention)), self.K)
+
+    def error_px(self, convention: Convention) -> float:
+        """Return the median distance from ``projected_cuboid``, infinite behind the camera."""
+        predicted = self.predicted_px(convention)
+        if predicted is None or self.item.corners_px is None:
+            return np.inf
+        distances = np.linalg.norm(predicted - self.item.corners_px, axis=1)
+        return float(np.median(np.nan_to_num(distances, nan=np.inf)))
+
+    def _corners(self, convention: Convention) -> NDArray[np.float64]:
+        """Return the corners the file lists, in its order, in the mesh frame, metres."""
+        if convention.frame == "mesh, front x":
+            return self._front_corners
+        return self._fixed_corners if convention.frame.startswith("fixed") else self.part.cuboid[:8]
+
+    @cached_property
+    def _front_corners(self) -> NDArray[np.float64]:
+        return _turned_corners(self.part, _FRONT_X)
+
+    @cached_property
+    def _fixed_corners(self) -> NDArray[np.float64]:
+        rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
+        return _turned_corners(self.part, rotation)
+
+
+def _turned_corners(part: Part, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "8 3"]:
+    """Return the corners of the box along turned axes, in NDDS order, in the part's frame.
+
+    A turn by other than right angles needs the shape itself; the cuboid's box would be too large.
+    """
+    quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
+    shape = part.points if part.mesh is None else part.mesh.vertices
+    turned = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
+    return np.asarray(cuboid_keypoints(turned.min(axis=0), turned.max(axis=0))[:8] @ rotation)
+
+
+MAX_ERROR_PX: Final = 5.0
+"""Of the right hypothesis in three quarters of the instances: annotations of photos are this good.
+"""
+
+_MAX_SHARE: Final = 0.05
+"""Of the longer side of its projected cuboid, an instance may be off, where that is more than
+``MAX_ERROR_PX``: annotations of photos are worse on what is near."""
+
+_MOST: Final = 0.75
+_RATIO: Final = 3.0
+_ROUNDING_PX: Final = 0.05
+_SAME_POSE: Final = 0.05
+"""Hypotheses whose corners differ by less than this many diameters are no rivals: the better fit of
+them counts even where noise leaves it less than three times better."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The convention of a data set.
+
+    Attributes:
+        convention: The one that fits.
+        error_px: Its reprojection error in three quarters of the instances.
+        rival_px: The error of the best one that gives other poses.
+        undecided: Other orders, units or axes that give the same poses in these instances.
+        num_instances: How many instances were compared.
+    """
+
+    convention: Convention
+    error_px: float
+    rival_px: float
+    undecided: tuple[Convention, ...]
+    num_instances: int
+
+    def __str__(self) -> str:
+        """Say what was found and how sure it is."""
+        text = (
+            f"{self.convention} (reprojection error {self.error_px:.2g} px, of the next best "
+            f"{self.rival_px:.3g} px, {self.num_instances} instances)"
+        )
+        if self.undecided:
+            others = "; ".join(map(str, self.undecided))
+            text += f"; the same poses so far with: {others}"
+        return text
+
+
+def find_convention(observations: Sequence[Observation], where: str) -> Finding:
+    """Find the one convention under which the part's cuboid lands on ``projected_cuboid``.
+
+    Args:
+        observations: Instances with ``projected_cuboid``; one is enough in most cases.
+        where: The data set, for errors.
+
+    Raises:
+        UserError: None fits three quarters of the instances within 5 px, or two that give different
+            poses fit alike.
+    """
+    errors = {
+        convention: _most([one.error_px(convention) for one in observations])
+        for convention in CONVENTIONS
+    }
+    ranked = sorted(errors, key=lambda one: errors[one])
+    least = errors[ranked[0]]
+    if not least <= MAX_ERROR_PX:
+        raise _undecidable(where, "no known convention fits", ranked[:6], errors)
+    best = next(one for one in CONVENTIONS if errors[one] <= least + _ROUNDING_PX)
+    rivals = [one for one in ranked if one != best]
+    alike = tuple(one for one in rivals if _same_poses(observations, best, one))
+    others = [one for one in rivals if one not in alike]
+    rival = min((errors[one] for one in others), default=np.inf)
+    if rival < _RATIO * errors[best] + _ROUNDING_PX:
+        raise _undecidable(where, "two conventions fit alike", [best, *others[:5]], errors)
+    undecided = tuple(one for one in alike if replace(one, frame=best.frame) != best)
+    return Finding(best, errors[best], rival, undecided, len(observations))
+
+
+def check_observation(one: Observation, convention: Convention) -> Float[np.ndarray, "4 4"]:
+    """Return an instance's pose after holding it against its own ``projected_cuboid``.
+
+    Raises:
+        UserError: The pose is behind the camera, needs a ``fixed_model_transform`` that its class
+            does not have, or is off by more than 5 px and 5 % of the cuboid's longer side.
+    """
+    T_cam_obj, field = one.T_cam_obj(convention), one.item.field
+    if T_cam_obj is None:
+        got = f"no fixed_model_transform of {one.item.label} in the object settings"
+        raise bad(one.path, f"{field}.class", got, f"one as for the others ({convention})")
+    if T_cam_obj[2, 3] <= 0:
+        got = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
+        raise bad(one.path, f"{field}.location", got, f"one before it ({convention})")
+    predicted = one.predicted_px(convention)
+    # Projections of what nobody sees or what reaches behind the camera mean nothing.
+    if predicted is None or not np.isfinite(predicted).all() or one.item.visibility == 0:
+        return T_cam_obj
+    error, extent = one.error_px(convention), float(np.ptp(predicted, axis=0).max())
+    if one.item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
+        got = f"{error:.3g} px from where the pose puts the cuboid of {one.part.name}"
+        raise bad(one.path, f"{field}.projected_cuboid", got, f"the data set's {convention}")
+    return T_cam_obj
+
+
+def _same_poses(observations: Sequence[Observation], a: Convention, b: Convention) -> bool:
+    """Tell whether two conventions put most instances' cuboids at the same place in space."""
+    distances = []
+    for one in observations:
+        T_a, T_b = one.T_cam_obj(a), one.T_cam_obj(b)
+        if T_a is None or T_b is None:
+            return False
+        apart = transform(T_a, one.part.cuboid) - transform(T_b, one.part.cuboid)
+        distances.append(float(np.abs(apart).max()) / one.part.diameter)
+    return _most(distances) <= _SAME_POSE
+
+
+def _most(values: Sequence[float]) -> float:
+    """Return what three quarters of the values do not exceed: a few damaged items do not count."""
+    return float(np.quantile(values, _MOST, method="higher"))
+
+
+def _undecidable(
+    where: str, why: str, shown: Sequence[Convention], errors: dict[Convention, float]
+) -> UserError:
+    figures = "; ".join(f"{errors[one]:.3g} px: {one}" for one in shown)
+    return UserError(
+        f"{where}: {why}; reprojection error: {figures}",
+        f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other's error",
+        "check that the parts are the meshes (and units) the data set was made with, and its K",
+    )

@@ -1,0 +1,256 @@
+"""NDDS and FAT data sets: JSON annotations beside PNG or JPEG images, one pair an item.
+
+How the files write their poses is found by reprojection
+(:mod:`~dopepp.data.formats.ndds.conventions`), said in the log and in
+:meth:`NddsSource.describe`, and checked again on every instance that is read. What
+:class:`~dopepp.data.formats.ndds.writer.NddsWriter` writes reads back exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.source import share
+from dopepp.data.formats.ndds.conventions import (
+    Finding,
+    Observation,
+    check_observation,
+    find_convention,
+)
+from dopepp.data.formats.ndds.fields import bad, objects_of, parse_object, read_record, stated
+from dopepp.data.formats.ndds.files import Masks, Settings, find_items, image_of, read_depth
+from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
+from dopepp.drawing.pictures import read_rgb
+from dopepp.geometry.camera import check_camera, project_keypoints
+from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
+
+_FAT_SUFFIX: Final = "_16k"
+"""FAT names a class after the part and its mesh: ``003_cracker_box_16k``."""
+
+_MAX_OBSERVATIONS: Final = 60
+"""Instances, evenly spread over the items, on which the convention is found."""
+
+_MAX_COUNTED_ITEMS: Final = 1000
+"""Reading this many annotations takes about a second."""
+
+
+class NddsSource:
+    """The items of an NDDS or FAT folder and of the folders below it.
+
+    ``visibility`` in the wild is 1 or 0 (visible at all or not), or the share of the visible
+    silhouette; either way the image's border is not counted, so the share of the projected cuboid
+    inside the image multiplies it, unless the file states that it is. Where it is missing or −1
+    (nvisii: unknown), only the border counts. Objects behind the camera that the file itself calls
+    invisible are left out, and so are those of other classes; both are counted.
+
+    A mask is taken from ``STEM.seg.png`` where its values are known to be one instance's: by the
+    object's ``segmentation_id``, or by its class's ``segmentation_class_id`` where the image holds
+    one object of that id. Depth is taken from ``STEM.depth.png`` where the unit is stated, or where
+    FAT's naming (``.left``, ``.right``) says it is 0.1 mm.
+
+    Args:
+        folder: The data set's folder.
+        parts: The objects to return; an instance's ``class`` is a part's name, or FAT's form of it
+            (``NAME_16k``), or one that ``classes`` translates.
+        part_of: First and last share of the sorted items to use, e.g. (0, 0.9) and (0.9, 1).
+        classes: Names of parts by the class names that the files use for them.
+        read_depth: Whether samples carry depth; training does not need it.
+
+    Raises:
+        UserError: The folder has no items, a setting is damaged, no instance of the parts is there,
+            or it cannot be told how their poses are written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        parts: Sequence[Part],
+        part_of: tuple[float, float] = (0.0, 1.0),
+        classes: Mapping[str, str] | None = None,
+        read_depth: bool = True,
+    ) -> None:
+        self.folder, self._read_depth = Path(folder), read_depth
+        self.name = f"ndds/{self.folder.resolve().name}"
+        self._parts = {part.name: part for part in parts}
+        self._classes = _check_classes(classes or {}, self._parts)
+        self._settings = Settings(self.folder)
+        items = _find(self.folder)
+        self.items = items[share(len(items), part_of, self.name)]
+        # On all items, so that training and validation shares of one folder are read alike.
+        self.finding = self._find_convention(items)
+        _log.info("%s: %s items; found: %s", self.name, f"{len(self.items):,}", self.finding)
+
+    def _find_convention(self, items: Sequence[Path]) -> Finding:
+        seen: list[Observation] = []
+        hidden: list[Observation] = []
+        others: Counter[str] = Counter()
+        for path in _spread(items):
+            record = read_record(path)
+            others.update(name for _, _, name in objects_of(record, path) if not self._part(name))
+            for one in self._observations(record, path):
+                if one.item.corners_px is not None:
+                    (hidden if one.item.visibility == 0 else seen).append(one)
+            if len(seen) >= _MAX_OBSERVATIONS:
+                break
+        if not seen and not hidden:
+            listed = ", ".join(f"{name} ({number})" for name, number in others.most_common(8))
+            raise UserError(
+                f"{self.folder}: no instance with projected_cuboid of the parts "
+                f"{', '.join(self._parts)}; other classes: {listed or 'none'}",
+                "at least one, whose class is a part's name",
+                "name the parts as the classes, or give classes={class: part}",
+            )
+        # What nobody sees may be behind the camera, where projections mean nothing.
+        return find_convention(seen or hidden, str(self.folder))
+
+    def _part(self, label: str) -> Part | None:
+        """Return the part of a class name; FAT's suffix is dropped where it hides a part's name."""
+        label = self._classes.get(label, label)
+        if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
+            label = label[: -len(_FAT_SUFFIX)]
+        return self._parts.get(label)
+
+    def _observations(
+        self, record: Mapping[str, Any], path: Path, K: Float[np.ndarray, "3 3"] | None = None
+    ) -> Iterator[Observation]:
+        """Yield the objects that are instances of the parts."""
+        for field, item, label in objects_of(record, path):
+            part = self._part(label)
+            if part is not None:
+                K = self._settings.camera(record, path) if K is None else K
+                fixed = self._settings.fixed_transform(path, label)
+                yield Observation(parse_object(item, field, path), part, K, fixed, path)
+
+    def __len__(self) -> int:
+        """Return the number of annotated images."""
+        return len(self.items)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Read an item; the epoch is ignored.
+
+        Raises:
+            UserError: A file is missing or damaged, K cannot belong to the image, or an instance
+                contradicts the data set's convention or stands behind the camera.
+        """
+        path = self.items[index]
+        record, image_path = read_record(path), image_of(path)
+        if image_path is None:
+            raise bad(path, "image", "no file", "a PNG or JPEG beside it")
+        image = read_rgb(image_path)
+        shape: tuple[int, int] = image.shape[:2]
+        masks = Masks(record, path, self._settings, shape)
+        K = check_camera(self._settings.camera(record, path), shape[::-1], str(path))
+        counts_truncation = stated(record, "visibility_counts_truncation") is True
+        instances = []
+        for one in self._observations(record, path, K):
+            if not self._is_out_of_view(one):
+                instance = self._instance(one, shape, counts_truncation)
+                instance.mask = masks.of(one.item.segmentation_id, one.item.label)
+                instances.append(instance)
+        depth = read_depth(record, path, shape) if self._read_depth else None
+        return Sample(image, K, instances, depth, self.name, self._key(path))
+
+    def _key(self, path: Path) -> str:
+        return path.relative_to(self.folder).as_posix().removesuffix(".json")
+
+    def _is_out_of_view(self, one: Observation) -> bool:
+        """Tell whether an object is behind the camera, where the file calls it invisible."""
+        T_cam_obj = one.T_cam_obj(self.finding.convention)
+        behind = T_cam_obj is not None and T_cam_obj[2, 3] <= 0
+        return behind and one.item.visibility is not None and one.item.visibility <= 0
+
+    def _instance(
+        self, one: Observation, shape: tuple[int, int], counts_truncation: bool
+    ) -> Instance:
+        T_cam_obj = check_observation(one, self.finding.convention)
+        keypoints = project_keypoints(one.part.cuboid, T_cam_obj, one.K)
+        fraction = one.item.visibility
+        if fraction is None or fraction == -1:
+            fraction, counts_truncation = 1.0, False
+        if not 0 <= fraction <= 1:
+            raise bad(one.path, f"{one.item.field}.visibility", f"{fraction:g}", "0 … 1, or −1")
+        if not counts_truncation:
+            inside, whole = hull_areas(keypoints[:8], shape)
+            fraction *= min(1.0, inside / whole) if whole > 0 else 0.0
+        return Instance(one.part.name, T_cam_obj, keypoints, float(fraction))
+
+    def contains(self, label: str) -> bool:
+        """Tell whether an item holds this object, reading annotations until one does."""
+        return label in self._parts and any(
+            self._part(name) is self._parts[label]
+            for path in self.items
+            for _, _, name in objects_of(read_record(path), path)
+        )
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the item list's hash, the objects and the convention; a small set is counted.
+
+        ``left out`` counts the objects of other classes and those behind the camera.
+        """
+        identity: dict[str, object] = {
+            "items": hashlib.sha256("\n".join(map(self._key, self.items)).encode()).hexdigest(),
+            "objects": {part.name: part.mesh_hash for part in self._parts.values()},
+            "convention": str(self.finding.convention),
+        }
+        if len(self.items) > _MAX_COUNTED_ITEMS:
+            return [SourceInfo(self.name, len(self.items), identity)]
+        kept, left_out = self._count()
+        identity["left out"] = dict(sorted(left_out.items()))
+        instances = {name: kept[name] for name in self._parts}
+        return [SourceInfo(self.name, len(self.items), identity, instances)]
+
+    def _count(self) -> tuple[Counter[str], Counter[str]]:
+        """Count the instances of the parts by name, and what is left out by class."""
+        kept: Counter[str] = Counter()
+        left_out: Counter[str] = Counter()
+        for path in self.items:
+            record = read_record(path)
+            names = [name for _, _, name in objects_of(record, path)]
+            left_out.update(name for name in names if self._part(name) is None)
+            for one in self._observations(record, path):
+                if self._is_out_of_view(one):
+                    left_out[f"{one.item.label}, behind the camera"] += 1
+                else:
+                    kept[one.part.name] += 1
+        return kept, left_out
+
+
+def _find(folder: Path) -> list[Path]:
+    items, lonely = find_items(folder) if folder.is_dir() else ([], [])
+    if not items:
+        raise UserError(
+            f"{folder} without one annotated image ({len(lonely)} JSON files without an image)",
+            "an NDDS or FAT folder with pairs such as 000000.json and 000000.png or .jpg",
+            "give the folder of the data set",
+        )
+    if lonely:
+        message = "%s: %s annotations have no image and are left out; first: %s"
+        _log.warning(message, folder, f"{len(lonely):,}", lonely[0])
+    return items
+
+
+def _spread(items: Sequence[Path]) -> Iterator[Path]:
+    """Yield all items, evenly spread ones first, so that a few of them stand for the whole."""
+    step = max(1, len(items) // _MAX_OBSERVATIONS)
+    for start in range(step):
+        yield from items[start::step]
+
+
+def _check_classes(classes: Mapping[str, str], parts: Mapping[str, Part]) -> dict[str, str]:
+    unknown = sorted(set(classes.values()) - set(parts))
+    if unknown:
+        raise UserError(
+            f"classes of the parts {unknown}", f"parts of {sorted(parts)}", "correct it"
+        )
+    return dict(classes)

@@ -1,0 +1,276 @@
+"""Write NDDS: ``000000.png``, ``.depth.png``, ``.seg.png`` and, last, ``000000.json``.
+
+What NDDS documents is written as NDDS writes it, and every annotation repeats it under
+``conventions``, which other readers ignore:
+
+- Lengths are centimetres. The camera frame is OpenCV's. ``quaternion_xyzw`` is x, y, z, w.
+- The object frame is the mesh frame, so ``fixed_model_transform`` is the identity times 100 (mesh
+  metres to centimetres), transposed as NDDS transposes it.
+- ``pose_transform`` is NDDS's: with R and t the pose, its rows are ``P·Rᵀ`` and t, where P maps
+  (x, y, z) to (z, x, −y) (Unreal's axes). ``R = (first 3×3)ᵀ·P`` inverts it.
+- ``bounding_box`` corners are (row, column): of the visible pixels or, without one, of the
+  projected cuboid.
+- ``projected_cuboid`` of a corner behind the camera is its projection through the camera's centre.
+- ``visibility`` is the visible share of the whole silhouette; occlusion and border both count.
+- ``.depth.png`` holds 0.1 mm a step as in FAT, 0 for unknown or beyond 6.55 m; ``.seg.png`` holds
+  an object's ``segmentation_id``, 0 elsewhere.
+
+The records of NDDS's JSON files, as :mod:`dopepp.data.formats.ndds.writer` documents them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_png, write_whole
+from dopepp.core.json import read_json
+from dopepp.data.formats.ndds.files import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
+from dopepp.data.sample import Instance, Sample
+from dopepp.geometry.camera import transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import matrix_to_quaternion
+from dopepp.parts.part import Part
+
+CM: Final = 100.0
+"""Centimetres per metre."""
+
+UNREAL_AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""P of ``pose_transform``: from the readme of Falling Things."""
+
+CONVENTIONS: Final = {
+    "length_unit": "cm",
+    "quaternion_xyzw": "x, y, z, w",
+    "camera_axes": "x right, y down, z forward",
+    "object_frame": "the mesh's own",
+    "bounding_box": "row, column",
+    "visibility_counts_truncation": True,
+    "segmentation": "segmentation_id",
+    "depth_unit_m": DEPTH_UNIT,
+}
+
+CAMERA_FIELDS: Final = ("width", "height", "intrinsics")
+"""What two images of one camera share in ``camera_data``."""
+
+_FARTHEST_PX: Final = 1e6
+"""Projections of points beside the camera are cut off here."""
+
+
+def object_settings(parts: Sequence[Part]) -> dict[str, Any]:
+    """Return ``_object_settings.json``: the classes, their ids from 1 and boxes (x, y, z, cm)."""
+    return {
+        "exported_object_classes": [part.name for part in parts],
+        "exported_objects": [
+            {
+                "class": part.name,
+                "segmentation_class_id": number,
+                "fixed_model_transform": np.diag([CM, CM, CM, 1.0]).tolist(),
+                "cuboid_dimensions": (CM * np.ptp(part.cuboid, axis=0)).tolist(),
+            }
+            for number, part in enumerate(parts, 1)
+        ],
+    }
+
+
+def camera_settings(camera: dict[str, Any]) -> dict[str, Any]:
+    """Return ``_camera_settings.json`` of one camera, given as an annotation's ``camera_data``."""
+    width, height, values = (camera[name] for name in CAMERA_FIELDS)
+    return {
+        "camera_settings": [
+            {
+                "name": "camera",
+                "horizontal_fov": float(np.rad2deg(2 * np.arctan(width / 2 / values["fx"]))),
+                "intrinsic_settings": {"resX": width, "resY": height, **values, "s": 0},
+                "captured_image_size": {"width": width, "height": height},
+            }
+        ]
+    }
+
+
+def camera_data(sample: Sample) -> dict[str, Any]:
+    """Return an annotation's ``camera_data``."""
+    K = np.asarray(sample.K, np.float64)
+    return {
+        "width": sample.size[0],
+        "height": sample.size[1],
+        # The camera frame is the world frame: a sample knows no other.
+        "location_worldframe": [0.0, 0.0, 0.0],
+        "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
+        "intrinsics": dict(
+            zip(("fx", "fy", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
+        ),
+    }
+
+
+def object_record(
+    number: int,
+    instance: Instance,
+    cuboid_obj: Float[np.ndarray, "9 3"],
+    K: Float[np.ndarray, "3 3"],
+) -> dict[str, Any]:
+    """Return one of an annotation's ``objects``.
+
+    Args:
+        number: Its number on the image, from 1: its id and its value in ``.seg.png``.
+        instance: The instance.
+        cuboid_obj: Its part's cuboid, metres, object frame.
+        K: Camera matrix, pixels.
+    """
+    cuboid = transform(instance.T_cam_obj, cuboid_obj)
+    rotation, location = instance.T_cam_obj[:3, :3], CM * instance.T_cam_obj[:3, 3]
+    w, x, y, z = matrix_to_quaternion(rotation).tolist()
+    pose = np.eye(4)
+    pose[:3, :3], pose[3, :3] = UNREAL_AXES @ rotation.T, location
+    projected = _projected(cuboid, K)
+    segmented = {} if instance.mask is None else {"segmentation_id": number}
+    return {
+        "class": instance.label,
+        "name": f"{instance.label}_{number}",
+        "instance_id": number,
+        **segmented,
+        "visibility": float(instance.visible_fraction),
+        "location": location.tolist(),
+        "quaternion_xyzw": [x, y, z, w],
+        "pose_transform": pose.tolist(),
+        "cuboid_centroid": (CM * cuboid[CENTROID]).tolist(),
+        "projected_cuboid_centroid": projected[CENTROID].tolist(),
+        "bounding_box": _bounding_box(instance.mask, projected[:CENTROID]),
+        "cuboid": (CM * cuboid[:CENTROID]).tolist(),
+        "projected_cuboid": projected[:CENTROID].tolist(),
+    }
+
+
+def _projected(
+    points_cam: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "9 2"]:
+    """Project through the camera's centre: a point behind it has a finite place too."""
+    pixels = points_cam @ K.T
+    depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
+    with np.errstate(over="ignore"):
+        return np.asarray(np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX))
+
+
+def _bounding_box(
+    mask: Bool[np.ndarray, "height width"] | None, corners_px: Float[np.ndarray, "8 2"]
+) -> dict[str, list[float]]:
+    if mask is None or not mask.any():
+        (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
+    else:
+        top, bottom = np.flatnonzero(mask.any(axis=1))[[0, -1]]
+        left, right = np.flatnonzero(mask.any(axis=0))[[0, -1]]
+    corners = {"top_left": (top, left), "bottom_right": (bottom, right)}
+    return {name: [float(row), float(column)] for name, (row, column) in corners.items()}
+
+
+def segmentation_map(
+    instances: Sequence[Instance], shape: tuple[int, int]
+) -> Integer[np.ndarray, "height width"]:
+    """Return 1, 2, … where the first, second, … instance is visible, 0 elsewhere."""
+    labels = np.zeros(shape, np.uint8 if len(instances) <= np.iinfo(np.uint8).max else np.uint16)
+    for number, instance in enumerate(instances, 1):
+        if instance.mask is not None:
+            labels[instance.mask] = number
+    return labels
+
+
+_DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
+"""A folder that holds such files, or folders, is somebody's data set."""
+
+
+class NddsWriter:
+    """Writes samples as one NDDS folder.
+
+    Args:
+        root: The folder.
+        parts: The parts that the samples' instances may be of.
+    """
+
+    name = "ndds"
+    chunk_size = 1000
+
+    def __init__(self, root: Path, parts: Sequence[Part]) -> None:
+        self._root = Path(root)
+        self._parts = {part.name: part for part in parts}
+
+    def prepare(self) -> None:
+        """Write ``_object_settings.json``; idempotent.
+
+        Raises:
+            UserError: The folder holds something else.
+        """
+        path = self._root / OBJECT_SETTINGS
+        settings = _encode(object_settings(list(self._parts.values())))
+        if path.is_file():
+            if path.read_bytes() != settings:
+                raise self._occupied(f"{path} of other parts")
+            return
+        present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
+        foreign = [path for path in present if path.is_dir() or path.suffix in _DATA_SUFFIXES]
+        if foreign:
+            got = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
+            raise self._occupied(got)
+        write_whole(path, settings)
+
+    def _occupied(self, got: str) -> UserError:
+        return UserError(got, "an empty folder, or one begun with the same parts", "name another")
+
+    def write(self, index: int, sample: Sample) -> None:
+        """Write an item's images and then its annotation, which marks it as complete.
+
+        Raises:
+            KeyError: An instance is of none of the parts.
+        """
+        segmentation = segmentation_map(sample.instances, sample.image.shape[:2])
+        record = {
+            "conventions": CONVENTIONS,
+            "camera_data": camera_data(sample),
+            "objects": [
+                object_record(number, instance, self._parts[instance.label].cuboid, sample.K)
+                for number, instance in enumerate(sample.instances, 1)
+            ],
+        }
+        write_png(self._path(index, ".png"), sample.image)
+        if sample.depth is not None:
+            steps = np.nan_to_num(np.rint(sample.depth.astype(np.float64) / DEPTH_UNIT))
+            steps[(steps < 0) | (steps > np.iinfo(np.uint16).max)] = 0
+            _write_map(self._path(index, ".depth.png"), steps.astype(np.uint16))
+        _write_map(self._path(index, ".seg.png"), segmentation)
+        write_whole(self._path(index, ".json"), _encode(record))
+
+    def _path(self, index: int, suffix: str) -> Path:
+        return self._root / f"{index:06d}{suffix}"
+
+    def written(self, chunk: int) -> set[int]:
+        """Return the chunk's indices with an annotation."""
+        indices = range(chunk * self.chunk_size, (chunk + 1) * self.chunk_size)
+        return {index for index in indices if self._path(index, ".json").is_file()}
+
+    def finalize(self, chunk: int, indices: Sequence[int]) -> None:
+        """Write ``_camera_settings.json`` when the chunk's images share one camera.
+
+        Every annotation has its own intrinsics; this file is for readers that look only here. A
+        preset has one camera, so every chunk writes the same bytes.
+        """
+        cameras = []
+        for index in sorted(indices):
+            record: Any = read_json(self._path(index, ".json"))
+            cameras.append(record["camera_data"])
+            if any(cameras[0][name] != cameras[-1][name] for name in CAMERA_FIELDS):
+                return
+        if cameras:
+            write_whole(self._root / CAMERA_SETTINGS, _encode(camera_settings(cameras[0])))
+
+
+def _write_map(path: Path, image: Integer[np.ndarray, "height width"]) -> None:
+    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
+
+
+def _encode(record: dict[str, Any]) -> bytes:
+    return (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()

@@ -1,0 +1,182 @@
+"""What a pose, a camera and a box in the image must fulfil, in any layout.
+
+Tolerances: a rotation is orthogonal to 1e-3; what is visible of an object lies in the reprojected
+box within 8 px (released poses of YCB-Video sit up to 6 px off) or 5 % of the box's longer side; an
+object that is fully visible covers at least a third of that box in width or in height; the camera
+is 0.1 to 300 diameters away from an object, which no mix-up of mm and m leaves so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import check_camera, project
+from dopepp.geometry.rotation import is_rotation
+
+BOX_TOLERANCE_PX: Final = 8.0
+BOX_TOLERANCE_SHARE: Final = 0.05
+SMALLEST_COVER: Final = 1 / 3
+FULLY_VISIBLE: Final = 0.95
+DIAMETERS_AWAY: Final = (0.1, 300.0)
+PIXEL_ASPECT: Final = (0.5, 2.0)
+DIAMETERS_MM: Final = (5.0, 5000.0)
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the image, pixel centres, ends included."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    @classmethod
+    def of_points(cls, points_px: Float[np.ndarray, "points 2"]) -> Box | None:
+        """Return the box of points, None where one of them is not finite."""
+        if not len(points_px) or not np.isfinite(points_px).all():
+            return None
+        (left, top), (right, bottom) = points_px.min(axis=0), points_px.max(axis=0)
+        return cls(float(left), float(top), float(right), float(bottom))
+
+    @classmethod
+    def of_mask(cls, mask: NDArray[Any]) -> Box | None:
+        """Return the box of a mask's pixels, None where it has none."""
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        if not len(rows):
+            return None
+        return cls(float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1]))
+
+    @classmethod
+    def of_bop(cls, box: Float[np.ndarray, "4"]) -> Box | None:
+        """Return the box of BOP's (x, y, width, height), None where there is none (−1).
+
+        Width and height are the differences of the outermost pixels' coordinates.
+        """
+        x, y, width, height = map(float, box)
+        return None if width < 0 or height < 0 else cls(x, y, x + width, y + height)
+
+    def distance(self, other: Box) -> float:
+        """Return the largest distance of two boxes' sides, pixels."""
+        sides = zip(
+            (self.left, self.top, self.right, self.bottom),
+            (other.left, other.top, other.right, other.bottom),
+            strict=True,
+        )
+        return max(abs(a - b) for a, b in sides)
+
+    def holds(self, other: Box, slack: float) -> bool:
+        """Tell whether another box is inside this one, ``slack`` pixels beyond it allowed."""
+        return (
+            self.left - slack <= other.left
+            and self.top - slack <= other.top
+            and other.right <= self.right + slack
+            and other.bottom <= self.bottom + slack
+        )
+
+    def is_inside(self, size: tuple[int, int]) -> bool:
+        """Tell whether all of it is in an image of (width, height)."""
+        width, height = size
+        return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
+
+    def __str__(self) -> str:
+        """Return its corners."""
+        return f"({self.left:.0f}, {self.top:.0f})–({self.right:.0f}, {self.bottom:.0f})"
+
+
+def rotation_problem(rotation: Float[np.ndarray, "3 3"]) -> str | None:
+    """Say why a matrix is no rotation, None where it is one."""
+    if is_rotation(rotation):
+        return None
+    deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    determinant = np.linalg.det(rotation)
+    return f"no rotation: R·Rᵀ off by {deviation:.2g} (allowed 1e-3), determinant {determinant:.3g}"
+
+
+def translation_problem(
+    translation: Float[np.ndarray, "3"], diameter: float | None
+) -> tuple[str, str] | None:
+    """Say what is wrong with an object's place as (kind, message), None where nothing is.
+
+    Args:
+        translation: Camera frame, any unit.
+        diameter: Of the object, the same unit; None where it is not known.
+    """
+    depth = float(translation[2])
+    if depth <= 0:
+        return "z", f"behind the camera (z = {depth:.4g})"
+    if diameter is None or not diameter > 0:
+        return None
+    distance = float(np.linalg.norm(translation)) / diameter
+    least, most = DIAMETERS_AWAY
+    if least <= distance <= most:
+        return None
+    return "unit", (
+        f"{distance:.3g} diameters ({diameter:.4g}) from the camera; {least:g} … {most:g} allowed: "
+        "is one of the two in another unit (mm, m)?"
+    )
+
+
+def camera_problem(K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> str | None:
+    """Say why K cannot belong to an image of (width, height), None where it can."""
+    try:
+        check_camera(K, size, "this image")
+    except UserError as error:
+        return f"{error.got}; allowed: {error.allowed}"
+    ratio = float(K[0, 0] / K[1, 1])
+    if not PIXEL_ASPECT[0] <= ratio <= PIXEL_ASPECT[1]:
+        return f"fx/fy = {ratio:.3g}; allowed: {PIXEL_ASPECT[0]} … {PIXEL_ASPECT[1]}"
+    return None
+
+
+def box_problem(
+    points_cam: Float[np.ndarray, "points 3"],
+    K: Float[np.ndarray, "3 3"],
+    seen: Box | None,
+    visible_fraction: float | None = None,
+    image_size: tuple[int, int] | None = None,
+) -> str | None:
+    """Hold what is seen of an object against where its pose puts it; None where they agree.
+
+    Args:
+        points_cam: Points whose hull contains the object, camera frame.
+        K: Camera matrix, pixels.
+        seen: Box of the visible pixels; None where nothing is seen.
+        visible_fraction: Visible share of the silhouette, None where it is not known.
+        image_size: (width, height) where that share does not count what the border cuts off.
+    """
+    predicted = Box.of_points(project(points_cam, K))
+    if predicted is None or seen is None:
+        return None
+    width, height = predicted.right - predicted.left, predicted.bottom - predicted.top
+    tolerance = max(BOX_TOLERANCE_PX, BOX_TOLERANCE_SHARE * max(width, height))
+    beyond = max(
+        predicted.left - seen.left,
+        predicted.top - seen.top,
+        seen.right - predicted.right,
+        seen.bottom - predicted.bottom,
+    )
+    if beyond > tolerance:
+        return (
+            f"seen at {seen}, {beyond:.0f} px outside the reprojected box {predicted} "
+            f"(allowed {tolerance:.0f} px)"
+        )
+    if visible_fraction is None or visible_fraction < FULLY_VISIBLE:
+        return None
+    if image_size is not None and not predicted.is_inside(image_size):
+        return None
+    cover = max(
+        (seen.right - seen.left + 1) / (width + 1), (seen.bottom - seen.top + 1) / (height + 1)
+    )
+    if cover >= SMALLEST_COVER:
+        return None
+    return (
+        f"fully visible at {seen}, {cover:.0%} of the reprojected box {predicted} "
+        f"(allowed: at least {SMALLEST_COVER:.0%} of its width or height)"
+    )

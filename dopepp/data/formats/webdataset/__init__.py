@@ -1,0 +1,1 @@
+"""BOP-WebDataset: tar shards of which any image can be read at random."""

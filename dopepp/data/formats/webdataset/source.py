@@ -1,0 +1,197 @@
+"""BOP-WebDataset: tar shards of which any image can be read at random, so a run resumes exactly.
+
+Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.json``,
+``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are millimetres there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import MAX_BYTES, parse_json
+from dopepp.data.formats.bop.images import decode_depth, decode_rgb, decode_runs
+from dopepp.data.formats.bop.models import parts_by_id
+from dopepp.data.formats.bop.records import (
+    ESTIMATED,
+    BopPoses,
+    make_instance,
+    read_cameras,
+    read_poses,
+)
+from dopepp.data.formats.bop.source import share
+from dopepp.data.formats.webdataset.shards import find_shards
+from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard
+from dopepp.data.sample import Sample, SourceInfo
+from dopepp.geometry.camera import check_camera
+from dopepp.parts.part import Part
+
+_MAX_NAMED: Final = 3
+
+
+class WebdatasetSource:
+    """The images of some shards, shard by shard in the shards' own order.
+
+    Opening reads the archives' headers; an image's members are read and checked when it is asked
+    for. An image without ``gt.json`` has no instances. Objects that are none of the parts, and
+    objects behind the camera, are left out. The visible fraction is ``visib_fract`` of
+    ``gt_info.json``; without it, see :func:`~dopepp.data.formats.bop.records.make_instance`.
+
+    Args:
+        root: The data set's folder, with ``models/`` in it where the data set has models.
+        parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
+        shards: A folder in ``root``, a file or a URL, or several; see
+            :func:`~dopepp.data.formats.webdataset.shards.find_shards`.
+        part_of: Consecutive share of the images to take, as (first, last) fractions.
+        read_depth: Whether samples carry depth; training does not need it.
+        download_dir: Where shards from URLs are kept; None refuses URLs.
+        allow_commands: Whether ``pipe:`` may run a command.
+
+    Raises:
+        UserError: A shard is missing, damaged or refused, a key comes twice, or no image is left.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        parts: Sequence[Part],
+        shards: str | Sequence[str] = ".",
+        part_of: tuple[float, float] = (0.0, 1.0),
+        read_depth: bool = True,
+        download_dir: str | Path | None = None,
+        allow_commands: bool = False,
+    ) -> None:
+        self.root = Path(root)
+        self.name = f"webdataset/{shards if isinstance(shards, str) else shards[0]}"
+        self._parts = parts_by_id(self.root, parts)
+        self._read_depth = read_depth
+        folder = None if download_dir is None else Path(download_dir)
+        paths = find_shards(self.root, shards, folder, allow_commands)
+        self._shards = [index_shard(path) for path in paths]
+        _check_keys(self._shards)
+        items = [(n, i) for n, shard in enumerate(self._shards) for i in range(len(shard.keys))]
+        table = np.array(items, np.int64).reshape(-1, 2)
+        self._items = table[share(len(table), part_of, self.name)]
+
+    def __len__(self) -> int:
+        """Return how many images there are."""
+        return len(self._items)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Read an image; the epoch does not matter.
+
+        Raises:
+            UserError: A member is damaged, sizes differ, or a pose or K is impossible.
+        """
+        shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
+        where = f"{shard.path}: {shard.keys[image]}"
+        content = shard.read(image, "image")
+        assert content is not None  # the index holds no image without
+        picture = decode_rgb(content, where)
+        shape: tuple[int, int] = picture.shape[:2]
+        K, scales = read_cameras([_json(shard, image, "camera")], lambda _: f"{where}.camera.json")
+        camera = check_camera(K[0], (shape[1], shape[0]), where)
+        masks = _json(shard, image, "mask_visib")
+        poses = self._poses(shard, image)
+        instances = []
+        for number in self._chosen(poses):
+            mask = None
+            if masks is not None:
+                place = f"{where}.mask_visib.json: {number}"
+                record = masks.get(str(number)) if isinstance(masks, dict) else None
+                mask = decode_runs(record, shape, place)
+            instances.append(
+                make_instance(
+                    self._parts[int(poses.obj_ids[number])],
+                    poses.T_cam_obj[number],
+                    camera,
+                    float(poses.visible_fractions[number]),
+                    mask,
+                    shape,
+                )
+            )
+        encoded = shard.read(image, "depth") if self._read_depth else None
+        depth = None
+        if encoded is not None:
+            depth = decode_depth(encoded, f"{where}.depth", float(scales[0]), shape)
+        return Sample(picture, camera, instances, depth, self.name, shard.keys[image])
+
+    def _poses(self, shard: ShardIndex, image: int) -> BopPoses:
+        """Read an image's ground truth; empty where it has none."""
+        where = f"{shard.path}: {shard.keys[image]}"
+        truths, infos = _json(shard, image, "gt"), _json(shard, image, "gt_info")
+        truths = [] if truths is None else truths
+        if not isinstance(truths, list) or not isinstance(infos, list | None):
+            raise _bad(f"{where}.gt.json or .gt_info.json", "lists of objects")
+        if infos is not None and len(infos) != len(truths):
+            raise _bad(
+                f"{where}.gt_info.json with {len(infos)} objects",
+                f"{len(truths)}, as many as in gt.json",
+            )
+        return read_poses(truths, infos, lambda n: f"{where}.gt.json (or gt_info): object {n}")
+
+    def _chosen(self, poses: BopPoses) -> list[int]:
+        """Return the numbers of the objects of interest before the camera."""
+        wanted = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
+        return [int(number) for number in np.flatnonzero(wanted)]
+
+    def contains(self, label: str) -> bool:
+        """Tell whether an image holds this object, reading ground truth until one does."""
+        wanted = {number for number, part in self._parts.items() if part.name == label}
+        if not wanted:
+            return False
+        for number, image in self._items.tolist():
+            poses = self._poses(self._shards[number], image)
+            if any(int(poses.obj_ids[k]) in wanted for k in self._chosen(poses)):
+                return True
+        return False
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the shards' members' sizes as a hash, the objects, and how fractions are known."""
+        digest = hashlib.sha256()
+        stated = True
+        for number, image in self._items.tolist():
+            shard = self._shards[number]
+            digest.update(shard.keys[image].encode())
+            digest.update(shard.spans[image, :, 1].tobytes())
+            stated &= bool((shard.spans[image, 4:5, 0] >= 0).all())
+        identity: dict[str, object] = {
+            "shards": [shard.path.name for shard in self._shards],
+            "members": digest.hexdigest(),
+            "objects": {part.name: part.mesh_hash for part in self._parts.values()},
+            "visible_fractions": "gt_info.json" if stated else ESTIMATED,
+        }
+        return [SourceInfo(self.name, len(self), identity)]
+
+
+def _json(shard: ShardIndex, image: int, field: str) -> Any:
+    """Parse a JSON member; None where the image has none."""
+    content = shard.read(image, field)
+    if content is None:
+        return None
+    where = f"{shard.path}: {shard.keys[image]}.{field}.json"
+    if len(content) > MAX_BYTES:
+        raise _bad(f"{where} of {len(content) / 1e6:.0f} MB", f"at most {MAX_BYTES / 1e6:.0f} MB")
+    return parse_json(content, where)
+
+
+def _check_keys(shards: Sequence[ShardIndex]) -> None:
+    owners: dict[str, Path] = {}
+    for shard in shards:
+        twice = [key for key in shard.keys if key in owners]
+        if twice:
+            raise _bad(
+                f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, "
+                f"e.g. {twice[:_MAX_NAMED]}",
+                "each key in one shard",
+            )
+        owners |= dict.fromkeys(shard.keys, shard.path)
+
+
+def _bad(got: str, allowed: str) -> UserError:
+    return UserError(got, allowed, "write or download the shard again")

@@ -1,0 +1,149 @@
+"""BOP-WebDataset shards, staged item by item and finalized shard by shard.
+
+``train_pbr/shard-000012.tar`` holds images 12,000 – 12,999 in order, ``key_to_shard.json`` tells
+each key's shard, ``models/`` lies beside the split as in BOP's scenewise layout. Until its shard is
+finalized, an image is a small archive of its own in the hidden folder ``.items``.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import partial_path, write_whole
+from dopepp.core.json import read_json
+from dopepp.data.formats.bop.images import encode_png, encode_runs
+from dopepp.data.formats.bop.writer import STAGING, BopFolder, finalizing, stage, staged_items
+from dopepp.data.formats.webdataset.tar import members, read_span
+from dopepp.data.sample import Sample
+
+KEY_FILE: Final = "key_to_shard.json"
+
+_OWNER: Final = "dopepp"
+"""A fixed owner and a modification time of 0 make the same images the same bytes."""
+
+Content = dict[str, bytes]
+"""An image's members by extension."""
+
+
+class WebdatasetWriter(BopFolder):
+    """A :class:`~dopepp.data.formats.Writer` of BOP-WebDataset shards."""
+
+    name = "webdataset"
+
+    def write(self, index: int, sample: Sample) -> None:
+        """Stage an image."""
+        labels = self._parts.labels(sample)
+        content = {
+            "rgb.png": encode_png(sample.image),
+            "depth.png": encode_png(labels.depth),
+            "camera.json": json.dumps(labels.camera).encode(),
+            "gt.json": json.dumps(labels.truths).encode(),
+            "gt_info.json": json.dumps(labels.infos).encode(),
+        }
+        for name, masks in (("mask", labels.masks), ("mask_visib", labels.visible_masks)):
+            runs = {str(number): encode_runs(mask) for number, mask in enumerate(masks)}
+            content[f"{name}.json"] = json.dumps(runs).encode()
+        chunk, image = divmod(index, self.chunk_size)
+        stage(self._staging(chunk) / f"{image:06d}.tar", _archive(_key(chunk, image), content))
+
+    def written(self, chunk: int) -> set[int]:
+        """Return the indices of the shard's complete images."""
+        images = {int(path.stem) for path in self._staged(chunk)}
+        if self._shard(chunk).exists():
+            images |= {_image(member.key) for member in members(self._shard(chunk))}
+        return {chunk * self.chunk_size + image for image in images}
+
+    def finalize(self, chunk: int, indices: Sequence[int]) -> None:
+        """Merge the staged images into the shard and into ``key_to_shard.json``."""
+        wanted = {index % self.chunk_size for index in indices}
+        with finalizing(self.root / self.split / STAGING):
+            staged = {int(path.stem): path for path in self._staged(chunk)}
+            staged = {image: path for image, path in staged.items() if image in wanted}
+            if staged:
+                self._write_shard(chunk, staged)
+            # Also of a shard that was finalized elsewhere and copied here.
+            self._write_keys(chunk)
+            for path in staged.values():
+                path.unlink()
+            with suppress(OSError):  # there is none, or not all items were finalized
+                self._staging(chunk).rmdir()
+
+    def _write_shard(self, chunk: int, staged: dict[int, Path]) -> None:
+        # The webdataset library's TarWriter writes the same archive but imports torch.
+        path = self._shard(chunk)
+        partial = partial_path(path)
+        try:
+            with tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive:
+                for key, content in _merged(path, chunk, staged):
+                    _add(archive, key, content)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _write_keys(self, chunk: int) -> None:
+        if not self._shard(chunk).exists():
+            return
+        path = self.root / self.split / KEY_FILE
+        shards = read_json(path) if path.exists() else {}
+        if not isinstance(shards, dict):
+            raise UserError(f"{path}", "the object that this writer wrote", "remove it")
+        merged = shards | {member.key: chunk for member in members(self._shard(chunk))}
+        if merged == shards:
+            return
+        lines = [f"  {json.dumps(key)}: {json.dumps(merged[key])}" for key in sorted(merged)]
+        write_whole(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+
+    def _shard(self, chunk: int) -> Path:
+        return self.root / self.split / f"shard-{chunk:06d}.tar"
+
+    def _staging(self, chunk: int) -> Path:
+        return self.root / self.split / STAGING / f"{chunk:06d}"
+
+    def _staged(self, chunk: int) -> list[Path]:
+        return staged_items(self._staging(chunk), ".tar")
+
+
+def _merged(path: Path, chunk: int, staged: dict[int, Path]) -> Iterator[tuple[str, Content]]:
+    """Yield the finalized and the staged images in order, one in memory at a time."""
+    sources: dict[int, Path] = {}
+    places: dict[int, list[tuple[str, int, int]]] = {}
+    for source in [*([path] if path.exists() else []), *staged.values()]:
+        for key, group in groupby(members(source), key=lambda member: member.key):
+            sources[_image(key)] = source
+            places[_image(key)] = [(m.extension, m.offset, m.size) for m in group]
+    for image in sorted(places):
+        yield (
+            _key(chunk, image),
+            {name: read_span(sources[image], start, size) for name, start, size in places[image]},
+        )
+
+
+def _archive(key: str, content: Content) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as archive:
+        _add(archive, key, content)
+    return buffer.getvalue()
+
+
+def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
+    for extension, data in sorted(content.items()):
+        info = tarfile.TarInfo(f"{key}.{extension}")
+        info.size, info.mode = len(data), 0o444
+        info.uname = info.gname = _OWNER
+        archive.addfile(info, io.BytesIO(data))
+
+
+def _key(chunk: int, image: int) -> str:
+    return f"{chunk:06d}_{image:06d}"
+
+
+def _image(key: str) -> int:
+    return int(key.rpartition("_")[2])

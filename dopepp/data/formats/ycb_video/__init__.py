@@ -1,0 +1,1 @@
+"""YCB-Video's own layout."""

@@ -1,0 +1,288 @@
+"""What a render job makes: everything that decides its bytes, as a factory and as a record.
+
+What decides a render job's bytes, as plain values: kept in the folder and compared later.
+
+The folder of a render job: its record, and what killed processes left in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
+from dopepp.core.interrupts import NO_SPACE, stopped
+from dopepp.core.json import read_json
+from dopepp.data.jobs.work import find_writer
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.mesh.read import ASSUMED_UNIT
+from dopepp.parts.part import Part, check_name
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.factory import Factory, code_hash
+from dopepp.virtual.presets.preset import customised_preset
+
+RECORD_FILE: Final = "_dopepp_render.json"
+"""The underscore is NDDS's mark of a settings file: without it, readers of that layout would take
+the record for an image's annotation."""
+
+_MAX_RECORD_BYTES: Final = 4_000_000
+"""Some 10,000 parts."""
+
+_MAX_DIFFERENCES: Final = 3
+"""As many as one line can hold."""
+
+
+def is_begun(root: Path) -> bool:
+    """Tell whether a job has claimed the folder."""
+    return (root / RECORD_FILE).is_file()
+
+
+def begin(root: Path, record: Mapping[str, Any]) -> None:
+    """Claim a folder for a job, or find that it is this job's already, and clean it.
+
+    Args:
+        root: The folder; made if it is not there.
+        record: What decides the job's bytes, as plain values.
+
+    Raises:
+        UserError: The folder cannot be written, holds another job or something else.
+        StoppedError: There is no space left.
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        _claim(root, json.loads(json.dumps(record)))
+        _remove_abandoned(root)
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise stopped(error, root) from error
+        raise UserError(
+            f"folder {root}: {error.strerror}", "a folder that can be written", "choose another"
+        ) from error
+
+
+def _claim(root: Path, record: Mapping[str, Any]) -> None:
+    path = root / RECORD_FILE
+    # Listed before the record is looked for: what another shard has made came after its record.
+    names = sorted(entry.name for entry in root.iterdir())
+    if not path.exists():
+        foreign = [name for name in names if not name.endswith(PARTIAL_SUFFIX)]
+        if foreign:
+            raise UserError(
+                f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}",
+                "an empty folder, or one that a render job began",
+                "choose another folder",
+            )
+        write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+    # Also after writing: two jobs may have begun in the same moment.
+    differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
+    if differences:
+        raise UserError(
+            f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}",
+            "the settings that the folder was begun with",
+            "repeat those settings with that version of dopepp, or choose another folder",
+        )
+
+
+def _differences(there: object, now: object, where: str) -> Iterator[str]:
+    """Yield every field that differs, with both values."""
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in [*now, *(key for key in there if key not in now)]:
+            field = f"{where}.{key}" if where else str(key)
+            yield from _differences(there.get(key), now.get(key), field)
+    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for number, pair in enumerate(zip(there, now, strict=True)):
+            yield from _differences(*pair, f"{where}[{number}]")
+    elif there != now:
+        yield f"{where or 'content'} is {_shown(there)} there and {_shown(now)} now"
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _remove_abandoned(root: Path) -> None:
+    """Remove the partial files that killed processes left, but none of a running shard."""
+    clock = partial_path(root / "clock")
+    clock.touch()
+    now = clock.stat().st_mtime
+    clock.unlink()
+    for folder, _, names in os.walk(root):
+        for name in names:
+            path = Path(folder, name)
+            if name.endswith(PARTIAL_SUFFIX) and is_abandoned(path, now):
+                path.unlink(missing_ok=True)
+
+
+RECORD_VERSION: Final = 1
+"""Of the record's layout."""
+
+_HASH_DIGITS: Final = 16
+"""Of the hash of the code that renders, enough to tell versions apart."""
+
+
+def record_of(factory: Factory, layout: str, unit: str | None) -> dict[str, Any]:
+    """Describe a job by plain values, those that a user chooses first.
+
+    Args:
+        factory: Renders the images.
+        layout: Name of the data set's layout.
+        unit: Of the mesh files, as the user states it; None for the assumed one.
+
+    Returns:
+        What JSON can write; equal records give equal bytes.
+    """
+    return {
+        "record_version": RECORD_VERSION,
+        "format": layout,
+        "seed": factory.seed,
+        "renderer": factory.renderer,
+        "unit": unit or ASSUMED_UNIT,
+        "parts": [_part_record(part) for part in factory.parts],
+        "negatives": [_part_record(part) for part in factory.negatives],
+        "backgrounds": factory.backgrounds.identity(),
+        "preset": _plain(factory.preset),
+        "rendering_code": code_hash()[:_HASH_DIGITS],
+    }
+
+
+def _part_record(part: Part) -> dict[str, Any]:
+    """Describe a part by its name, its size and hashes of its shape and its texture."""
+    mesh = part.mesh
+    appearance = hashlib.sha256()
+    for array in () if mesh is None else (mesh.uv, mesh.texture):
+        if array is not None:
+            appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return {
+        "name": part.name,
+        "diameter": float(part.diameter),
+        "mesh_hash": part.mesh_hash,
+        "texture_hash": appearance.hexdigest(),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Turn a preset into what JSON can write; groups of ranges keep their kind."""
+    if is_dataclass(value):
+        content = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+        return {"kind": type(value).__name__} | content
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value
+
+
+_NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")
+"""``NAME=FILE``; a name is not a path."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is rendered, whoever renders how much of it.
+
+    Attributes:
+        factory: Renders image (0, index).
+        layout: Name of the data set's layout.
+        record: The settings as plain values; equal records give equal bytes.
+    """
+
+    factory: Factory
+    layout: str
+    record: Mapping[str, Any]
+
+
+def make_job(
+    parts: Sequence[str],
+    *,
+    unit: str | None = None,
+    preset: str = "paper",
+    changes: Sequence[str] = (),
+    size: str | None = None,
+    seed: int = 0,
+    backgrounds: str | Path | None = None,
+    negatives: Sequence[str] = (),
+    renderer: str = "raster",
+    layout: str = "bop",
+) -> Job:
+    """Make a job from what a user writes.
+
+    Args:
+        parts: Built-in names, mesh files, or ``NAME=FILE`` where the file's name will not do.
+        unit: The files' unit.
+        preset: Name of a preset.
+        changes: ``field.field=value``, the value as YAML.
+        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels; None for the preset's own.
+        seed: Of the whole job.
+        backgrounds: As :func:`~dopepp.virtual.backgrounds.find_backgrounds` takes it.
+        negatives: Parts among the distractors, written as ``parts``.
+        renderer: Name of a renderer.
+        layout: Name of a layout.
+
+    Raises:
+        UserError: Any of it cannot be used.
+    """
+    find_writer(layout)
+    scenes = customised_preset(preset, _nested(changes))
+    factory = Factory(
+        [named_part(text, unit) for text in parts],
+        scenes if size is None else scenes.resized(*_sides(size)),
+        seed,
+        find_backgrounds(backgrounds),
+        renderer=renderer,
+        negatives=[named_part(text, unit) for text in negatives],
+    )
+    return Job(factory, layout, record_of(factory, layout, unit))
+
+
+def named_part(text: str, unit: str | None) -> Part:
+    """Load a part that is written as in :func:`make_job`.
+
+    Raises:
+        UserError: There is no such part, or the name cannot be one.
+    """
+    match = None if Path(text).exists() else _NAMED.fullmatch(text)
+    if match is None:
+        return load_part(text, unit)
+    return replace(load_part(match[2], unit), name=check_name(match[1]))
+
+
+def _sides(size: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,6})[x,]([0-9]{1,6})", size)
+    if match is None:
+        raise UserError(f"--size {size}", "WIDTHxHEIGHT in pixels, e.g. 640x480", "change --size")
+    return int(match[1]), int(match[2])
+
+
+def _nested(changes: Sequence[str]) -> dict[str, Any]:
+    """Turn ``a.b=1`` into ``{"a": {"b": 1}}``."""
+    tree: dict[str, Any] = {}
+    for change in changes:
+        path, sign, text = change.partition("=")
+        *groups, field = path.split(".")
+        try:
+            value = yaml.safe_load(text)
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            sign, value = "", error
+        if not sign or not all((*groups, field)):
+            raise UserError(
+                f"--set {change:.200}", "FIELD.FIELD=VALUE, the value in YAML",
+                "write it like lighting.num_lights=[1,3]",
+            )  # fmt: skip
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+            if not isinstance(node, dict):
+                break
+        if not isinstance(node, dict) or field in node:
+            raise UserError(f"--set {change} after another --set of {path}", "one each", "drop one")
+        node[field] = value
+    return tree

@@ -1,0 +1,237 @@
+"""A piece of a render job and what came of it, the same on every engine.
+
+To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
+
+Which images belong to a shard, and which of them are still to be made.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+import cv2
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats import Writer
+from dopepp.data.jobs.job import RECORD_FILE, is_begun
+from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
+from dopepp.parts.part import Part
+from dopepp.virtual.factory import Factory
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several equal, contiguous parts of a job.
+
+    Attributes:
+        number: Which one, from 0.
+        total: How many there are.
+    """
+
+    number: int = 0
+    total: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read ``i/n``, i from 0 to n − 1.
+
+        Raises:
+            UserError: It is something else.
+        """
+        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+        if match is None or int(match[1]) >= int(match[2]):
+            raise UserError(
+                f"shard {text!r}",
+                "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves",
+                "count the shards from 0",
+            )
+        return cls(int(match[1]), int(match[2]))
+
+    def span(self, num_items: int) -> range:
+        """Return the shard's indices of a job of ``num_items`` images."""
+        return range(
+            num_items * self.number // self.total, num_items * (self.number + 1) // self.total
+        )
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What a shard has to do with a chunk.
+
+    Attributes:
+        number: The chunk.
+        required: All of the job's images in it, also those of other shards: with these it is
+            finalized.
+        missing: The shard's images in it that are not there yet.
+    """
+
+    number: int
+    required: range
+    missing: Sequence[int]
+
+
+def check_count(num_items: int) -> None:
+    """Refuse a number of images that no job can have.
+
+    Raises:
+        UserError: It is not in 1 … 10⁹.
+    """
+    if not 1 <= num_items <= MAX_ITEMS:
+        raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "change -n")
+
+
+def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
+    """Yield the chunks that a shard touches, in order, also those that are complete."""
+    span, size = shard.span(num_items), writer.chunk_size
+    if not span:
+        return
+    for number in range(span[0] // size, span[-1] // size + 1):
+        required = range(number * size, min((number + 1) * size, num_items))
+        own = range(max(span.start, required.start), min(span.stop, required.stop))
+        written = writer.written(number)
+        missing = [index for index in own if index not in written] if written else own
+        yield Chunk(number, required, missing)
+
+
+WriterClass = Callable[[Path, Sequence[Part]], Writer]
+
+WRITERS: Final = {
+    "bop": ("dopepp.data.formats.bop.writer", "BopWriter"),
+    "ndds": ("dopepp.data.formats.ndds.writer", "NddsWriter"),
+    "webdataset": ("dopepp.data.formats.webdataset.writer", "WebdatasetWriter"),
+}
+"""Module and class of each layout's writer."""
+
+
+def find_writer(layout: str) -> WriterClass:
+    """Return a layout's writer; its module is imported only now.
+
+    Raises:
+        UserError: The layout is unknown.
+    """
+    if layout not in WRITERS:
+        raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
+    module, name = WRITERS[layout]
+    writer: WriterClass = getattr(import_module(module), name)
+    return writer
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a process needs to know in order to do any task of a job.
+
+    Attributes:
+        factory: Renders the images.
+        layout: Key of :data:`WRITERS`.
+        root: The data set's folder, absolute.
+    """
+
+    factory: Factory
+    layout: str
+    root: Path
+
+    def writer(self) -> Writer:
+        """Return a new writer into the folder."""
+        return find_writer(self.layout)(self.root, self.factory.parts)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A piece of the job.
+
+    Attributes:
+        chunk: The chunk it belongs to.
+        indices: The images to render and write; for finalizing, those without which it must not
+            happen.
+        finalizes: Whether the chunk is to be finalized.
+    """
+
+    chunk: int
+    indices: Sequence[int]
+    finalizes: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a task.
+
+    Attributes:
+        task: The task.
+        finalized: Whether it finalized its chunk; false where images of it are still to come.
+        render_s: CPU seconds that rendering took.
+        write_s: CPU seconds that encoding and writing took.
+        error: What went wrong.
+    """
+
+    task: Task
+    finalized: bool = False
+    render_s: float = 0.0
+    write_s: float = 0.0
+    error: Exception | None = None
+
+
+class Worker:
+    """Does tasks in one process, on one thread.
+
+    Args:
+        content: A pickled :class:`Work`; unpickled with the first task, so that whatever is wrong
+            with it on this machine becomes that task's outcome.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        self._opened: tuple[Factory, Writer] | None = None
+
+    def perform(self, task: Task) -> Outcome:
+        """Do a task; an error comes back as a part of the outcome."""
+        try:
+            factory, writer = self._open()
+            if task.finalizes:
+                return Outcome(task, finalized=_seal(writer, task))
+            return _render(factory, writer, task)
+        except (UserError, OSError) as error:
+            return Outcome(task, error=error)
+        except Exception:  # a defect: not every exception survives pickling, its text does
+            return Outcome(task, error=RuntimeError(traceback.format_exc()))
+
+    def _open(self) -> tuple[Factory, Writer]:
+        if self._opened is None:
+            cv2.setNumThreads(1)
+            work: Work = pickle.loads(self._content)
+            if not is_begun(work.root):
+                raise UserError(
+                    f"{work.root} without {RECORD_FILE}, as one of the workers sees it",
+                    "a folder that every machine of the cluster sees under the same path",
+                    "choose --out on a shared file system",
+                )
+            self._opened = work.factory, work.writer()
+        return self._opened
+
+
+def _render(factory: Factory, writer: Writer, task: Task) -> Outcome:
+    render_s = write_s = 0.0
+    for index in task.indices:
+        start = time.process_time()
+        sample = rendered_sample(factory.render(0, index), "virtual", str(index))
+        middle = time.process_time()
+        writer.write(index, sample)
+        render_s += middle - start
+        write_s += time.process_time() - middle
+    return Outcome(task, render_s=render_s, write_s=write_s)
+
+
+def _seal(writer: Writer, task: Task) -> bool:
+    """Seal a chunk with all it holds, unless an image that belongs to it is missing."""
+    written = writer.written(task.chunk)
+    if not written.issuperset(task.indices):
+        return False
+    writer.finalize(task.chunk, sorted(written))
+    return True

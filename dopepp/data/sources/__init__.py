@@ -1,0 +1,1 @@
+"""Where samples come from besides files: renders, kept renders, and mixtures."""

@@ -1,0 +1,169 @@
+"""Hybrid data: real frames, renders and the data set's own synthetic frames in one epoch.
+
+``real_fraction`` counts real camera frames only (paper Table 1: real against hybrid); synthetic
+frames of a data set, e.g. YCB-Video's ``data_syn``, count as virtual.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Int
+
+from dopepp.core.errors import UserError
+from dopepp.data.rng import Purpose, item_rng
+from dopepp.data.sample import DescribedSource, Sample, SourceInfo
+
+_log = logging.getLogger(__name__)
+
+REAL: Final = 0
+VIRTUAL: Final = 1
+SYNTHETIC: Final = 2
+_ROLES: Final = ("real", "virtual", "synthetic")
+
+
+def _shares(
+    present: tuple[bool, ...], real_fraction: float, synthetic_fraction: float
+) -> list[float]:
+    """Return the shares of (real, virtual, synthetic); the others take an absent one's."""
+    real, virtual, synthetic = present
+    real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
+    synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0
+    return [
+        real_share,
+        (1 - real_share) * (1 - synthetic_part),
+        (1 - real_share) * synthetic_part,
+    ]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which source each item of an epoch comes from, and its rank among that source's items."""
+
+    epoch: int
+    roles: Int[np.ndarray, " items"]
+    ranks: Int[np.ndarray, " items"]
+
+
+class HybridSource:
+    """A mix with exact shares, a pure function of (seed, epoch, index).
+
+    Every epoch holds exactly round(share × samples_per_epoch) items of each source in an order
+    drawn per epoch. Each source is gone through in its own shuffled order from one epoch into the
+    next, so all its items are used equally often; how often it was gone through is the epoch it is
+    asked for.
+
+    Args:
+        real: Real camera frames; without them the real share is 0.
+        virtual: Renders.
+        real_fraction: Share of ``real``, in [0, 1].
+        samples_per_epoch: Items of an epoch.
+        seed: Seed of the mix.
+        synthetic: A data set's own synthetic frames.
+        synthetic_fraction: Share of ``synthetic`` in what is not real, in [0, 1].
+        name: Name of the mix.
+
+    Raises:
+        UserError: No source at all, a fraction outside [0, 1], or no item in an epoch.
+    """
+
+    def __init__(
+        self,
+        real: DescribedSource | None,
+        virtual: DescribedSource | None,
+        real_fraction: float,
+        samples_per_epoch: int,
+        seed: int,
+        synthetic: DescribedSource | None = None,
+        synthetic_fraction: float = 0.0,
+        name: str = "hybrid",
+    ) -> None:
+        for option, value in (
+            ("real_fraction", real_fraction),
+            ("synthetic_fraction", synthetic_fraction),
+        ):
+            if not 0.0 <= value <= 1.0:
+                raise UserError(f"data.{option}={value}", "a share in [0, 1]", "correct the option")
+        if samples_per_epoch < 1:
+            raise UserError(
+                f"data.samples_per_epoch={samples_per_epoch}", "at least 1", "correct the option"
+            )
+        self._sources = (real, virtual, synthetic)
+        present = tuple(source is not None for source in self._sources)
+        if not any(present):
+            raise UserError("a hybrid mix without any source", "at least one", "give data.root")
+        shares = _shares(present, real_fraction, synthetic_fraction)
+        if real is not None and shares[REAL] != real_fraction:
+            _log.warning("there are no virtual images: the real share is 1, not %g", real_fraction)
+        num_real = round(shares[REAL] * samples_per_epoch)
+        num_synthetic = round(shares[SYNTHETIC] * samples_per_epoch)
+        if virtual is None and synthetic is not None:
+            num_synthetic = samples_per_epoch - num_real
+        self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
+        self.name, self._seed, self._length = name, seed, samples_per_epoch
+        self._plan: _Plan | None = None
+        self._orders: dict[tuple[int, int], Int[np.ndarray, " items"]] = {}
+
+    def __len__(self) -> int:
+        """Return ``samples_per_epoch``."""
+        return self._length
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return item ``index`` of ``epoch`` from whichever source the mix has drawn for it."""
+        role, cycle, item = self.locate(index, epoch)
+        source = self._sources[role]
+        assert source is not None  # an absent source has no items in the plan
+        return source.sample(item, cycle)
+
+    def locate(self, index: int, epoch: int) -> tuple[int, int, int]:
+        """Return (role, the source's epoch, the source's index) of an item."""
+        plan = self._epoch_plan(epoch)
+        role = int(plan.roles[index])
+        position = epoch * self.counts[role] + int(plan.ranks[index])
+        source = self._sources[role]
+        assert source is not None
+        cycle, place = divmod(position, len(source))
+        return role, cycle, int(self._order(role, cycle, len(source))[place])
+
+    def _epoch_plan(self, epoch: int) -> _Plan:
+        if self._plan is None or self._plan.epoch != epoch:
+            roles = np.repeat(np.arange(len(_ROLES)), self.counts)
+            roles = item_rng(self._seed, Purpose.MIX, epoch).permutation(roles)
+            ranks = np.empty_like(roles)
+            for role, count in enumerate(self.counts):
+                ranks[roles == role] = np.arange(count)
+            self._plan = _Plan(epoch, roles, ranks)
+        return self._plan
+
+    def _order(self, role: int, cycle: int, length: int) -> Int[np.ndarray, " items"]:
+        key = (role, cycle)
+        if key not in self._orders:
+            # An epoch may straddle two cycles of a source; older ones are not needed again.
+            self._orders = {
+                k: v for k, v in self._orders.items() if k[0] != role or k[1] == cycle - 1
+            }
+            rng = item_rng(self._seed, Purpose.CYCLE, cycle, role)
+            self._orders[key] = rng.permutation(length)
+        return self._orders[key]
+
+    def contains(self, label: str) -> bool:
+        """Tell whether any source that has a share holds this object."""
+        return any(
+            count > 0 and source is not None and source.contains(label)
+            for source, count in zip(self._sources, self.counts, strict=True)
+        )
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the entries of all sources that have a share."""
+        mix = {"seed": self._seed, "samples_per_epoch": self._length}
+        entries = []
+        for role, source, count in zip(_ROLES, self._sources, self.counts, strict=True):
+            if source is None or count == 0:
+                continue
+            for info in source.describe():
+                identity = {**info.identity, "hybrid": {**mix, "role": role, "count": count}}
+                entries.append(replace(info, identity=identity, num_per_epoch=count))
+        return entries

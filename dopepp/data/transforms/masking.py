@@ -1,0 +1,282 @@
+"""Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
+
+A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
+box high and wide; it is smaller where the background has no such window. The network still has to
+place the keypoints that the patch covers: keypoints stay as they are, while masks and visible
+fractions lose the covered pixels.
+
+Covering an object with crops of the image's own background, never with a solid colour.
+
+Training and the shading protocol (:mod:`dopepp.data.transforms.shading`) differ in where patches
+lie and how many there are; what a patch may show is decided here for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from dopepp.data.sample import Instance, Sample, silhouette
+from dopepp.virtual.backgrounds import Backgrounds
+
+MIN_PATCH_PX: Final = 2
+"""A patch of one pixel is a solid colour, whatever it shows."""
+
+MIN_CONTRAST: Final = 3.0
+"""A crop counts as solid when no colour channel's standard deviation reaches this many grey
+levels."""
+
+MAX_DRAWS: Final = 8
+"""Crops drawn from a picture until one is not solid."""
+
+
+class BackgroundCrops:
+    """Draws crops of an image that show no object.
+
+    Args:
+        image: RGB, unpadded, so that padding is never taken as background.
+        silhouettes: What each object covers; no crop touches any of it.
+        min_contrast: See :data:`MIN_CONTRAST`.
+        max_draws: See :data:`MAX_DRAWS`.
+    """
+
+    def __init__(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        silhouettes: Sequence[Bool[np.ndarray, "height width"]],
+        min_contrast: float = MIN_CONTRAST,
+        max_draws: int = MAX_DRAWS,
+    ) -> None:
+        self.image, self.min_contrast, self.max_draws = image, min_contrast, max_draws
+        occupied = np.zeros(image.shape[:2], bool)
+        for seen in silhouettes:
+            occupied |= seen
+        self._integral = cv2.integral(occupied.astype(np.uint8))
+
+    def draw(
+        self, size: tuple[int, int], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Return a crop of (height, width), or None when a few draws gave none with contrast."""
+        places = np.flatnonzero(self._is_free(size).ravel())
+        for _ in range(self.max_draws if len(places) else 0):
+            crop = self._crop(int(rng.choice(places)), size)
+            if has_contrast(crop, self.min_contrast):
+                return crop
+        return None
+
+    def search(
+        self, size: tuple[int, int], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Return a crop of (height, width) with contrast, however rare they are.
+
+        Where no crop has enough, as on a smooth background under small patches, one that is not of
+        a single colour will do; None when there is none of these, either.
+        """
+        free = self._is_free(size)
+        if not free.any():
+            return None
+        sums, squares = self._moments
+        num = size[0] * size[1]
+        # num²·variance: whole numbers below 2⁵³, so that a single colour gives exactly 0.
+        spread = (num * _windows(squares, size) - _windows(sums, size) ** 2).max(axis=2)
+        spread[~free] = 0
+        for least in ((num * self.min_contrast) ** 2, 1.0):
+            places = np.flatnonzero(spread.ravel() >= least)
+            if len(places):
+                return self._crop(int(rng.choice(places)), size)
+        return None
+
+    def largest(
+        self, size: tuple[int, int], rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Return a crop of (height, width), of half that where there is none, and so on.
+
+        None where the background has no contrast at all, or no room for two pixels by two.
+        """
+        height, width = size
+        while True:
+            crop = self.draw((height, width), rng)
+            if crop is None:
+                crop = self.search((height, width), rng)
+            if crop is not None or max(height, width) == MIN_PATCH_PX:
+                return crop
+            height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
+
+    def _is_free(self, size: tuple[int, int]) -> Bool[np.ndarray, "rows columns"]:
+        """Tell of the top left corner of every window whether it is free of objects."""
+        return np.asarray(_windows(self._integral, size) == 0)
+
+    @cached_property
+    def _moments(self) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+        """Integral images of the pixels and of their squares."""
+        sums, squares = cv2.integral2(self.image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+        return sums, squares
+
+    def _crop(self, place: int, size: tuple[int, int]) -> UInt8[np.ndarray, "rows columns 3"]:
+        """Return the window that is counted row by row."""
+        row, column = divmod(place, self.image.shape[1] - size[1] + 1)
+        return self.image[row : row + size[0], column : column + size[1]]
+
+
+def _windows(integral: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the sum in every window of (height, width), from an integral image."""
+    height, width = size
+    return np.asarray(
+        integral[height:, width:]
+        - integral[:-height, width:]
+        - integral[height:, :-width]
+        + integral[:-height, :-width]
+    )
+
+
+def has_contrast(crop: UInt8[np.ndarray, "rows columns 3"], min_contrast: float) -> bool:
+    """Tell whether a crop is more than a solid colour."""
+    return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
+
+
+def covered_instance(
+    instance: Instance,
+    seen: Bool[np.ndarray, "height width"],
+    covered: Bool[np.ndarray, "height width"],
+) -> Instance:
+    """Return an instance without the covered pixels; keypoints and pose stay as they are.
+
+    Args:
+        instance: Before covering.
+        seen: Its silhouette before covering.
+        covered: All covered pixels of the image.
+    """
+    before = int(np.count_nonzero(seen))
+    if before == 0:
+        return instance
+    share = int(np.count_nonzero(seen & covered)) / before
+    return replace(
+        instance,
+        mask=None if instance.mask is None else instance.mask & ~covered,
+        visible_fraction=instance.visible_fraction * (1 - share),
+        masked_fraction=share,
+    )
+
+
+class RandomMask:
+    """Cover each instance with one background patch, with a probability.
+
+    Args:
+        probability: Chance of each instance to get a patch.
+        max_height: Largest patch height as a share of the object's box height (paper: 0.8).
+        max_width: Largest patch width as a share of the object's box width (paper: 0.8).
+        min_contrast: A crop counts as solid when no colour channel's standard deviation reaches
+            this many grey levels.
+        max_draws: Crops drawn from each picture until one is not solid; an instance for which even
+            the other picture gives none stays uncovered, with ``masked_fraction`` 0.
+
+    Raises:
+        ValueError: A share or the probability is outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        probability: float = 0.5,
+        max_height: float = 0.8,
+        max_width: float = 0.8,
+        min_contrast: float = MIN_CONTRAST,
+        max_draws: int = MAX_DRAWS,
+    ) -> None:
+        if not all(0.0 <= share <= 1.0 for share in (probability, max_height, max_width)):
+            raise ValueError(
+                f"probability={probability}, max_height={max_height}, max_width={max_width}: "
+                "each must be in [0, 1]"
+            )
+        self.probability, self.max_height, self.max_width = probability, max_height, max_width
+        self.min_contrast, self.max_draws = min_contrast, max_draws
+
+    def __call__(self, sample: Sample, rng: np.random.Generator, other: Backgrounds) -> Sample:
+        """Return a masked copy of the sample; the argument is not changed.
+
+        Args:
+            sample: Image with instances, unpadded, so that padding is never taken as background.
+            rng: The item's generator.
+            other: Gives another picture when the image has no fitting background left.
+        """
+        silhouettes = [
+            silhouette(instance, sample.image.shape[:2]) for instance in sample.instances
+        ]
+        crops = BackgroundCrops(sample.image, silhouettes, self.min_contrast, self.max_draws)
+        image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
+        for seen in silhouettes:
+            if rng.random() >= self.probability or not seen.any():
+                continue
+            patch = self._patch(seen, rng)
+            if patch is None:
+                continue
+            crop = self._crop(crops, (_length(patch[0]), _length(patch[1])), rng, other)
+            if crop is not None:
+                rows, columns = map(_middle, patch, crop.shape)
+                image[rows, columns], covered[rows, columns] = crop, True
+        instances = [
+            covered_instance(instance, seen, covered)
+            for instance, seen in zip(sample.instances, silhouettes, strict=True)
+        ]
+        return replace(sample, image=image, instances=instances)
+
+    def _patch(
+        self, seen: Bool[np.ndarray, "height width"], rng: np.random.Generator
+    ) -> tuple[slice, slice] | None:
+        """Draw a patch inside the object's box; None when the box is too small for any."""
+        slices = []
+        for axis, limit in ((1, self.max_height), (0, self.max_width)):
+            hit = np.flatnonzero(seen.any(axis=axis))
+            start, extent = int(hit[0]), int(hit[-1] - hit[0] + 1)
+            longest = int(limit * extent)
+            if longest < MIN_PATCH_PX:
+                return None
+            length = int(rng.integers(MIN_PATCH_PX, longest + 1))
+            offset = start + int(rng.integers(0, extent - length + 1))
+            slices.append(slice(offset, offset + length))
+        return slices[0], slices[1]
+
+    def _crop(
+        self,
+        crops: BackgroundCrops,
+        size: tuple[int, int],
+        rng: np.random.Generator,
+        other: Backgrounds,
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Draw a crop from the image's background, smaller where it must be.
+
+        Only where there is no background, or one of a single colour, another picture gives it.
+        """
+        crop = crops.largest(size, rng)
+        if crop is not None:
+            return crop
+        for _ in range(self.max_draws):
+            crop = _crop_of_other(other, crops.image.shape[:2], size, rng)
+            if has_contrast(crop, self.min_contrast):
+                return crop
+        return None
+
+
+def _length(patch: slice) -> int:
+    return int(patch.stop - patch.start)
+
+
+def _middle(patch: slice, length: int) -> slice:
+    """Return the middle of a patch's rows or columns."""
+    start = patch.start + (_length(patch) - length) // 2
+    return slice(start, start + length)
+
+
+def _crop_of_other(
+    other: Backgrounds, shape: tuple[int, int], size: tuple[int, int], rng: np.random.Generator
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Crop (height, width) from another picture of the image's (height, width)."""
+    picture = other.draw(rng, shape[1], shape[0])
+    row = int(rng.integers(0, shape[0] - size[0] + 1))
+    column = int(rng.integers(0, shape[1] - size[1] + 1))
+    return np.asarray(picture[row : row + size[0], column : column + size[1]])

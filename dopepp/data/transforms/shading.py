@@ -1,0 +1,203 @@
+"""The shading protocol (paper Table 3): cover a stated share of what is visible of each object.
+
+Random crops of the image's own background are laid over an object inside its box, one after the
+other, until all of its visible pixels that are asked for are covered. Every pixel so has a place in
+an order, and a share is the beginning of that order which covers so many visible pixels: it is
+reached to half a pixel, and more shading contains less. The patch that reaches the share is cut off
+there, between two pixels of a row.
+
+A patch passes behind the other objects on the image, so that each is covered by its own patches
+alone. What training does (Eq. 4, one patch) is :mod:`dopepp.data.transforms.masking`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt8
+
+from dopepp.data.rng import Purpose, item_rng
+from dopepp.data.sample import Instance, Sample, silhouette
+from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instance
+
+TOLERANCE: Final = 0.02
+"""How far the covered share may be from the asked one."""
+
+_SIDES: Final = (0.15, 0.5)
+"""A patch's sides as shares of the box's: small enough for several, large enough to hide edges."""
+
+_MAX_PATCHES: Final = 300
+"""With more the patches are confetti, because the background has no room for larger crops."""
+
+_NEVER: Final = np.iinfo(np.int32).max
+
+
+@dataclass(frozen=True)
+class Shaded:
+    """An image with shaded objects.
+
+    Attributes:
+        share: What was asked for.
+        sample: The image; masks, visible fractions and masked fractions say what is left, depth is
+            unknown where a patch lies.
+        reached: The share of each instance's visible pixels that is covered; None of an instance
+            without a mask or without a visible pixel, which cannot be shaded.
+    """
+
+    share: float
+    sample: Sample
+    reached: tuple[float | None, ...]
+
+
+def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[Shaded]:
+    """Shade an image's objects, once for each share.
+
+    Args:
+        sample: An image with instance masks; not changed.
+        shares: Of the visible pixels of each instance, each in [0, 1]. An image depends on its own
+            share alone, not on the others asked for.
+        seed: Seed of the protocol.
+        index: The image's place in the test set.
+
+    Raises:
+        ValueError: A share is outside [0, 1].
+    """
+    if not all(0 <= share <= 1 for share in shares):
+        raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
+    shape = sample.image.shape[:2]
+    silhouettes = [silhouette(one, shape) for one in sample.instances]
+    crops = BackgroundCrops(sample.image, silhouettes)
+    # Of its own for every instance: how much of one is covered changes no patch of another.
+    rngs = item_rng(seed, Purpose.SHADING, 0, index).spawn(len(silhouettes))
+    largest = max(shares, default=0.0)
+    covers = []
+    for number, (instance, rng) in enumerate(zip(sample.instances, rngs, strict=True)):
+        if _can_be_shaded(instance):
+            seen, others = silhouettes[number], np.zeros(shape, bool)
+            for other in silhouettes[:number] + silhouettes[number + 1 :]:
+                others |= other
+            covers.append(_Cover(seen, others & ~seen, crops, largest, rng))
+    return [_shaded(sample, silhouettes, covers, share) for share in shares]
+
+
+def _can_be_shaded(instance: Instance) -> bool:
+    return instance.mask is not None and bool(instance.mask.any())
+
+
+def _shaded(
+    sample: Sample,
+    silhouettes: Sequence[Bool[np.ndarray, "height width"]],
+    covers: Sequence[_Cover],
+    share: float,
+) -> Shaded:
+    """Lay every instance's patches, so far as the share goes."""
+    image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
+    for cover in covers:
+        laid = cover.laid(share)
+        image[cover.box][laid] = cover.pixels[laid]
+        covered[cover.box] |= laid
+    instances = [
+        covered_instance(instance, seen, covered)
+        for instance, seen in zip(sample.instances, silhouettes, strict=True)
+    ]
+    depth = None if sample.depth is None else np.where(covered, np.float32(0), sample.depth)
+    return Shaded(
+        share,
+        replace(sample, image=image, instances=instances, depth=depth),
+        tuple(
+            after.masked_fraction if _can_be_shaded(before) else None
+            for before, after in zip(sample.instances, instances, strict=True)
+        ),
+    )
+
+
+class _Cover:
+    """Patches over one instance and the order in which they cover its box, pixel by pixel.
+
+    Attributes:
+        box: Rows and columns of the instance's box.
+        pixels: What the patches show.
+        order: When each pixel is covered, :data:`_NEVER` where none of the patches lies.
+
+    Args:
+        seen: The instance's visible pixels, at least one.
+        spared: Pixels that no patch may cover.
+        crops: The image's background.
+        share: Up to which share of the visible pixels patches are needed.
+        rng: The instance's generator.
+    """
+
+    def __init__(
+        self,
+        seen: Bool[np.ndarray, "height width"],
+        spared: Bool[np.ndarray, "height width"],
+        crops: BackgroundCrops,
+        share: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self.box = _box(seen)
+        self._seen, self._spared = seen[self.box], spared[self.box]
+        self.pixels = np.zeros((*self._seen.shape, 3), np.uint8)
+        self.order: Int[np.ndarray, "rows columns"] = np.full(self._seen.shape, _NEVER, np.int32)
+        self._num_seen, self._num_laid = int(np.count_nonzero(self._seen)), 0
+        for _ in range(_MAX_PATCHES):
+            bare = np.argwhere(self._seen & (self.order == _NEVER))
+            if self._num_seen - len(bare) >= self._num_asked(share):
+                break
+            crop = self._draw_crop(crops, rng)
+            if crop is None:
+                break
+            self._lay(crop, bare[rng.integers(len(bare))], rng)
+
+    def laid(self, share: float) -> Bool[np.ndarray, "rows columns"]:
+        """Return the pixels of the box that are covered at a share of the visible pixels."""
+        asked = self._num_asked(share)
+        if asked == 0:
+            return np.zeros(self.order.shape, bool)
+        last = np.sort(self.order[self._seen])[asked - 1]
+        return self.order <= min(int(last), _NEVER - 1)
+
+    def _num_asked(self, share: float) -> int:
+        return round(share * self._num_seen)
+
+    def _draw_crop(
+        self, crops: BackgroundCrops, rng: np.random.Generator
+    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        """Draw a crop of random size, of half that size where the background has none, and so on.
+
+        None where the box is too small for any, or the background is a single colour.
+        """
+        extent = self._seen.shape
+        if min(extent) < MIN_PATCH_PX:
+            return None
+        height, width = (
+            max(MIN_PATCH_PX, int(rng.uniform(*_SIDES) * extent[axis])) for axis in (0, 1)
+        )
+        return crops.largest((height, width), rng)
+
+    def _lay(
+        self,
+        crop: UInt8[np.ndarray, "rows columns 3"],
+        pixel: Int[np.ndarray, "2"],
+        rng: np.random.Generator,
+    ) -> None:
+        """Lay a crop at random, so that it covers a given pixel, below all earlier ones."""
+        slices = []
+        for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
+            first, last = max(0, position - length + 1), min(position, extent - length)
+            start = int(rng.integers(first, last + 1))
+            slices.append(slice(start, start + length))
+        place = slices[0], slices[1]
+        new = (self.order[place] == _NEVER) & ~self._spared[place]
+        num_new = int(np.count_nonzero(new))
+        self.order[place][new] = np.arange(self._num_laid, self._num_laid + num_new)
+        self.pixels[place][new] = crop[new]
+        self._num_laid += num_new
+
+
+def _box(seen: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

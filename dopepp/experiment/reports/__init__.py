@@ -1,0 +1,1 @@
+"""What was measured: reports, conditions, tables and comparisons."""

@@ -1,0 +1,237 @@
+"""What can be measured on a test set: an estimator that is run, or poses that a file brings.
+
+To measure something else, write a class with the methods of :class:`Method`.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.models import parts_by_id, read_models
+from dopepp.data.formats.bop.results import PoseResult, read_results
+from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.sample import Sample
+from dopepp.geometry.camera import project_keypoints
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.models.network import network_cost
+from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
+
+ImageId = tuple[int, int]
+"""BOP's scene_id and im_id."""
+
+_WARM_UP_FRAMES: Final = 3
+"""The first frames allocate memory and choose kernels; they are not timed."""
+
+_BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
+_NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
+
+
+class Posed(Protocol):
+    """What a measurement reads of a detection."""
+
+    @property
+    def object(self) -> str:
+        """Name of the part."""
+
+    @property
+    def score(self) -> float:
+        """Confidence."""
+
+    @property
+    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+        """Estimated pose, metres."""
+
+    @property
+    def keypoints(self) -> Float[np.ndarray, "9 2"]:
+        """The cuboid projected with it, pixels."""
+
+
+@dataclass(frozen=True)
+class MeasuredPose:
+    """A pose on an image of the test set.
+
+    Attributes:
+        image: The image.
+        pose: The detection.
+        seconds: What the whole image took; None where unknown.
+    """
+
+    image: ImageId
+    pose: Posed
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a method costs; None where nobody knows.
+
+    Attributes:
+        parameters: Number of trained numbers.
+        gmacs: Multiply-accumulates of one image of the input size, 10⁹.
+        ms_per_frame: Median time from image to poses; of an estimator in this run.
+    """
+
+    parameters: int | None = None
+    gmacs: float | None = None
+    ms_per_frame: float | None = None
+
+
+class Method(Protocol):
+    """Something that gives poses for the images of a test set.
+
+    Attributes:
+        parts: The objects it is scored on, as the test set has them.
+    """
+
+    parts: Sequence[Part]
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Return the poses on an image and the seconds they took, None where unknown."""
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Return what it costs, given the known times of all images, in order."""
+
+
+class EstimatorMethod:
+    """An estimator, run on every image at native resolution.
+
+    Args:
+        estimator: The estimator.
+        parts: The test set's objects; it is scored on those that it knows.
+    """
+
+    def __init__(self, estimator: PoseEstimator, parts: Sequence[Part]) -> None:
+        known = {part.name for part in estimator.parts}
+        self.estimator = estimator
+        self.parts: Sequence[Part] = [part for part in parts if part.name in known]
+        self._names = {part.name for part in self.parts}
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Run it; what it finds of objects that are not measured is left out."""
+        start = time.perf_counter()
+        detections = self.estimator.predict(sample.image, sample.K, depth=sample.depth)
+        seconds = time.perf_counter() - start
+        return [one for one in detections if one.object in self._names], seconds
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Count parameters and operations, and take the median of the timed frames."""
+        size = self.estimator.checkpoint.input_size
+        parameters, gmacs = network_cost(self.estimator.network, size)
+        return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
+
+
+@dataclass(frozen=True)
+class FilePose:
+    """A pose that a file brings; see :class:`Posed`."""
+
+    object: str
+    score: float
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    keypoints: Float[np.ndarray, "9 2"]
+
+
+class FileMethod:
+    """Another program's poses, out of a BOP challenge CSV.
+
+    Args:
+        path: The file.
+        parts: The measured objects; poses of the data set's other objects are left out.
+        numbers: Numbers of the data set's objects, by name.
+
+    Raises:
+        UserError: The file is wrong.
+    """
+
+    def __init__(self, path: Path, parts: Sequence[Part], numbers: Mapping[str, int]) -> None:
+        self._path = path
+        self.parts: Sequence[Part] = list(parts)
+        self._parts = {numbers[part.name]: part for part in parts}
+        self._unused: dict[ImageId, list[PoseResult]] = {}
+        self._used: dict[ImageId, list[PoseResult]] = {}
+        for one in read_results(path, numbers.values()):
+            self._unused.setdefault((one.scene_id, one.im_id), []).append(one)
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Look the image up; of several times that its lines state, the largest counts."""
+        rows = self._used.setdefault(image, self._unused.pop(image, []))
+        poses = [
+            FilePose(part.name, one.score, one.T_cam_obj, self._keypoints(part, one, sample))
+            for one in rows
+            if (part := self._parts.get(one.obj_id)) is not None
+        ]
+        seconds = max((one.seconds for one in rows), default=-1.0)
+        return poses, seconds if seconds >= 0 else None
+
+    @staticmethod
+    def _keypoints(part: Part, one: PoseResult, sample: Sample) -> Float[np.ndarray, "9 2"]:
+        return project_keypoints(part.cuboid, one.T_cam_obj, sample.K)
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Return the median of the stated times."""
+        return Cost(ms_per_frame=_median_ms(seconds))
+
+    def check_used(self) -> None:
+        """Say, after all images, how many poses had no place in the measurement.
+
+        Raises:
+            UserError: None of them was on one of the images.
+        """
+        used = [one for rows in self._used.values() for one in rows]
+        unused = [one for rows in self._unused.values() for one in rows]
+        if unused and not used:
+            raise UserError(
+                f"{self._path}, whose {len(unused):,} poses are all on other images, the first "
+                f"in scene {unused[0].scene_id}, image {unused[0].im_id}",
+                f"images of the test set, e.g. scene and image {next(iter(self._used), 'none')}",
+                "choose the images that the file was made for, e.g. with data.image_sets.test",
+            )
+        others = sum(one.obj_id not in self._parts for one in used)
+        if unused or others:
+            _log.warning(
+                "%s: left out %s poses on images that are not in the test set and %s of objects "
+                "that are not measured", self._path, f"{len(unused):,}", f"{others:,}",
+            )  # fmt: skip
+
+
+def object_numbers(data: Mapping[str, Any], parts: Sequence[Part]) -> dict[str, int]:
+    """Return BOP's number of each object, by name.
+
+    In a BOP data set they are those of ``models_info.json``, all of them; in YCB-Video the lines of
+    ``classes.txt``, which BOP's YCB-V has kept. Elsewhere parts are counted from 1.
+    """
+    if data["root"] is not None and data["format"] in ("bop", "webdataset"):
+        root = Path(data["root"])
+        known = {info.name: number for number, info in read_models(root).items()}
+        return known or {part.name: number for number, part in parts_by_id(root, parts).items()}
+    if data["root"] is not None and data["format"] == "ycb_video":
+        return {name: number for number, name in enumerate(read_classes(Path(data["root"])), 1)}
+    return {part.name: number for number, part in enumerate(parts, 1)}
+
+
+def image_id(sample: Sample, index: int) -> ImageId:
+    """Return an image's BOP numbers.
+
+    They are those in the key of a BOP data set or of YCB-Video, like ``000001/000017``, whose
+    numbers BOP's YCB-V has kept; elsewhere scene 0 and the image's place in the test set.
+    """
+    match = _BOP_KEY.fullmatch(sample.key)
+    if match is None or sample.source.partition("/")[0] not in _NUMBERED_SOURCES:
+        return 0, index
+    return int(match[1]), int(match[2])
+
+
+def _median_ms(seconds: Sequence[float]) -> float | None:
+    return 1000 * statistics.median(seconds) if seconds else None

@@ -1,0 +1,95 @@
+"""What an evaluation measures beside the test set as it is: shading, scale, and rates per bin.
+
+To add a protocol, give :class:`Protocols` its option, write a module that measures and records it,
+and call that in :func:`dopepp.experiment.evaluate.measure_and_record`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.reports.breakdown import QUANTITIES
+from dopepp.models.registry import check_integer
+
+SHORT_NAMES: Final = {"scale": "scale_factors"}
+"""What evaluate.py calls an option on the command line, and the option: ``scale`` alone, without
+being short for something, would be a file of ``conf/scale``, which chooses a training's sizes."""
+
+_MAX_BINS: Final = 1000
+
+_MAX_SCALE: Final = 20.0
+"""Twenty times as near or as far."""
+
+
+@dataclass(frozen=True)
+class Protocols:
+    """The protocols asked for.
+
+    Attributes:
+        shading: Shares of every object's visible area to cover, ascending, without 0.
+        scales: How many times as large the parts are to appear, ascending, without 1.
+        by: Quantities over which rates are broken down.
+        num_bins: Bins of each.
+    """
+
+    shading: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()
+    by: tuple[str, ...] = ()
+    num_bins: int = 5
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Protocols:
+        """Read an evaluation's options, or a training's, which has no scales.
+
+        Raises:
+            UserError: One of them is wrong.
+        """
+        return cls(
+            shading=_shares(config["shading"]),
+            scales=_scales(config.get("scale_factors")),
+            by=_quantities(config["by"]),
+            num_bins=check_integer("num_bins", config["num_bins"], 1, _MAX_BINS),
+        )
+
+    def __bool__(self) -> bool:
+        """Tell whether there is any."""
+        return bool(self.shading or self.scales or self.by)
+
+
+def _shares(given: object) -> tuple[float, ...]:
+    """Read ``shading``: one share or several; 0, the image as it is, is measured anyway."""
+    allowed = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
+    return _levels("shading", given, (0, 1), 0, allowed)
+
+
+def _scales(given: object) -> tuple[float, ...]:
+    """Read ``scale``: one scale or several; 1, the image as it is, is measured anyway."""
+    bounds = (1 / _MAX_SCALE, _MAX_SCALE)
+    allowed = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
+    return _levels("scale", given, bounds, 1, allowed)
+
+
+def _levels(
+    option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
+) -> tuple[float, ...]:
+    """Read a number or several within bounds, some other than that of the images as they are."""
+    levels = [] if given is None else given if isinstance(given, list) else [given]
+    numbers = [one for one in levels if isinstance(one, int | float) and not isinstance(one, bool)]
+    wrong = len(numbers) < len(levels) or not all(bounds[0] <= one <= bounds[1] for one in numbers)
+    if wrong or (given is not None and all(one == usual for one in numbers)):
+        raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
+    return tuple(sorted({float(one) for one in numbers if one != usual}))
+
+
+def _quantities(given: object) -> tuple[str, ...]:
+    """Read ``by``: one quantity or several."""
+    names = [] if given is None else given if isinstance(given, list) else [given]
+    wrong = [name for name in names if not isinstance(name, str) or name not in QUANTITIES]
+    if wrong or (given is not None and not names):
+        raise UserError(
+            f"by={given!r:.100}", f"one or more of {', '.join(QUANTITIES)}", "change by"
+        )
+    return tuple(dict.fromkeys(str(name) for name in names))

@@ -1,0 +1,250 @@
+"""Measuring methods on a test set: one loop, one accumulator, for every kind of comparison."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dopepp.data.sample import Sample
+from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.sheet import Tile
+from dopepp.experiment.reports.evaluators import Cost, MeasuredPose, Method, image_id
+from dopepp.experiment.runs.images import Fingerprint
+from dopepp.metrics.pose import MEAN, PoseMetrics
+from dopepp.metrics.row import PoseRow, mean_row
+from dopepp.models.network import network_cost
+from dopepp.models.spec import build_network
+
+FULL_SIZE_COST: Final = "full_size_cost"
+"""Key of the details that holds what a narrowed network costs at full width and size."""
+
+
+@dataclass
+class Report:
+    """One method's result on one test set.
+
+    Attributes:
+        name: The method's name.
+        rows: A row per object, then the mean.
+        references: The reference rows, by reference and object.
+        errors: ADD of every instance, metres, infinite where missed, by object.
+        cost: The network's cost.
+        num_images: Size of the test set.
+        details: Further plain facts, e.g. the range of poses.
+        rotation_deg: Rotation error of every instance, degrees, infinite where missed, by object.
+        diameters: The objects' diameters, metres.
+        test_set: Fingerprint of the images it was measured on; empty where that is not known.
+    """
+
+    name: str
+    rows: dict[str, PoseRow]
+    references: dict[str, dict[str, PoseRow]]
+    errors: dict[str, Float[np.ndarray, "instances"]]
+    cost: Cost
+    num_images: int
+    details: dict[str, Any] = field(default_factory=dict)
+    rotation_deg: dict[str, Float[np.ndarray, "instances"]] = field(default_factory=dict)
+    diameters: dict[str, float] = field(default_factory=dict)
+    test_set: str = ""
+
+    @property
+    def mean(self) -> PoseRow:
+        """The mean over objects."""
+        return self.rows[MEAN]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what ``metrics.json`` holds."""
+        return {
+            "name": self.name,
+            "num_images": self.num_images,
+            "objects": {name: row.to_record() for name, row in self.rows.items()},
+            "references": {
+                reference: {name: row.to_record() for name, row in rows.items()}
+                for reference, rows in self.references.items()
+            },
+            "add": _listed(self.errors),
+            "rotation_deg": _listed(self.rotation_deg),
+            "diameters": self.diameters,
+            "test_set": self.test_set,
+            "cost": vars(self.cost),
+            **self.details,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Report:
+        """Read ``metrics.json`` back; files of earlier versions lack the optional fields."""
+        return cls(
+            name=record["name"],
+            rows={name: PoseRow(**row) for name, row in record["objects"].items()},
+            references={
+                reference: {name: PoseRow(**row) for name, row in rows.items()}
+                for reference, rows in record["references"].items()
+            },
+            errors=_unlisted(record["add"]),
+            cost=Cost(**record["cost"]),
+            num_images=record["num_images"],
+            details={key: value for key, value in record.items() if key not in _FIELDS},
+            rotation_deg=_unlisted(record.get("rotation_deg", {})),
+            diameters=dict(record.get("diameters", {})),
+            test_set=record.get("test_set", ""),
+        )
+
+    @classmethod
+    def joined(cls, reports: Sequence[Report]) -> Report:
+        """Return the results of several networks, one a part, as those of one method.
+
+        Args:
+            reports: Of networks that differ in nothing but their parts; no part occurs twice.
+        """
+        reports = sorted(reports, key=lambda report: list(report.rows))
+        first = reports[0]
+        known = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
+        return replace(
+            first,
+            rows=_joined_rows([report.rows for report in reports]),
+            references={
+                reference: _joined_rows([report.references[reference] for report in reports])
+                for reference in first.references
+            },
+            errors={name: e for report in reports for name, e in report.errors.items()},
+            cost=replace(first.cost, ms_per_frame=statistics.mean(known) if known else None),
+            num_images=sum(report.num_images for report in reports),
+            rotation_deg={name: e for one in reports for name, e in one.rotation_deg.items()},
+            diameters={name: d for report in reports for name, d in report.diameters.items()},
+            test_set=" ".join(report.test_set for report in reports),
+        )
+
+
+def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
+    """Put the rows of several tables into one and average them anew."""
+    rows = {name: row for group in groups for name, row in group.items() if name != MEAN}
+    return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
+
+
+_FIELDS: Final = (
+    "name", "num_images", "objects", "references", "add", "rotation_deg", "diameters", "test_set",
+    "cost",
+)  # fmt: skip
+"""Keys of ``metrics.json`` that are no details."""
+
+
+def _listed(errors: Mapping[str, Float[np.ndarray, "instances"]]) -> dict[str, list[float | None]]:
+    """Return errors as JSON has them, null where missed."""
+    return {
+        name: [float(error) if np.isfinite(error) else None for error in values]
+        for name, values in errors.items()
+    }
+
+
+def _unlisted(
+    record: Mapping[str, Sequence[float | None]],
+) -> dict[str, Float[np.ndarray, "instances"]]:
+    """Undo :func:`_listed`."""
+    return {
+        name: np.array([np.inf if error is None else error for error in values], np.float64)
+        for name, values in record.items()
+    }
+
+
+@dataclass
+class Measured:
+    """What came out of measuring methods on a test set.
+
+    Attributes:
+        reports: One per method.
+        tiles: Pictures of the first images.
+        poses: Every pose of each method.
+        metrics: The accumulator of each method.
+    """
+
+    reports: list[Report]
+    tiles: list[Tile]
+    poses: dict[str, list[MeasuredPose]]
+    metrics: dict[str, PoseMetrics]
+
+
+def measure(
+    methods: Mapping[str, Method], samples: Iterable[Sample], num_pictures: int = 12
+) -> Measured:
+    """Run methods over the same images at native resolution.
+
+    Args:
+        methods: By name, the baseline first where there is one.
+        samples: The test set.
+        num_pictures: How many of the first images are drawn.
+
+    Returns:
+        A report per method, and pictures with the truth in green, the last method's predictions in
+        yellow and those of the methods before it in blue (paper Fig. 14).
+    """
+    # One process measures alone: after a distributed training the others have ended.
+    metrics = {
+        name: PoseMetrics(method.parts, name, sync_on_compute=False)
+        for name, method in methods.items()
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    measured = Measured([], [], {name: [] for name in methods}, metrics)
+    num_images = 0
+    parts = {part.name: part for method in methods.values() for part in method.parts}
+    seen = Fingerprint(list(parts.values()))
+    for index, sample in enumerate(samples):
+        num_images += 1
+        seen.add(sample)
+        image = image_id(sample, index)
+        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
+        for number, (name, method) in enumerate(methods.items()):
+            poses, taken = method.detect(sample, image)
+            seconds[name] += [] if taken is None else [taken]
+            metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
+            colour = BLUE if number < len(methods) - 1 else YELLOW
+            wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
+        if len(measured.tiles) < num_pictures:
+            measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
+    measured.reports = [
+        Report(
+            name,
+            metrics[name].compute(),
+            metrics[name].references(),
+            {part.name: metrics[name].errors(part.name) for part in method.parts},
+            method.cost(seconds[name]),
+            num_images,
+            rotation_deg={
+                part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
+            },
+            diameters={part.name: float(part.diameter) for part in method.parts},
+            test_set=seen.word(),
+        )
+        for name, method in methods.items()
+    ]
+    return measured
+
+
+def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:
+    """Measure the untrained network of a spec at width 1: what narrowing has saved.
+
+    Args:
+        spec: The narrowed network's spec.
+        input_size: Input (width, height), pixels; the paper's is 416×416.
+        repeats: Timed forward passes after one that is not; the median counts.
+    """
+    widened = {
+        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
+        for key, node in spec.items()
+    }
+    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
+    times = []
+    with torch.inference_mode():
+        for _ in range(1 + repeats):
+            start = time.perf_counter()
+            network.maps(images)
+            times.append(1000 * (time.perf_counter() - start))
+    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))

@@ -1,0 +1,117 @@
+"""What a person sees in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from rich.tree import Tree
+
+from dopepp.data.datamodule import SourceRow
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.tuning import Tuning
+from dopepp.metrics.pose import MEAN
+from dopepp.metrics.row import COLUMNS
+
+# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
+# overrides, paths and messages hold square brackets of their own.
+console = Console(highlight=False, markup=False, width=None if Console().is_terminal else 180)
+
+
+def show_config(config: Mapping[str, Any]) -> None:
+    """Print the composed config as a tree."""
+    tree = Tree(Text("config", style="bold"))
+    _branch(tree, config)
+    console.print(tree)
+
+
+def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            _branch(tree.add(Text(str(key), style="bold")), value)
+        else:
+            tree.add(f"{key}: {value!r}", style="default")
+
+
+def show_sources(rows: Sequence[SourceRow]) -> None:
+    """Print where the images come from and how many each source gives."""
+    table = Table("split", "source", "images", "per epoch", "instances", title="data")
+    for row in rows:
+        instances = ", ".join(f"{name} {count:,}" for name, count in row.num_instances.items())
+        counts = (f"{row.num_images:,}", f"{row.num_per_epoch:,}")
+        table.add_row(row.split, row.source, *counts, instances or "in every render")
+    console.print(table)
+
+
+def show_report(report: Report, all_measures: bool = False) -> None:
+    """Print a table per object: a line per measure, the reference rows beside the estimate.
+
+    Args:
+        report: What was measured.
+        all_measures: Whether to print the symmetric measures of a part without symmetries, too.
+    """
+    for name, row in report.rows.items():
+        if name == MEAN and len(report.rows) == 2:
+            continue
+        if row.num_instances == 0:
+            console.print(
+                f"{name}: n/a, no ground truth in the test set; "
+                f"{row.false_positives} false positives"
+            )
+            continue
+        rows = [row, *(rows[name] for rows in report.references.values())]
+        table = Table("", title=f"{name}: {report.num_images} test images")
+        for number, one in enumerate(rows):
+            style = "bold" if number == 0 else "dim"
+            table.add_column(one.method, justify="right", style=style)
+        shown = [c for c in COLUMNS if all_measures or row.num_symmetries > 1 or not c.symmetric]
+        for column, following in zip(shown, [*shown[1:], None], strict=True):
+            ends = following is not None and following.group != column.group
+            texts = (column.text(one) for one in rows)
+            table.add_row(column.heading, *texts, end_section=ends)
+        console.print(table)
+
+
+def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
+    """Print rows by heading, the first columns of words, the others of numbers.
+
+    The columns are those of the fullest row; a row may lack some.
+    """
+    table = Table(title=title)
+    header = list(rows[max(range(len(rows)), key=lambda number: len(rows[number]))])
+    for number, heading in enumerate(header):
+        table.add_column(
+            heading, justify="left" if number < num_labels else "right", overflow="fold"
+        )
+    for row in rows:
+        table.add_row(*(row.get(heading, "") for heading in header))
+    console.print(table)
+
+
+def show_tuning(tuning: Tuning, path: Path) -> None:
+    """Print what tuning changed, measured on test images, and where the checkpoint is."""
+    shown, empty = tuning.num_images
+    title = f"tuned; measured on {shown} test images and {empty} without objects"
+    table = Table("", "before", "after", title=title)
+    for name in ("calibration_error", "false_positive_rate", "recall"):
+        before, after = getattr(tuning.before, name), getattr(tuning.after, name)
+        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
+    console.print(table)
+    for name, value in tuning.options.items():
+        console.print(f"recovery.{name}: {value:.4g}")
+    console.print(f"tuned checkpoint {path}")
+
+
+def show_files(run_dir: Path) -> None:
+    """Print what a run folder holds."""
+    table = Table("file", "bytes")
+    for path in sorted(run_dir.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(run_dir).parts)
+        if path.is_file() and not hidden:
+            table.add_row(str(path.relative_to(run_dir)), f"{path.stat().st_size:,}")
+    console.print(f"run folder {run_dir}", soft_wrap=True)
+    console.print(table)

@@ -1,0 +1,193 @@
+"""Whether an evaluation measures on the images that the checkpoint's run was measured on.
+
+Which images were measured, as one word: results on other images cannot be set off against.
+
+What the images of a run are, so that it shows later when they are others.
+
+The data configuration may stay as it is while files, meshes or the rendering code change. So a
+checkpoint holds, of every split, what its sources say of themselves and how its first image looks:
+its labels and a picture of 16 × 12 pixels, which another machine's rounding does not change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from dopepp.data.sample import DescribedSource, Sample
+from dopepp.experiment.build.sources import build_test_source
+from dopepp.experiment.config.chosen_data import trained_on
+from dopepp.experiment.config.options import below, flat
+from dopepp.geometry.camera import Letterbox
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.parts.part import Part
+
+_DECIMALS: Final = 6
+"""Of pixels and metres: machines differ in the last digits of what they compute."""
+
+
+class Fingerprint:
+    """A hash over a test set: its objects, and every image's name, camera and truth, in order.
+
+    The pixels are not in it, because they may differ in a bit from machine to machine; the name of
+    the source tells renderers apart, and the covered share shaded images.
+
+    Args:
+        parts: The objects that are scored.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._hash = hashlib.sha256()
+        self._add(sorted((part.name, part.mesh_hash) for part in parts))
+
+    def add(self, sample: Sample) -> None:
+        """Take the next image."""
+        truths = [
+            [
+                one.label,
+                _rounded(one.T_cam_obj),
+                bool(one.visible_fraction >= MIN_VISIBLE_FRACTION),
+                round(one.masked_fraction, 2),
+            ]
+            for one in sample.instances
+        ]
+        self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
+
+    def word(self) -> str:
+        """Return the hash of what was taken so far."""
+        return self._hash.hexdigest()
+
+    def _add(self, facts: object) -> None:
+        self._hash.update(json.dumps(facts).encode() + b"\n")
+
+
+def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
+    """Return rounded numbers, of which none is a negative zero."""
+    return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
+
+
+_LOOK_SIZE: Final = (16, 12)
+_MAX_LEVELS: Final = 2.0
+"""Mean difference of two small pictures, in grey levels, above which they show something else."""
+_MAX_LABEL: Final = 1e-4
+"""Difference of two camera matrices (relative) or poses (metres) above which they are others."""
+_LONG: Final = 40
+"""Values with more characters are not shown."""
+
+
+def describe_images(source: DescribedSource) -> dict[str, Any]:
+    """Describe a split's images in plain values."""
+    sources = {
+        f"{number} {info.name}": {"images": info.num_images, **info.identity}
+        for number, info in enumerate(source.describe())
+    }
+    return {"sources": sources, "first_image": _look(source.sample(0, 0))}
+
+
+def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
+    """Say in which points two descriptions of images differ; nothing where they do not."""
+    old, new = (dict(flat(one["sources"])) for one in (stored, present))
+    lines = [
+        f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
+        for key in {**old, **new}
+        if old.get(key) != new.get(key)
+    ]
+    if not _same_labels(stored["first_image"], present["first_image"]):
+        lines.append("labels of the first image")
+    if _picture_difference(stored["first_image"], present["first_image"]) > _MAX_LEVELS:
+        lines.append("pixels of the first image")
+    return lines
+
+
+def _look(sample: Sample) -> dict[str, Any]:
+    box = Letterbox.fit(sample.size, _LOOK_SIZE)
+    small = cv2.resize(sample.image, (box.width, box.height), interpolation=cv2.INTER_AREA)
+    return {
+        "K": sample.K.tolist(),
+        "labels": [one.label for one in sample.instances],
+        "T_cam_obj": [one.T_cam_obj.tolist() for one in sample.instances],
+        "size": [box.width, box.height],
+        "pixels": np.asarray(small, np.uint8).tobytes().hex(),
+    }
+
+
+def _same_labels(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    if one["labels"] != other["labels"]:
+        return False
+    return all(
+        np.allclose(one[name], other[name], rtol=_MAX_LABEL, atol=_MAX_LABEL)
+        for name in ("K", "T_cam_obj")
+    )
+
+
+def _picture_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
+    """Return the mean absolute difference, grey levels; infinite for other sizes."""
+    if one["size"] != other["size"]:
+        return np.inf
+    pictures = (_pixels(look["pixels"]).astype(float) for look in (one, other))
+    return float(np.abs(np.subtract(*pictures)).mean())
+
+
+def _pixels(text: str) -> UInt8[np.ndarray, "n"]:
+    return np.frombuffer(bytes.fromhex(text), np.uint8)
+
+
+def _shown(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= _LONG else f"{text[:_LONG]}…"
+
+
+_log = logging.getLogger(__name__)
+
+_DECIDE_TEST: Final = (
+    "format", "root", "objects", "parts", "unit", "frames", "image_sets", "virtual",
+    "num_test", "eval_seed", "test.renderer", "targets", "classes",
+)  # fmt: skip
+"""Data options that name a test set; the others cannot mean another one."""
+
+
+def warn_of_other_images(
+    checkpoint: Checkpoint, data: Mapping[str, Any], parts: Sequence[Part], seed: int
+) -> None:
+    """Say it in one line where figures are not comparable with the checkpoint's own.
+
+    Two things are: a test set that has changed although its configuration is the checkpoint's, and
+    an object of another shape than the one trained on, whatever the test set. Another test set,
+    chosen by its configuration, is as its user wants it.
+
+    Args:
+        checkpoint: What is measured.
+        data: The data config of the evaluation.
+        parts: The checkpoint's objects as these data have them.
+        seed: Of renders.
+    """
+    pairs = zip(checkpoint.parts, parts, strict=True)
+    others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]
+    if others:
+        _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
+    stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
+    if not isinstance(stored, dict) or config is None:
+        return  # a checkpoint of an earlier version does not say
+    if _test_set(config) != _test_set(data):
+        return
+    found = differing_images(stored["test"], describe_images(build_test_source(data, parts, seed)))
+    if found:
+        _log.warning(
+            "the test images are not those of the checkpoint's own figures, "
+            "though their configuration is the same: %s",
+            "; ".join(found),
+        )
+
+
+def _test_set(data: Mapping[str, Any]) -> dict[str, object]:
+    return {
+        key: value for key, value in flat(data) if value is not None and below(key, _DECIDE_TEST)
+    }

@@ -1,0 +1,78 @@
+"""Multirun: every job is a row, failed ones too; it ends with a comparison and its table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from dopepp.experiment.cost import COST_FILE
+from dopepp.experiment.reports.compare.compare import compare_runs
+from dopepp.experiment.reports.compare.runs import read_run
+from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
+from dopepp.experiment.runs import display, record
+from dopepp.experiment.runs.readme import write_sweep_readme
+from dopepp.experiment.runs.tracking import log_comparison
+
+
+class CompareJobs(Callback):
+    """Hydra's hook at the end of a multirun.
+
+    Hydra skips the hook when a job raises, so a failing job writes ``failed.json`` and returns;
+    the sweep then ends non-zero here, after the table.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Say in the sweep's folder what runs there."""
+        write_sweep_readme(Path(str(config.hydra.sweep.dir)), _command(), {})
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Compare all jobs of the sweep folder.
+
+        Raises:
+            SystemExit: With code 1 if a job failed.
+        """
+        plain = {
+            key: OmegaConf.to_container(config[key], resolve=True)
+            for key in ("table", "logger")
+            if config.get(key) is not None
+        }
+        if not compare_jobs(Path(str(config.hydra.sweep.dir)), plain):
+            raise SystemExit(1)
+
+
+def compare_jobs(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Compare the jobs that a sweep's folder holds; return whether none has failed.
+
+    Args:
+        folder: The sweep's folder.
+        config: The resolved config, of which ``table`` and ``logger`` are read.
+    """
+    jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
+    if not jobs:
+        return True
+    entries = compare_runs([read_run(job) for job in jobs], folder)
+    if config.get("table") is not None:
+        write_paper_table(PaperTable.of(config["table"]), entries, folder)
+    log_comparison(config.get("logger"), folder)
+    write_sweep_readme(folder, _command(), {job.name: _state(job) for job in jobs})
+    display.console.print(f"comparison in {folder}")
+    return not any(entry.failure and not entry.pruned for entry in entries)
+
+
+def _command() -> list[str]:
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]
+
+
+def _state(job: Path) -> str:
+    """Say how a job stands, by what is in its folder."""
+    ends = {record.FAILURE_FILE: "failed", record.PRUNED_FILE: "stopped by the search"}
+    for name, word in ends.items():
+        if (job / name).is_file():
+            return f"{word}: {record.read_json(job / name).get('reason', '')}"
+    done = any((job / name).is_file() for name in (record.METRICS_FILE, COST_FILE))
+    return "finished" if done else "unfinished"

@@ -1,0 +1,249 @@
+"""Poses refined with depth: point-to-plane ICP around the RGB pose, kept only when it fits better.
+
+The part is its surface points, so a checkpoint is all that is needed. Three kinds of evidence enter
+one Gauss–Newton step: small_gicp's point-to-plane terms, which fix what a surface's shape fixes;
+the outline (see :mod:`dopepp.inference.refinement.fit`), which keeps a flat plate from sliding in
+its own plane; and the RGB pose with its covariance, which decides where depth is silent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import invert_transform, make_transform, transform
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.inference.refinement.fit import Fit, Prior, Terms, fit_of, make_prior, outline_terms
+from dopepp.inference.refinement.search import best_shift
+from dopepp.inference.refinement.view import GATE, DepthView, Overlay, lay_over, view_around
+from dopepp.inference.refinement.visible import (
+    FEWEST_POINTS,
+    SurfacePoints,
+    surface_points,
+    visible,
+)
+from dopepp.parts.part import Part
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the rounds from coarse to fine; lengths in diameters where nothing else is said.
+
+    Attributes:
+        reach: Correspondence distance of the point-to-plane terms.
+        steps: Gauss–Newton steps.
+        anew: Whether the visible points are found anew.
+        search: Step of the search across the viewing axis before it; 0 for none.
+        tolerance: Of that search, standard deviations of the depth; a pose that is still tilted
+            needs more.
+        outline: Largest difference of outlines that pulls; 0 for none.
+    """
+
+    reach: float
+    steps: int = 2
+    anew: bool = False
+    search: float = 0.0
+    tolerance: float = 0.0
+    outline: float = 0.0
+
+
+STAGES: Final = (
+    Stage(0.06, search=0.025, tolerance=5.0),
+    Stage(0.045, search=0.0125, tolerance=3.0),
+    Stage(0.03, steps=3, anew=True, outline=0.05),
+)
+
+PLANE_NEIGHBOURS: Final = 8
+"""Visible points that small_gicp estimates a plane from."""
+
+MOST_PIXELS: Final = 500
+"""Depth points in a step."""
+
+INDEPENDENT: Final = 100.0
+"""So many independent measurements stand behind any number of neighbouring pixels."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What depth has made of a pose.
+
+    Attributes:
+        T_cam_obj: The refined pose, or the one that was given.
+        covariance: Of the refined pose, as :class:`~dopepp.geometry.pnp.PnPResult` defines it; None
+            where the given pose was kept.
+        reason: Why the given pose was kept; empty where it was refined.
+        fit: How well the refined pose fits the depth; None where there was nothing to fit.
+    """
+
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"] | None = None
+    reason: str = ""
+    fit: Fit | None = None
+
+
+class DepthRefiner:
+    """Refines the poses of some parts.
+
+    Args:
+        parts: The parts, with their points.
+
+    Raises:
+        UserError: The extra ``depth`` is not installed.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._gicp = _small_gicp()
+        self._surfaces = {
+            part.name: surface_points(part.points)
+            for part in parts
+            if len(part.points) >= FEWEST_POINTS
+        }
+        self._diameters = {part.name: part.diameter for part in parts}
+
+    def refine(
+        self,
+        name: str,
+        T_cam_obj: Float[np.ndarray, "4 4"],
+        depth: Float[np.ndarray, "height width"],
+        K: Float[np.ndarray, "3 3"],
+        covariance: Float[np.ndarray, "6 6"] | None = None,
+    ) -> Refinement:
+        """Refine one pose.
+
+        Args:
+            name: The part's name.
+            T_cam_obj: The pose to start from, metres.
+            depth: Metres along z, aligned to the image, 0 where unknown.
+            K: Camera matrix of the depth image, pixels.
+            covariance: Of the given pose: rotation vector about the object's origin and shift, both
+                in camera axes, radians and metres. Without it, a broad one is taken.
+
+        Raises:
+            KeyError: There is no such part.
+        """
+        given, diameter = np.asarray(T_cam_obj, np.float64), self._diameters[name]
+        surface = self._surfaces.get(name)
+        if surface is None:
+            return Refinement(given, reason="the part has too few surface points")
+        points = transform(given, surface.points)
+        if points[:, 2].min() <= 0:
+            return Refinement(given, reason="the part reaches behind the camera")
+        view = view_around(depth, K, points)
+        if view is None:
+            return Refinement(given, reason="the part lies outside the depth image")
+        prior = make_prior(given, diameter, covariance)
+        seen = visible(surface, given)
+        found = self._descend(view, surface, diameter, prior, seen)
+        if found is None:
+            return Refinement(given, reason="too little depth was measured on the part")
+        pose, information = found
+        after = fit_of(view, surface, pose, visible(surface, pose))
+        before = fit_of(view, surface, given, seen)
+        reason = after.doubt(before) or prior.doubt(pose)
+        if reason:
+            return Refinement(given, reason=reason, fit=after)
+        return Refinement(pose, np.linalg.inv(information), fit=after)
+
+    def _descend(
+        self,
+        view: DepthView,
+        surface: SurfacePoints,
+        diameter: float,
+        prior: Prior,
+        seen: Bool[np.ndarray, "points"],
+    ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None:
+        """Search and descend, coarse to fine; return the pose and the information behind it.
+
+        ``seen`` are the visible points at the prior's pose.
+        """
+        pose = prior.T_cam_obj
+        information = prior.information
+        plane = self._plane_terms(surface, seen)
+        for stage in STAGES:
+            if stage.anew:
+                seen = visible(surface, pose)
+                plane = self._plane_terms(surface, seen)
+            if stage.search:
+                shift = best_shift(
+                    view, transform(pose, surface.points[seen]), prior,
+                    pose[:3, 3] - prior.T_cam_obj[:3, 3], stage.search * diameter,
+                    stage.tolerance * view.noise,
+                )  # fmt: skip
+                if shift is None:
+                    return None
+                pose = make_transform(pose[:3, :3], pose[:3, 3] + shift)
+            reach = max(stage.reach * diameter, GATE * view.noise)
+            for _ in range(stage.steps):
+                overlay = lay_over(view, surface, seen, pose)
+                if overlay is None:
+                    return None
+                H_plane, g_plane = plane(view, overlay, pose, reach)
+                information = H_plane + prior.information
+                pull = g_plane + prior.information @ prior.offset(pose)
+                if stage.outline:
+                    H_outline, g_outline = outline_terms(
+                        view, overlay, pose[:3, 3], surface.spacing, stage.outline * diameter
+                    )
+                    information, pull = information + H_outline, pull + g_outline
+                pose = _moved(pose, np.linalg.solve(information, pull))
+        return pose, information
+
+    def _plane_terms(
+        self, surface: SurfacePoints, seen: Bool[np.ndarray, "points"]
+    ) -> Callable[[DepthView, Overlay, Float[np.ndarray, "4 4"], float], Terms]:
+        """Return small_gicp's point-to-plane terms against a part's visible points."""
+        gicp = self._gicp
+        target = gicp.PointCloud(surface.points[seen])
+        tree = gicp.KdTree(target)
+        gicp.estimate_normals(target, tree, PLANE_NEIGHBOURS)
+
+        def terms(
+            view: DepthView, overlay: Overlay, pose: Float[np.ndarray, "4 4"], reach: float
+        ) -> Terms:
+            covered = overlay.covered & (np.abs(overlay.offset) <= reach)
+            points = view.points(covered)
+            points = points[:: -(-len(points) // MOST_PIXELS) or 1]
+            if not len(points):
+                return np.zeros((6, 6)), np.zeros(6)
+            # One iteration, so H and b are those at this pose, and the step is left to us.
+            one = gicp.align(
+                target, gicp.PointCloud(points), tree, invert_transform(pose), "PLANE_ICP",
+                max_correspondence_distance=reach, max_iterations=1,
+            )  # fmt: skip
+            # It turns and shifts the depth about the camera; a move of the part is the opposite.
+            to_camera = -np.eye(6)
+            to_camera[3:, :3] = -np.cross(np.eye(3), pose[:3, 3])
+            deviation = view.noise**2 + (surface.spacing / 4) ** 2
+            weight = min(1.0, INDEPENDENT / max(1, one.num_inliers)) / deviation
+            H = to_camera.T @ one.H @ to_camera * weight
+            return H, -weight * to_camera.T @ np.ravel(one.b)
+
+        return terms
+
+
+def _moved(
+    pose: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "4 4"]:
+    """Turn a pose about the object's origin and shift it, both in camera axes."""
+    return make_transform(
+        rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
+    )
+
+
+def _small_gicp() -> ModuleType:
+    """Import small_gicp when it is asked for."""
+    try:
+        return import_module("small_gicp")
+    except ImportError as error:
+        raise UserError(
+            "refine=depth without the package small_gicp",
+            "an installation with the extra: pip install 'dopepp[depth]'",
+            "install it, or leave refine out",
+        ) from error

@@ -1,0 +1,1 @@
+"""The checkpoint: one self-describing file, written whole, read without trust."""

@@ -1,0 +1,229 @@
+"""The gate before every object that a config or a checkpoint may name: an explicit allow-list.
+
+A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
+is compared with the allow-list before anything is imported, and what it resolves to is checked
+again, so neither a path through another module (``dopepp.models.spec.os.system``) nor a re-bound
+name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
+
+To allow a class of your own: import its module and call ``GATE.register("package.module.Class")``.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from types import ModuleType
+from typing import Any, Generic, TypeVar
+
+from dopepp.core.errors import UserError
+
+T = TypeVar("T")
+TARGET = "_target_"
+
+
+class Registry(Generic[T]):
+    """Builds objects of one kind, and nothing else, from plain nodes.
+
+    Args:
+        kind: What the gate builds, for messages: ``"backbone"``, ``"optimizer"``.
+        base: The class that every target must inherit from.
+        targets: Dotted names of the allowed classes.
+    """
+
+    def __init__(self, kind: str, base: type[T], targets: Iterable[str] = ()) -> None:
+        self.kind, self.base = kind, base
+        self._targets = set(targets)
+
+    @classmethod
+    def of_module(cls, kind: str, base: type[T], module: ModuleType) -> Registry[T]:
+        """Allow the public classes that ``module`` itself defines below ``base``."""
+        return cls(
+            kind,
+            base,
+            (
+                f"{module.__name__}.{name}"
+                for name, value in vars(module).items()
+                if inspect.isclass(value)
+                and issubclass(value, base)
+                and value is not base
+                and value.__module__ == module.__name__
+                and not name.startswith("_")
+            ),
+        )
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The allowed dotted names, sorted."""
+        return tuple(sorted(self._targets))
+
+    def register(self, dotted: str) -> None:
+        """Allow one more class; it is checked now, so a wrong name fails where it was written.
+
+        Raises:
+            UserError: The name does not lead to a class of this gate's kind.
+        """
+        self._load(dotted)
+        self._targets.add(dotted)
+
+    def resolve(self, dotted: object) -> type[T]:
+        """Return the class that an allowed name stands for.
+
+        Raises:
+            UserError: The name is not text or not in the allow-list, or it leads to something other
+                than the class that the allow-list names.
+        """
+        if not isinstance(dotted, str) or dotted not in self._targets:
+            raise UserError(
+                f"{self.kind} {TARGET} {dotted!r:.200}",
+                ", ".join(self.targets) or "nothing",
+                f"choose one of them, or register your own {self.kind} in code",
+            )
+        return self._load(dotted)
+
+    def build(self, node: object, **provided: Any) -> T:
+        """Build a node's object.
+
+        Args:
+            node: ``{"_target_": dotted name, argument: plain value, …}``.
+            **provided: Arguments that the caller sets; the node may not repeat them.
+
+        Raises:
+            UserError: The target is refused, an argument is unknown, missing, nested or provided
+                twice, or the class refuses a value.
+        """
+        if not isinstance(node, Mapping):
+            raise UserError(
+                f"{self.kind} {node!r:.200}",
+                f"a mapping with {TARGET} and arguments",
+                f"name one of {', '.join(self.targets)} under {TARGET}",
+            )
+        target = self.resolve(node.get(TARGET))
+        arguments = {key: value for key, value in node.items() if key != TARGET}
+        self._check_arguments(node[TARGET], target, arguments, provided)
+        try:
+            return target(**arguments, **provided)
+        except UserError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise UserError(
+                f"{node[TARGET]} with {arguments!r:.300}, which it refuses: {error}",
+                f"{node[TARGET]}{inspect.signature(target)}",
+                f"correct the arguments of this {self.kind}",
+            ) from error
+
+    def _load(self, dotted: str) -> type[T]:
+        module_name, _, name = dotted.rpartition(".")
+        try:
+            value = getattr(import_module(module_name), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise UserError(
+                f"{self.kind} {dotted}, which cannot be imported: {error}",
+                f"the dotted name of an importable {self.base.__name__}",
+                "install or import the module that defines it, or correct the name",
+            ) from error
+        # A package may re-export a class from a module below itself; from anywhere else, or under
+        # another name, it is not the class that was allowed.
+        genuine = (
+            inspect.isclass(value)
+            and value.__qualname__ == name
+            and f"{value.__module__}.".startswith(f"{module_name}.")
+        )
+        if not genuine or not issubclass(value, self.base):
+            raise UserError(
+                f"{self.kind} {dotted}, which is {value!r:.200}",
+                f"a class below {self.base.__name__} that {module_name} itself defines",
+                "register the class under the module that defines it",
+            )
+        return value  # type: ignore[no-any-return]
+
+    def _check_arguments(
+        self,
+        dotted: str,
+        target: type[T],
+        arguments: Mapping[Any, object],
+        provided: Mapping[str, object],
+    ) -> None:
+        parameters = inspect.signature(target).parameters
+        named = {
+            name: parameter
+            for name, parameter in parameters.items()
+            if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        }
+        # Lightning's loggers hand further keywords on, so theirs cannot be listed.
+        open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        free = [name for name in named if name not in provided]
+        allowed = ", ".join(free) + (", …" if open_ended else "") or "no arguments"
+        for key, value in arguments.items():
+            unknown = key not in free and (not open_ended or key in provided)
+            if not isinstance(key, str) or key.startswith("_") or unknown:
+                raise UserError(
+                    f"argument {key!r:.100} of {dotted}", allowed, "remove or rename it"
+                )
+            _check_plain(value, f"{dotted}, argument {key}")
+        missing = [
+            name for name in free if name not in arguments and named[name].default is inspect._empty
+        ]
+        if missing:
+            raise UserError(
+                f"{dotted} without {', '.join(missing)}", allowed, f"give {', '.join(missing)}"
+            )
+
+
+def _check_plain(value: object, where: str) -> None:
+    """Refuse everything but plain data: an argument is never itself something to build."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not isinstance(key, str) or key.startswith("_"):
+                raise UserError(
+                    f"key {key!r:.100} in {where}", "plain values", "nested targets are not built"
+                )
+            _check_plain(item, where)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _check_plain(item, where)
+    elif value is not None and not isinstance(value, (bool, int, float, str)):
+        raise UserError(
+            f"a {type(value).__name__} in {where}",
+            "null, true/false, numbers, text, and lists and mappings of them",
+            "write a plain value",
+        )
+
+
+def check_number(name: str, value: object, lowest: float, highest: float) -> float:
+    """Return a finite real number of a closed range.
+
+    Raises:
+        UserError: It is not a number of that range.
+    """
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or not lowest <= value <= highest:  # type: ignore[arg-type, operator]
+        raise UserError(
+            f"{name}={value!r:.100}", f"a number from {lowest:g} to {highest:g}", f"change {name}"
+        )
+    return float(value)  # type: ignore[arg-type]
+
+
+def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
+    """Return an integer of a closed range.
+
+    Raises:
+        UserError: It is not an integer of that range.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
+        raise UserError(
+            f"{name}={value!r:.100}", f"an integer from {lowest} to {highest}", f"change {name}"
+        )
+    return value
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Return a truth value.
+
+    Raises:
+        UserError: It is neither true nor false.
+    """
+    if not isinstance(value, bool):
+        raise UserError(f"{name}={value!r:.100}", "true or false", f"change {name}")
+    return value

@@ -1,0 +1,1 @@
+"""Mesh files and what is measured on triangles."""

@@ -1,0 +1,196 @@
+"""Mesh files and YCB-Video models, in metres, checked before they are used.
+
+To add a format, write a reader that returns a `RawMesh` and raises for a
+damaged file, and one line in :data:`READERS`.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dopepp.core.errors import UserError
+from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
+from dopepp.parts.mesh.measure import RawMesh, face_areas
+from dopepp.parts.mesh.obj import read_obj
+from dopepp.parts.mesh.ply import read_ply
+from dopepp.parts.mesh.polygons import read_off
+from dopepp.parts.mesh.topology import find_topology, opposed_faces, turn_over
+from dopepp.parts.part import UNITS, Mesh, Part, make_part
+
+logger = logging.getLogger(__name__)
+
+ASSUMED_UNIT: Final = "mm"
+"""What CAD programs write into files that cannot state a unit."""
+
+MAX_BYTES: Final = 250_000_000
+"""Five million triangles: far beyond any use here, and a bound on memory."""
+
+MAX_POINTS_BYTES: Final = 20_000_000
+"""Of a ``points.xyz``: half a million points."""
+
+READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
+    ".stl": read_stl,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".glb": read_glb,
+    ".3mf": read_3mf,
+    ".off": read_off,
+}
+"""The reader of each suffix."""
+
+
+def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
+    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file.
+
+    Args:
+        path: The file; its suffix tells the format.
+        unit: The file's unit: mm, cm, m or inch. None takes the one that a 3MF file states, metres
+            for GLB, and millimetres for all others, which the log says.
+
+    Returns:
+        The mesh in metres: duplicate STL vertices merged, flat triangles dropped, triangles turned
+        to face as their neighbours do, uv and texture where an OBJ or PLY names a texture in its
+        own folder or a GLB has one. It may have open edges and triangles that intersect each other.
+
+    Raises:
+        UserError: The file is missing, too large, of another format or damaged; the unit is
+            unknown; there is no face with an area; a coordinate is not finite; a texture is
+            missing, damaged or outside of the mesh's folder.
+    """
+    return read_in_unit(path, unit)[0]
+
+
+def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
+    """Read a file as :func:`read_mesh` does; return the unit that it was read in, too."""
+    path = Path(path)
+    if unit is not None and unit not in UNITS:
+        raise UserError(f"unit={unit!r} for {path}", ", ".join(UNITS), "state the file's unit")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        suffixes = ", ".join(READERS)
+        raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
+    if not _is_file(path):
+        raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
+    if path.stat().st_size > MAX_BYTES:
+        raise _damaged(
+            path,
+            f"{path.stat().st_size / 1e6:.0f} MB",
+            "reduce its triangles, or write it as a binary file",
+        )
+    try:
+        raw = reader(path)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise _damaged(path, str(error)) from error
+    except Exception as error:  # whatever a parser makes of a damaged file
+        raise _damaged(path, f"{type(error).__name__}: {error}") from error
+    taken = unit or raw.unit or ASSUMED_UNIT
+    mesh = _checked(path, raw._replace(vertices=UNITS[taken] * raw.vertices))
+    if unit is None and raw.unit is None:
+        logger.warning("%s states no unit: taken as %s (unit=… changes it)", path, ASSUMED_UNIT)
+    elif raw.unit not in (None, taken):
+        logger.warning("%s is in %s by its format: taken as %s, as asked", path, raw.unit, taken)
+    return mesh, taken
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long, for one
+        return False
+
+
+def ycb_part(root: str | Path, name: str) -> Part:
+    """Make a part from a YCB-Video folder: ``models/NAME/points.xyz`` and ``textured.obj``.
+
+    The ADD points are all of ``points.xyz``. Without a ``textured.obj`` the part has no mesh, and
+    its points give cuboid and diameter. Both files are in metres.
+
+    Raises:
+        UserError: The folder has no models, no model of that name, or one of its files is damaged.
+    """
+    models = Path(root) / "models"
+    names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
+    if not names:
+        raise UserError(
+            f"{root}, which has no models/NAME/points.xyz",
+            "the root folder of YCB-Video",
+            "check data.root, or unpack YCB_Video_Models into its models folder",
+        )
+    if name not in names:
+        raise UserError(f"unknown object {name!r}", ", ".join(names), f"choose one of {models}")
+    points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
+    mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
+    return make_part(name, mesh, _read_points(points_path), unit="m")
+
+
+def _read_points(path: Path) -> Float[np.ndarray, "points 3"]:
+    allowed = "lines of three finite numbers"
+    try:
+        if path.stat().st_size > MAX_POINTS_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes, over {MAX_POINTS_BYTES}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns of an empty file
+            points = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError, UserWarning) as error:
+        raise UserError(f"{path}: {error}", allowed, "replace the file") from error
+    if points.shape[1] != 3 or not np.isfinite(points).all():
+        raise UserError(f"{path} of shape {points.shape}", allowed, "replace the file")
+    return np.asarray(points, np.float64)
+
+
+def _checked(path: Path, raw: RawMesh) -> Mesh:
+    """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
+    vertices, faces, uv, texture, _ = raw
+    if not len(vertices) or not len(faces):
+        raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
+    for values in (vertices, uv):
+        if values is not None and not np.isfinite(values).all():
+            bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+            raise _damaged(path, f"a coordinate that is not a finite number, vertex {bad + 1}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise _damaged(path, f"a face index outside of its {len(vertices)} vertices")
+    # A millionth of the mesh wide and long: such a triangle has no meaningful normal.
+    smallest = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
+    proper = face_areas(vertices, faces) > smallest
+    if not proper.any():
+        raise _damaged(path, f"{len(faces)} faces, none with an area")
+    if not proper.all():
+        logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
+    used, index = np.unique(faces[proper], return_inverse=True)
+    vertices = vertices[used]
+    return Mesh(
+        vertices=vertices,
+        faces=_outward(path, vertices, index.reshape(-1, 3)).astype(np.int32),
+        uv=None if uv is None else np.asarray(uv, np.float64)[used],
+        texture=texture,
+    )
+
+
+def _outward(
+    path: Path, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Int[np.ndarray, "faces 3"]:
+    """Make neighbouring triangles face the same way, and say what is unusual about their edges."""
+    topology = find_topology(vertices, faces)
+    if not topology.is_closed:
+        logger.info(
+            "%s is not watertight, taken as it is: %d open edges, %d edges of over two triangles",
+            path, topology.num_open, topology.num_crowded,
+        )  # fmt: skip
+    turned = opposed_faces(vertices, faces, topology)
+    if turned.any():
+        logger.info("%s: turned over %d triangles that faced the wrong way", path, turned.sum())
+    return turn_over(faces, turned)
+
+
+def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
+    allowed = f"a whole mesh with triangles and finite coordinates, under {MAX_BYTES / 1e6:.0f} MB"
+    return UserError(f"mesh {path} with {got}", allowed, fix)

@@ -1,0 +1,204 @@
+"""A contact sheet of validation images with predicted (yellow) and true (green) wireframes.
+
+Pictures to whichever logger can take them, and to files that a run can do without.
+
+The validation's accuracy-threshold curves (paper Fig. 4), as a picture and as numbers.
+
+A contact sheet of the first validation images, drawn anew in every validation.
+
+To draw another one, a subclass with a ``name`` and :meth:`ValidationSheet.tiles`, and an entry in
+``conf/callbacks``.
+
+A contact sheet of validation images under the belief maps that the network gives.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from dopepp.core.files import figure_image, write_png
+from dopepp.data.batch import Batch
+from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
+from dopepp.training.callbacks.pose_metrics import PoseMetricsCallback
+from dopepp.training.loggers import GuardedLogger
+from dopepp.training.system import PoseSystem, ValidationOutput
+
+_log = logging.getLogger(__name__)
+
+
+def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
+    for logger in trainer.loggers:
+        if isinstance(logger, GuardedLogger):
+            logger.log_picture(name, image, trainer.global_step)
+
+
+@contextmanager
+def best_effort(what: str) -> Iterator[None]:
+    """Report it in a line where a file cannot be written, and go on."""
+    try:
+        yield
+    except OSError as error:
+        _log.warning("cannot write %s: %s", what, error.strerror or error)
+
+
+class AUCCurves(Callback):
+    """Writes ``val_auc.png`` and ``val_auc.csv`` after every validation and logs the picture.
+
+    Must stand after :class:`PoseMetricsCallback`, whose errors it draws.
+    """
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw one curve per object; every process takes part in gathering the errors."""
+        metrics = next(
+            callback.metrics
+            for callback in trainer.callbacks  # type: ignore[attr-defined]
+            if isinstance(callback, PoseMetricsCallback)
+        )
+        curves = {name: metrics.errors(name) for name in metrics.parts}
+        if trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        title = f"validation, epoch {trainer.current_epoch}"
+        folder = Path(trainer.default_root_dir)
+        with best_effort(f"{folder}/val_auc"):
+            figure = save_accuracy_curves(folder / "val_auc", curves, title=title)
+            log_picture(trainer, "val/auc", figure_image(figure))
+
+
+class ValidationSheet(Callback):
+    """Writes ``val_NAME.png`` after every validation and logs it as ``val/NAME``.
+
+    Args:
+        num_images: Images on the sheet, the first ones of the validation set.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, num_images: int) -> None:
+        self.num_images = num_images
+        self._tiles: list[Tile] = []
+        self._num_drawn = 0
+
+    @abstractmethod
+    def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
+        """Return the pictures of all images of a batch, in order."""
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start a new sheet."""
+        self._tiles, self._num_drawn = [], 0
+
+    def on_validation_batch_end(  # type: ignore[override]
+        self,
+        trainer: Trainer,
+        pl_module: PoseSystem,
+        outputs: ValidationOutput,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Draw the batch's first images until the sheet is full."""
+        num = min(self.num_images - self._num_drawn, len(batch))
+        if num <= 0 or not trainer.is_global_zero or trainer.sanity_checking:
+            return
+        first = ValidationOutput(outputs.loss, outputs.belief[:num], outputs.field[:num])
+        self._tiles += self.tiles(pl_module, first, batch.rows(torch.arange(num)))
+        self._num_drawn += num
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write and log the sheet."""
+        if not self._tiles:
+            return
+        sheet = contact_sheet(self._tiles)
+        path = Path(trainer.default_root_dir) / f"val_{self.name}.png"
+        with best_effort(str(path)):
+            write_png(path, sheet)
+        log_picture(trainer, f"val/{self.name}", sheet)
+
+
+class BeliefMaps(ValidationSheet):
+    """Writes ``val_belief.png`` after every validation and logs it as ``val/belief``.
+
+    Two pictures per image, with their maxima: the strongest belief of any corner, and of the
+    centroid, over all objects.
+
+    Args:
+        num_images: Images on the sheet, the first ones of the validation set.
+    """
+
+    name: ClassVar[str] = "belief"
+
+    def __init__(self, num_images: int = 6) -> None:
+        super().__init__(num_images)
+
+    def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
+        """Return each image twice, under its corners' and under its centroid's beliefs."""
+        images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
+        shape = (len(images), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
+        beliefs = outputs.belief.reshape(shape).amax(dim=1).cpu().numpy()
+        tiles = []
+        for image, belief, key in zip(images, beliefs, batch.keys, strict=True):
+            maps = {"corners": belief[:CENTROID].max(axis=0), "centroid": belief[CENTROID]}
+            for name, one in maps.items():
+                picture = heat_picture(image, one, system.geometry.stride)
+                tiles.append(Tile(picture, f"{key} {name}, max {one.max():.2f}"))
+        return tiles
+
+
+def heat_picture(
+    image: UInt8[np.ndarray, "height width 3"],
+    channel: Float[np.ndarray, "map_height map_width"],
+    stride: int = 8,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Blend one map into the dimmed image, the more opaque the stronger the belief.
+
+    Args:
+        image: RGB, at the network's input scale.
+        channel: A map that covers it; values are clipped to [0, 1].
+        stride: Pixels of the image per cell.
+    """
+    # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
+    large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)
+    share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)
+    heat = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_JET)
+    weight = (0.8 * share)[..., None]
+    # The picture is dimmed, so that a faint belief is not lost in a bright background.
+    blended = (1 - weight) * 0.6 * image + weight * heat[..., ::-1]
+    return np.asarray(np.rint(blended), np.uint8)
+
+
+class Overlays(ValidationSheet):
+    """Writes ``val_overlay.png`` after every validation and logs it as ``val/overlay``.
+
+    Args:
+        num_images: Images on the sheet, the first ones of the validation set.
+    """
+
+    name: ClassVar[str] = "overlay"
+
+    def __init__(self, num_images: int = 12) -> None:
+        super().__init__(num_images)
+
+    def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
+        """Return each image with its wireframes."""
+        images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
+        truths = batch.keypoints.cpu().numpy()
+        tiles = []
+        for row, detections in enumerate(system.recover(outputs, batch)):
+            wireframes = [Wireframe(points, GREEN, "true") for points in truths[row]]
+            wireframes += [Wireframe(one.keypoints, YELLOW, "predicted") for one in detections]
+            tiles.append(Tile(overlay(images[row], wireframes), batch.keys[row]))
+        return tiles

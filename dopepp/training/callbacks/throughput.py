@@ -1,0 +1,239 @@
+"""The progress bar: of the present epoch, with the time left for the whole run.
+
+How fast training runs and what it waits for.
+
+Where a training's time goes: Lightning's profilers, written into the run's folder.
+
+To add one, a subclass of Lightning's ``Profiler`` with :meth:`totals`, and a line in
+:func:`make_profiler`.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.profilers import Profiler, PyTorchProfiler, SimpleProfiler
+from torch.profiler import profile
+
+from dopepp.core.errors import UserError
+from dopepp.data.batch import Batch
+
+_log = logging.getLogger(__name__)
+
+_STARVED: Final = 0.2
+"""A larger share of waiting is worth a hint."""
+
+
+class Throughput(Callback):
+    """Logs images per second and the share of an epoch spent waiting for the loader.
+
+    ``throughput/images_per_s`` counts training time only; ``throughput/loader_wait`` is the share
+    of it between the end of one step and the arrival of the next batch. Both are said in a line
+    per epoch, with what helps where the loader is too slow.
+    """
+
+    def __init__(self) -> None:
+        self._images, self._waited = 0, 0.0
+        self._started = self._step_ended = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what has been counted of this epoch."""
+        elapsed = self._step_ended - self._started
+        return {"images": self._images, "waited_s": self._waited, "elapsed_s": elapsed}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on counting an epoch that was cut off."""
+        self._images, self._waited = state_dict["images"], state_dict["waited_s"]
+        self._started, self._step_ended = -float(state_dict["elapsed_s"]), 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave out the time between a cut-off epoch and its continuation."""
+        pause = time.perf_counter() - self._step_ended
+        self._started, self._step_ended = self._started + pause, self._step_ended + pause
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clocks."""
+        self._images, self._waited = 0, 0.0
+        self._started = self._step_ended = time.perf_counter()
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
+    ) -> None:
+        """Count the time since the last step ended as waiting."""
+        self._waited += time.perf_counter() - self._step_ended
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+    ) -> None:
+        """Count the batch's images, over all processes."""
+        self._images += len(batch) * trainer.world_size
+        self._step_ended = time.perf_counter()
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the epoch's figures."""
+        elapsed = max(self._step_ended - self._started, 1e-9)
+        speed, waiting = self._images / elapsed, self._waited / elapsed
+        pl_module.log("throughput/images_per_s", speed, rank_zero_only=False)
+        pl_module.log("throughput/loader_wait", waiting, rank_zero_only=False)
+        if trainer.is_global_zero:
+            hint = (
+                "; data.cache=memory or disk renders each image once" if waiting > _STARVED else ""
+            )
+            _log.info(
+                "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s",
+                trainer.current_epoch, speed, 100 * waiting, hint,
+            )  # fmt: skip
+
+
+_REFRESH_EVERY = 5
+"""Batches; drawing the bar costs more than a small network's step."""
+
+
+class RunProgress(TQDMProgressBar):
+    """Adds ``left``, the time until the run's last step, to the bar of the epoch.
+
+    Extrapolated from all steps since the run began or was resumed, their validations included.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(refresh_rate=_REFRESH_EVERY)
+        self._start, self._first_step = 0.0, 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        super().on_train_start(trainer, pl_module)
+        self._start, self._first_step = time.monotonic(), trainer.global_step
+
+    def get_metrics(
+        self, trainer: Trainer, pl_module: LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """Return what stands behind the bar."""
+        metrics = super().get_metrics(trainer, pl_module)
+        done = trainer.global_step - self._first_step
+        if done <= 0:
+            return metrics
+        missing = max(0.0, trainer.estimated_stepping_batches - trainer.global_step)
+        seconds = (time.monotonic() - self._start) * missing / done
+        return {"left": str(timedelta(seconds=round(seconds))), **metrics}
+
+
+FOLDER: Final = "profile"
+"""Where in the run folder the full report is, and with ``pytorch`` the traces for a browser."""
+
+_FILE: Final = "report"
+_US: Final = 1e-6
+_SHOWN: Final = 12
+
+Total = tuple[str, int, float]
+"""What took time, how often it was called, and seconds of all calls."""
+
+
+class Hooks(SimpleProfiler):
+    """The hooks of the training loop, over the whole training.
+
+    Args:
+        folder: Where the report is written to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(dirpath=folder, filename=_FILE)
+
+    def totals(self) -> list[Total]:
+        """Return every hook; one that calls another one contains its time."""
+        recorded = self.recorded_durations.items()
+        return [(name, len(seconds), sum(seconds)) for name, seconds in recorded]
+
+
+class Operators(PyTorchProfiler):
+    """Torch's operators in a few steps of training and of validation, without what they call.
+
+    Args:
+        folder: Where the report and a trace of each are written to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)
+        self._folder, self._num_traces = folder, 0
+        self._totals: dict[str, tuple[int, float]] = {}
+
+    def _collect(self, recorded: profile) -> None:
+        """Add a recording; Lightning's own report is of the last one alone, a validation."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
+        self._num_traces += 1
+        averages: Any = recorded.key_averages()
+        for one in averages:
+            if one.is_user_annotation or one.key.startswith("[pl]"):
+                continue  # Lightning's hooks
+            calls, seconds = self._totals.get(one.key, (0, 0.0))
+            spent = _US * (one.self_cpu_time_total + one.self_device_time_total)
+            self._totals[one.key] = (calls + one.count, seconds + spent)
+
+    def totals(self) -> list[Total]:
+        """Return every operator; of a GPU's, launching and running together."""
+        return [(name, *total) for name, total in self._totals.items()]
+
+    def summary(self) -> str:
+        """Return the report."""
+        self._delete_profilers()
+        lines = [
+            f"{seconds:12.6f} s {calls:8d} calls  {name}"
+            for name, calls, seconds in sorted(self.totals(), key=_seconds, reverse=True)
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def make_profiler(kind: object, run_dir: Path) -> Profiler | None:
+    """Build the profiler that ``trainer.profiler`` names.
+
+    Args:
+        kind: ``simple`` (hooks of the training loop), ``pytorch`` (operators, a few steps) or None.
+        run_dir: The run's folder.
+
+    Raises:
+        UserError: It is something else.
+    """
+    if kind is None:
+        return None
+    kinds: dict[str, type[Hooks] | type[Operators]] = {"simple": Hooks, "pytorch": Operators}
+    if not isinstance(kind, str) or kind not in kinds:
+        raise UserError(
+            f"trainer.profiler={kind!r:.100}", f"null, {', '.join(kinds)}", "choose one of them"
+        )
+    return kinds[kind](run_dir / FOLDER)
+
+
+def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
+    """Return what took longest, a row of texts each; empty where nothing was recorded.
+
+    Args:
+        profiler: Of :func:`make_profiler`, after the training; of any other nothing is known.
+        limit: Rows, at most.
+    """
+    if not isinstance(profiler, Hooks | Operators):
+        return []
+    totals = sorted(profiler.totals(), key=_seconds, reverse=True)
+    return [
+        {
+            "what": name,
+            "calls": f"{calls:,}",
+            "s": f"{seconds:.3f}",
+            "ms/call": f"{1000 * seconds / max(1, calls):.2f}",
+        }
+        for name, calls, seconds in totals[:limit]
+    ]
+
+
+def _seconds(total: Total) -> float:
+    return total[2]

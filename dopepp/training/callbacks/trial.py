@@ -1,0 +1,140 @@
+"""A training as one trial of a study: what it reports after each validation, and when it stops.
+
+The study is a database that all its trials write to, in this process or on another machine; its
+objective is the value that the best checkpoint is chosen by.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from dopepp.core.errors import UserError
+from dopepp.models.registry import check_integer
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.storages import BaseStorage
+
+_WAIT_S: Final = 60
+"""How long a trial waits for others to finish writing to an SQLite file."""
+
+MOST: Final = 10**6
+"""Above any number of trials or epochs that means something."""
+
+
+class PrunedError(Exception):
+    """A trial was stopped because it was worse than the others; no failure."""
+
+
+class TrialReport(Callback):
+    """Reports the objective after each validation and stops a trial that is not worth finishing.
+
+    Optuna's median rule: it is stopped when its best value so far is worse than the median of the
+    other trials' values at the same epoch.
+
+    Args:
+        storage: The study's SQLite file, or a database URL.
+        study: The study's name.
+        number: The trial's number in it.
+        monitor: Logged value that is the objective.
+        prune: Whether to stop bad trials at all.
+        after_trials: Finished trials there must be before any is stopped.
+        after_epochs: Epochs that every trial may train.
+
+    Attributes:
+        pruned: Why training was stopped; empty where it was not.
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    def __init__(
+        self,
+        storage: str,
+        study: str,
+        number: int,
+        monitor: str,
+        prune: bool,
+        after_trials: int,
+        after_epochs: int,
+    ) -> None:
+        self.monitor, self.number, self.prune, self.pruned = monitor, number, prune, ""
+        self._place, self._name = storage, study
+        self._after_trials = check_integer("search.prune_after_trials", after_trials, 1, MOST)
+        self._after_epochs = check_integer("search.prune_after_epochs", after_epochs, 0, MOST)
+        self._study: Study | None = None
+        self._trial_id = -1
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Find the trial in its study."""
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        pruner = optuna.pruners.MedianPruner(self._after_trials, self._after_epochs)
+        self._storage = open_storage(self._place)
+        self._study = optuna.load_study(study_name=self._name, storage=self._storage, pruner=pruner)
+        study_id = self._storage.get_study_id_from_name(self._name)
+        self._trial_id = self._storage.get_trial_id_from_study_id_trial_number(
+            study_id, self.number
+        )
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Report this epoch's value; one that goes on after an interruption repeats itself."""
+        value = trainer.callback_metrics.get(self.monitor)
+        if value is None or not math.isfinite(value):
+            return
+        epoch = trainer.current_epoch
+        self._storage.set_trial_intermediate_value(self._trial_id, epoch, float(value))
+        last = trainer.max_epochs is not None and epoch + 1 >= trainer.max_epochs
+        if self.prune and not last and self._is_bad():
+            self.pruned = (
+                f"after epoch {epoch}, whose {self.monitor} of {float(value):.4g} is worse "
+                "than the other trials' median"
+            )
+            trainer.should_stop = True
+
+    def _is_bad(self) -> bool:
+        assert self._study is not None
+        trial = self._storage.get_trial(self._trial_id)
+        return bool(self._study.pruner.prune(self._study, trial))
+
+
+def raise_if_pruned(trainer: Trainer) -> None:
+    """Tell a training that was stopped early from one that ended.
+
+    Raises:
+        PrunedError: It was stopped; the message says why.
+    """
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, TrialReport) and callback.pruned:
+            raise PrunedError(callback.pruned)
+
+
+def open_storage(place: str) -> BaseStorage:
+    """Open the database of a study, which is created where there is none.
+
+    Raises:
+        UserError: It cannot be opened.
+    """
+    from optuna.exceptions import StorageInternalError
+    from optuna.storages import RDBStorage
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        if "://" in place:
+            return RDBStorage(place)
+        path = Path(place)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Absolute, because a job may run in another folder.
+        url = f"sqlite:///{path.absolute()}"
+        return RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _WAIT_S}})
+    except (OSError, ImportError, RuntimeError, SQLAlchemyError, StorageInternalError) as error:
+        raise UserError(
+            f"search.storage={place}, which cannot be opened: {error}",
+            "a file of an Optuna study or a place for one, or a database URL",
+            "choose another search.storage",
+        ) from error

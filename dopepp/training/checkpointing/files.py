@@ -1,0 +1,284 @@
+"""Checkpoints that are whole or absent, and what becomes of one that could not be written.
+
+The checkpoints of a run's folder: which there are, which is the newest that is whole.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shutil
+import time
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from torch import Tensor
+
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned
+from dopepp.models.checkpoint.schema import Checkpoint, read
+from dopepp.models.checkpoint.storage import write_atomic
+
+_log = logging.getLogger(__name__)
+
+FOLDER: Final = "checkpoints"
+LAST: Final = "last.ckpt"
+PREVIOUS: Final = "previous.ckpt"
+BEST: Final = "best.ckpt"
+
+_NEEDED: Final = frozenset({"global_step", "loops", "optimizer_states", "callbacks"})
+_NUM_FILES: Final = 4
+"""Last, previous, best, and one that is being written."""
+_WEIGHTS_PER_FILE: Final = 3
+"""The weights and an optimiser's two moments."""
+
+
+def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
+    """Return the newest whole checkpoint of a run; None if it has not saved any yet.
+
+    Every damaged file is reported in a line.
+
+    Raises:
+        UserError: There are checkpoints, and none is whole.
+    """
+    damaged = []
+    for name in (LAST, PREVIOUS, BEST):
+        path = run_dir / FOLDER / name
+        if not path.exists():
+            continue
+        try:
+            checkpoint, step = _read_whole(path)
+        except UserError as error:
+            damaged.append(path)
+            _log.warning("left out: %s", error.got)
+            continue
+        if damaged:
+            _log.warning("going on from %s, step %d", path.name, step)
+        return path, checkpoint
+    if damaged:
+        raise UserError(
+            f"{run_dir}, whose checkpoints are all damaged ({', '.join(p.name for p in damaged)})",
+            f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}",
+            "restore one of them from a backup, or start anew without resume",
+        )
+    return None
+
+
+def saved_step(path: Path) -> int | None:
+    """Return after how many steps a checkpoint was taken; None if it cannot be told."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        return int(content["global_step"])
+    except Exception:  # a damaged file raises whatever its bytes lead to
+        return None
+
+
+def check_room(run_dir: Path, weight_bytes: int) -> None:
+    """Check that a run can write its checkpoints, as far as that can be known in advance.
+
+    Args:
+        run_dir: The run's folder.
+        weight_bytes: Size of the network's weights.
+
+    Raises:
+        UserError: The folder cannot be written, or its disk has too little space.
+    """
+    folder = run_dir / FOLDER
+    probe = folder / ".probe"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"\0")
+        probe.unlink()
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise UserError(
+            f"{folder}, which cannot be written: {error.strerror or error}",
+            "a folder that can be written, for checkpoints",
+            "set output_dir=…, or make it writable",
+        ) from error
+    there = sum(path.stat().st_size for path in folder.glob("*.ckpt"))
+    needed = _NUM_FILES * _WEIGHTS_PER_FILE * weight_bytes
+    if free + there < needed:
+        raise UserError(
+            f"{free / 1e6:,.1f} MB free in {folder}",
+            f"at least {(needed - there) / 1e6:,.1f} MB, for {_NUM_FILES} checkpoints",
+            "free some space, or set output_dir=…",
+        )
+
+
+def sweep(run_dir: Path) -> None:
+    """Remove the half-written files of processes that are gone."""
+    for folder in (run_dir, run_dir / FOLDER):
+        for path in folder.glob(f".*{PARTIAL_SUFFIX}"):
+            if is_abandoned(path, time.time()):
+                path.unlink(missing_ok=True)
+
+
+def _read_whole(path: Path) -> tuple[Checkpoint, int]:
+    """Read a checkpoint after comparing its checksums, which torch does not do.
+
+    Raises:
+        UserError: It is damaged, or holds no training to go on with.
+    """
+    checkpoint = read(path)
+    with zipfile.ZipFile(path) as archive:
+        try:
+            bad = archive.testzip()
+        except (zipfile.BadZipFile, OSError, ValueError) as error:
+            bad = str(error)
+    content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    missing = sorted(_NEEDED - content.keys())
+    if bad is not None or missing:
+        raise UserError(
+            f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}",
+            "a checkpoint as training wrote it",
+            "take another one",
+        )
+    return checkpoint, int(content["global_step"])
+
+
+_ADVICE: Final = {
+    errno.ENOSPC: "free some space there",
+    errno.EDQUOT: "free some of your share of it",
+    errno.EROFS: "make it writable",
+    errno.EACCES: "make it writable",
+}
+
+
+_PATHS: Final = ("best_model_path", "kth_best_model_path", "last_model_path")
+
+
+class SavingFailedError(RunError):
+    """What a run must leave could not be written, said in one line."""
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's checkpoint files, saved atomically and loaded without running code.
+
+    A checkpoint that cannot be written (disk full, server away) is kept in memory and written
+    before the next one, so files on disk never refer to one that is not there; a newer version of
+    the same file takes its place. Training goes on meanwhile; :meth:`finish` fails if something is
+    still not written.
+
+    Args:
+        prepare: Called before each writing; if it raises ``OSError``, nothing is written.
+        folder: The run's folder, outside of which nothing is removed; None for no limit.
+    """
+
+    def __init__(
+        self, prepare: Callable[[], None] | None = None, folder: Path | None = None
+    ) -> None:
+        super().__init__()
+        self._prepare, self._folder = prepare, folder
+        self._waiting: dict[Path, tuple[dict[str, Any], Path | None]] = {}
+
+    @property
+    def waiting(self) -> list[Path]:
+        """The files that could not be written so far, oldest first."""
+        return list(self._waiting)
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Write the file so that a crash leaves either the old or the new one.
+
+        Args:
+            checkpoint: What to write.
+            path: The file.
+            storage_options: None, or ``{"previous": PATH}`` to keep the old file there.
+        """
+        target = Path(os.fspath(path))
+        self._waiting.pop(target, None)
+        self._waiting[target] = (checkpoint, (storage_options or {}).get("previous"))
+        error = self._write_waiting()
+        if error is not None:
+            _log.warning("%s; trying again at the next saving", _failure(self.waiting[0], error))
+
+    def finish(self) -> None:
+        """Write what is still waiting.
+
+        Raises:
+            SavingFailedError: It still cannot be written.
+        """
+        error = self._write_waiting()
+        if error is not None:
+            raise SavingFailedError(_failure(self.waiting[0], error)) from error
+
+    def _write_waiting(self) -> OSError | None:
+        """Write in order; stop at the first file that cannot be written and keep the rest."""
+        for path, (checkpoint, previous) in list(self._waiting.items()):
+            try:
+                if self._prepare is not None:
+                    self._prepare()
+                write_atomic(checkpoint, path, previous)
+            except OSError as error:
+                # Training goes on to change the tensors that the newest one refers to.
+                self._waiting = {
+                    name: (_copy(one), old) for name, (one, old) in self._waiting.items()
+                }
+                return error
+            del self._waiting[path]
+        return None
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a file of the run.
+
+        Which one is named by the state of a callback, so by a checkpoint: it may be anybody's.
+        """
+        target = Path(os.fspath(path))
+        folder = target.parent.resolve()
+        if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
+            _log.warning("%s is not of this run and stays", target)
+            return
+        if target.is_file():
+            target.unlink()
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Load a file as plain data; a pickled object in it is refused, whoever asks.
+
+        A run's folder may have been moved since: what its callbacks call their files is looked for
+        beside the file itself.
+        """
+        loaded: Mapping[str, Any] = super().load_checkpoint(
+            path, map_location=map_location, weights_only=True
+        )
+        if self._folder is None:
+            return dict(loaded)
+        folder = self._folder / FOLDER
+        callbacks = {
+            name: _moved(state, folder) if isinstance(state, dict) and "dirpath" in state else state
+            for name, state in loaded.get("callbacks", {}).items()
+        }
+        return {**loaded, "callbacks": callbacks}
+
+
+def _copy(value: Any) -> Any:
+    """Return a checkpoint whose tensors are its own, on the CPU."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, Mapping):
+        return {key: _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+def _moved(state: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a ``ModelCheckpoint``'s state with all of its files in a folder."""
+
+    def place(path: str) -> str:
+        return str(folder / Path(path).name) if path else path
+
+    moved = {key: place(state[key]) for key in _PATHS if key in state}
+    best = {place(path): score for path, score in state.get("best_k_models", {}).items()}
+    return {**state, **moved, "dirpath": str(folder), "best_k_models": best}
+
+
+def _failure(path: Path, error: OSError) -> str:
+    advice = _ADVICE.get(error.errno or 0, "see to it")
+    return f"cannot save {path.name} in {path.parent}: {error.strerror or error}; {advice}"

@@ -1,0 +1,296 @@
+"""The checkpoint a run goes on from: saved by the clock, at moments that leave no trace.
+
+A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
+metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
+``docs/reliability.md``.
+
+Ctrl-C and SIGTERM while training: remembered, and answered between two steps.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
+
+from dopepp.core.interrupts import Interruption
+from dopepp.data.batch import Batch
+from dopepp.data.loader import PoseLoader
+from dopepp.training.checkpointing import resume_point
+from dopepp.training.checkpointing import resume_point as random_state
+from dopepp.training.checkpointing.files import (
+    FOLDER,
+    LAST,
+    PREVIOUS,
+    AtomicCheckpointIO,
+    saved_step,
+    sweep,
+)
+
+
+class StopRequest:
+    """Takes the signals that ask a run to stop, so that it can save before it does.
+
+    The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
+    that is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
+    the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
+
+    Attributes:
+        number: The signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._process = os.getpid()
+        self._kept: dict[int, Any] = {}
+
+    def listen(self) -> None:
+        """Take the signals over from whoever had them; in the main thread only."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in _numbers():
+            self._kept[number] = signal.signal(number, self._remember)
+
+    def end(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._kept.items():
+            signal.signal(number, handler)
+        self._kept = {}
+
+    def _remember(self, number: int, _: FrameType | None) -> None:
+        if os.getpid() != self._process:  # a loader's worker: its parent decides
+            return
+        if number == signal.SIGINT and self.number is not None:
+            raise Interruption(number)
+        first = self.number is None
+        self.number = signal.SIGINT if number == signal.SIGINT else signal.SIGTERM
+        if first:
+            # Not through a stream or a logger: the signal may have come in the middle of its own.
+            os.write(2, _ANSWERS[self.number])
+
+
+_ANSWERS: Final = {
+    int(signal.SIGINT): b"\nsaving after this step; Ctrl-C again ends at once\n",
+    int(signal.SIGTERM): b"\nasked to stop: saving after this step\n",
+}
+
+
+def _numbers() -> list[int]:
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if "SLURM_JOB_ID" in os.environ:
+        numbers.append(signal.SIGUSR1)
+    return [int(number) for number in numbers]
+
+
+_log = logging.getLogger(__name__)
+
+Cut = Callable[[dict[str, Any]], None]
+"""Sets a loop state's counters to a moment that can be resumed from."""
+
+
+class LastCheckpoint(Checkpoint):
+    """Saves ``checkpoints/last.ckpt`` during an epoch, too, and keeps the one before.
+
+    It saves between two batches or before a validation, when ``every_s`` have passed, when a new
+    best checkpoint was saved, at the end, and when a signal asks the run to stop, which it then
+    does.
+
+    Args:
+        every_s: Seconds between two savings.
+        max_share: Share of the time that saving by the clock may take; where saving is slow, it
+            happens less often.
+
+    Raises:
+        ValueError: An argument is out of its range.
+    """
+
+    def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
+        if every_s < 0:
+            raise ValueError(f"every_s={every_s}, must be at least 0")
+        if not 0 < max_share <= 1:
+            raise ValueError(f"max_share={max_share}, must be in (0, 1]")
+        self.every_s, self.max_share = every_s, max_share
+        self._stop = StopRequest()
+        self._cut: Cut | None = None
+        self._random: dict[str, Any] | None = None
+        self._saved_at = self._duration_s = 0.0
+        self._saved: tuple[int, float | None] = (0, None)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the random generators' states; in a validation, those at its beginning."""
+        return {"random": self._random or random_state.capture()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Keep the states until training starts."""
+        self._random = state_dict["random"]
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Set the counters of every full checkpoint to a moment that can be resumed from."""
+        fit_loop = checkpoint["loops"]["fit_loop"]
+        epochs = fit_loop["epoch_progress"]["total"]
+        if self._cut is not None:
+            self._cut(fit_loop)
+        elif epochs["processed"] == epochs["ready"]:  # the best one, at the end of an epoch
+            resume_point.between_epochs(fit_loop)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take up the random states and the signals; tidy up after the run that was cut off."""
+        if self._random is not None:
+            random_state.restore(self._random)
+            self._random = None
+        _find_place(trainer)
+        if trainer.is_global_zero:
+            sweep(Path(trainer.default_root_dir))
+            _set_aside_damaged(trainer)
+        _forget_later_best(trainer)
+        self._saved, self._saved_at = _state(trainer), time.monotonic()
+        self._stop = StopRequest()
+        self._stop.listen()
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
+    ) -> None:
+        """Save what the batches before this one have made of the weights, if it is time."""
+        # Gradients that are being accumulated are in no checkpoint.
+        if batch_idx % trainer.accumulate_grad_batches == 0:
+            self._save_if_due(trainer, resume_point.before_batch)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remember the random states that a repeated validation has to begin with."""
+        self._random = random_state.capture()
+
+    def on_validation_batch_start(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Save if it is time; the validation is repeated as a whole."""
+        self._save_if_due(trainer, resume_point.before_validation)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Go back to the present states."""
+        self._random = None
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save the result.
+
+        Raises:
+            SavingFailedError: It cannot be written.
+        """
+        self._stop.end()
+        self._save(trainer, resume_point.between_epochs)
+        if trainer.is_global_zero:
+            _files(trainer).finish()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Give the signals back."""
+        self._stop.end()
+
+    def _save_if_due(self, trainer: Trainer, cut: Cut) -> None:
+        """Save by the clock and by request; after a request, end the run.
+
+        Raises:
+            Interruption: A signal asks for it.
+        """
+        stop = self._stop.number
+        wait_s = max(self.every_s, self._duration_s / self.max_share)
+        due = trainer.is_global_zero and (
+            time.monotonic() - self._saved_at >= wait_s or _state(trainer)[1] != self._saved[1]
+        )
+        # Of several processes the first one has the clock, but any may be asked to stop.
+        agree = trainer.strategy.reduce_boolean_decision
+        if not agree(due or stop is not None, all=False):
+            return
+        if _state(trainer) != self._saved:
+            self._save(trainer, cut)
+        if agree(stop is not None, all=False):
+            raise Interruption(stop or signal.SIGTERM)
+
+    def _save(self, trainer: Trainer, cut: Cut) -> None:
+        folder = Path(trainer.default_root_dir) / FOLDER
+        self._cut = cut
+        start = time.monotonic()
+        try:
+            trainer.save_checkpoint(folder / LAST, storage_options={"previous": folder / PREVIOUS})
+        finally:
+            self._cut = None
+        self._saved_at = time.monotonic()
+        self._duration_s = self._saved_at - start
+        self._saved = _state(trainer)
+
+
+def _set_aside_damaged(trainer: Trainer) -> None:
+    """Keep a damaged file from taking the place of the whole one that is resumed from."""
+    last = Path(trainer.default_root_dir) / FOLDER / LAST
+    if trainer.ckpt_path is not None and Path(trainer.ckpt_path).name != LAST and last.exists():
+        last.replace(last.with_name(f"{LAST}.damaged"))
+
+
+def _find_place(trainer: Trainer) -> None:
+    """Go to the place of the epoch that the loop's counters tell."""
+    epoch_loop, epochs = trainer.fit_loop.epoch_loop, trainer.fit_loop.epoch_progress.total
+    batches = epoch_loop.batch_progress
+    num_done = 0 if batches.is_last_batch else batches.current.ready
+    if epochs.ready == epochs.completed or batches.current.ready == 0:
+        epoch_loop.restarting = False  # nothing of this epoch is done yet
+        num_done = 0
+    # Lightning itself forgets to, where the schedule has asked for the number of steps.
+    loader = trainer.train_dataloader
+    if isinstance(loader, PoseLoader):
+        loader.load_state_dict({"num_batches": num_done})
+
+
+def _state(trainer: Trainer) -> tuple[int, float | None]:
+    """Return the step and the best score: what a checkpoint that is worth saving differs in."""
+    best = _best(trainer)
+    score = None if best is None else best.best_model_score
+    return trainer.global_step, None if score is None else float(score)
+
+
+def _best(trainer: Trainer) -> ModelCheckpoint | None:
+    """Return the callback that keeps the best checkpoint."""
+    for callback in trainer.checkpoint_callbacks:
+        if isinstance(callback, ModelCheckpoint) and callback.monitor is not None:
+            return callback
+    return None
+
+
+def _forget_later_best(trainer: Trainer) -> None:
+    """Choose the best checkpoint anew if its file is from after the step that is resumed from.
+
+    Arithmetic that does not repeat exactly would not find that checkpoint again, and the run would
+    end with a best one that none of its metrics are of.
+    """
+    best = _best(trainer)
+    if best is None or not best.best_model_path:
+        return
+    step = saved_step(Path(best.best_model_path))
+    if step is not None and step <= trainer.global_step:
+        return
+    _log.info("%s is newer than step %d: chosen anew", best.best_model_path, trainer.global_step)
+    fresh = ModelCheckpoint(monitor=best.monitor, mode=best.mode)
+    best.best_k_models, best.kth_value = {}, fresh.kth_value
+    best.best_model_path = best.kth_best_model_path = ""
+    best.best_model_score = None
+
+
+def _files(trainer: Trainer) -> AtomicCheckpointIO:
+    files = trainer.strategy.checkpoint_io
+    assert isinstance(files, AtomicCheckpointIO)
+    return files

@@ -1,0 +1,1 @@
+"""From a preset to one scene: which bodies, where, how they lie."""

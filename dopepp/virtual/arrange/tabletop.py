@@ -1,0 +1,306 @@
+"""Objects on a table: each on the plane beside the others, or dropped onto a heap.
+
+Objects on a table, set down from above: a height map knows what lies where.
+
+The table's frame has its origin on the plane and z upwards. Heights are kept on a square grid of
+cells; an object is let down until, in some cell, its underside meets what is already there. That
+is no physics: an object stays as it was turned. Objects never overlap but by what changes within a
+cell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from dopepp.geometry.camera import make_transform
+from dopepp.virtual.arrange.body import Body
+from dopepp.virtual.arrange.composition import Composition
+from dopepp.virtual.presets.table import Table, plane_of
+from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.surface import Surface
+
+_MAX_CELLS: Final = 1024
+"""Cells along a footprint, at most; an object that needs more finds no place."""
+
+_NEAR: Final = 0.25
+"""Below the least depth, 1/2, that a height is turned into."""
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """A turned object as seen from below and above, with a border of one cell around it.
+
+    Attributes:
+        bottom: Height of its underside above its lowest point, metres, the least of a cell and
+            its eight neighbours: what happens between cells' centres is provided for. Infinite
+            where the object is not.
+        top: Height of its upper side above its lowest point, metres; −infinite beside it.
+        corner: x and y of the first cell's centre relative to the object's origin, in cells.
+    """
+
+    bottom: Float32[np.ndarray, "rows columns"]
+    top: Float32[np.ndarray, "rows columns"]
+    corner: tuple[int, int]
+
+    @property
+    def middle(self) -> tuple[int, int]:
+        """Its middle, x and y relative to the object's origin, in cells."""
+        rows, columns = self.top.shape
+        return self.corner[0] + columns // 2, self.corner[1] + rows // 2
+
+
+class HeightMap:
+    """What lies on the table.
+
+    Args:
+        cell: Size of a cell, metres.
+        reach: The map covers x and y from −reach to reach, metres; beyond it nothing can lie.
+    """
+
+    def __init__(self, cell: float, reach: float) -> None:
+        self.cell = cell
+        self._half = max(math.ceil(reach / cell), 1)
+        side = 2 * self._half + 1
+        self._heights = np.zeros((side, side), np.float32)
+
+    def footprint(
+        self, surface: Surface, rotation: Float[np.ndarray, "3 3"], lowest: float
+    ) -> Footprint | None:
+        """See a turned object from below and above.
+
+        Args:
+            surface: The object.
+            rotation: From the object to the table frame.
+            lowest: Height of its lowest point relative to its origin, metres.
+
+        Returns:
+            None where the object covers too many cells.
+        """
+        # In cells; one contiguous row per coordinate.
+        x, y, z = (rotation / self.cell) @ surface.vertices.T
+        x0, y0 = math.ceil(x.min()) - 1, math.ceil(y.min()) - 1
+        x1, y1 = math.floor(x.max()) + 1, math.floor(y.max()) + 1
+        shape = (max(y1 - y0, 2) + 1, max(x1 - x0, 2) + 1)
+        if max(shape) > _MAX_CELLS:
+            return None
+        heights = z - lowest / self.cell
+        span = max(float(heights.max()), 1.0)
+        faces, closed = surface.faces, surface.closed
+        below = _greatest(x, y, 1 - heights / span, faces, closed, (x0, y0), shape)
+        # Seen from above without turning the map over, what is in front winds the other way.
+        mirrored = np.ascontiguousarray(faces[:, ::-1])
+        above = _greatest(x, y, heights / span, mirrored, closed, (x0, y0), shape)
+        if not above.any():
+            # Thinner than a cell: it takes the one in the middle, from its foot to its head.
+            above[shape[0] // 2, shape[1] // 2] = below[shape[0] // 2, shape[1] // 2] = 2
+        inside, unit = above > 0, np.float32(span * self.cell)
+        bottom = np.where(inside, unit * (2 - below), np.float32(np.inf))
+        return Footprint(
+            bottom=np.asarray(cv2.erode(bottom, np.ones((3, 3), np.uint8))),
+            top=np.where(inside, unit * (above - 1), np.float32(-np.inf)),
+            corner=(x0, y0),
+        )
+
+    def height(self, footprint: Footprint, place: tuple[int, int]) -> float | None:
+        """Return how high an object's lowest point would come to lie, metres.
+
+        Args:
+            footprint: The object.
+            place: x and y of its origin, in cells.
+
+        Returns:
+            None beyond the map.
+        """
+        window = self._window(footprint, place)
+        if window is None:
+            return None
+        return max(float((self._heights[window] - footprint.bottom).max()), 0.0)
+
+    def put(self, footprint: Footprint, place: tuple[int, int], height: float) -> None:
+        """Set an object down where :meth:`height` said."""
+        window = self._window(footprint, place)
+        if window is None:
+            raise ValueError(f"place {place} beyond the map")
+        np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
+
+    def is_free(self, footprint: Footprint, place: tuple[int, int]) -> bool:
+        """Tell whether nothing lies where the object would, neither under nor over it."""
+        window = self._window(footprint, place)
+        if window is None:
+            return False
+        return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
+
+    def _window(self, footprint: Footprint, place: tuple[int, int]) -> tuple[slice, slice] | None:
+        rows, columns = footprint.top.shape
+        left = place[0] + footprint.corner[0] + self._half
+        top = place[1] + footprint.corner[1] + self._half
+        side = len(self._heights)
+        if left < 0 or top < 0 or left + columns > side or top + rows > side:
+            return None
+        return slice(top, top + rows), slice(left, left + columns)
+
+
+def _greatest(
+    x: Float[np.ndarray, "vertices"],
+    y: Float[np.ndarray, "vertices"],
+    values: Float[np.ndarray, "vertices"],
+    faces: Int[np.ndarray, "faces 3"],
+    cull: bool,
+    corner: tuple[int, int],
+    shape: tuple[int, int],
+) -> Float32[np.ndarray, "rows columns"]:
+    """Return 1 + the greatest value over every cell's centre, 0 beside the object.
+
+    The rasteriser keeps the greatest 1/z and interpolates it linearly over the image, so a vertex
+    at column x and row y with z = 1/(1 + value) makes it a map of any linear value in [0, 1].
+    """
+    z = 1.0 / (1.0 + values)
+    hom = np.stack([x * z, y * z, z], axis=1)
+    greatest, ids = np.zeros((*shape, 1), np.float32), np.empty((*shape, 1), np.int32)
+    rasterise(hom, faces, cull, _NEAR, corner, CENTRE_SAMPLE, greatest, ids, 0)
+    return np.asarray(greatest[..., 0])
+
+
+_VIEWS: Final = 8
+"""Draws of the camera's place; another one is drawn where no target finds room in the image."""
+
+_ROUNDS: Final = 6
+"""So often an object is turned anew, until it fits."""
+
+_PLACES: Final = 6
+"""Draws of where an object lies, for each turning."""
+
+_COMPARED: Final = 2
+"""Turnings among whose places the lowest is taken on a heap, where things slide down."""
+
+_CELL_SHARE: Final = 0.01
+"""Size of the height map's cells over the largest target's diameter."""
+
+_MAX_HALF_CELLS: Final = 512
+"""The height map has at most so many cells to either side."""
+
+_FARTHEST: Final = 3.0
+"""Nothing is placed farther away than so many camera distances, where it would be tiny."""
+
+
+def arrange_on_table(
+    composition: Composition, table: Table, targets: Sequence[Body]
+) -> Float[np.ndarray, "4 4"]:
+    """Choose a view and place targets and distractors.
+
+    Args:
+        composition: Empty; objects are added to it, no target if none finds a place.
+        table: How they may lie.
+        targets: What to place.
+
+    Returns:
+        T_cam_table, which maps the table's frame (z up, plane z = 0) to the camera's.
+    """
+    rng = composition.rng
+    for _ in range(_VIEWS):
+        composition.clear()
+        setting = _Setting(composition, table, targets)
+        for body in targets:
+            if not setting.place(body) and not composition.objects:
+                break
+        if composition.objects or not targets:
+            break
+    low, high = composition.preset.distractors.number
+    for _ in range(int(rng.integers(low, high + 1))):
+        setting.place(composition.draw_distractor(float(setting.T_cam_table[2, 3])))
+    return setting.T_cam_table
+
+
+@dataclass(frozen=True, eq=False)
+class _Lying:
+    """One way in which a body could lie.
+
+    Attributes:
+        T_table_obj: Its pose in the table's frame.
+        footprint: What it covers.
+        place: x and y of its origin, in the height map's cells.
+        height: Of its lowest point above the plane, metres.
+        centre: Of its centre of mass above the plane, metres.
+    """
+
+    T_table_obj: Float[np.ndarray, "4 4"]
+    footprint: Footprint
+    place: tuple[int, int]
+    height: float
+    centre: float
+
+
+class _Setting:
+    """One view of the table and what lies on it."""
+
+    def __init__(self, composition: Composition, table: Table, targets: Sequence[Body]) -> None:
+        self.composition, self.table, self.rng = composition, table, composition.rng
+        self.T_cam_table = table.draw_view(self.rng)
+        distance = float(self.T_cam_table[2, 3])
+        diameter = max((2 * body.surface.radius for body in targets), default=0.3 * distance)
+        self._radius = diameter * self.rng.uniform(*table.heap_radius)
+        # A heap needs fine cells but little room; on a free table it is the other way round.
+        reach = self._radius + 2 * diameter if table.heaped else 2 * distance
+        self._map = HeightMap(max(_CELL_SHARE * diameter, reach / _MAX_HALF_CELLS), reach)
+        plane = plane_of(self.T_cam_table)
+        # Of the plane, per homogeneous pixel: 1/depth is linear in the image.
+        self._inverse_depth = plane.normal @ np.linalg.inv(composition.K) / plane.offset
+
+    def place(self, body: Body) -> bool:
+        """Lay a body down; tell whether it found a place."""
+        material = self.composition.draw_material(body)
+        for _ in range(_ROUNDS):
+            for lying in self._candidates(body):
+                T_cam_obj = self.T_cam_table @ lying.T_table_obj
+                if self.composition.add(body, T_cam_obj, material):
+                    self._map.put(lying.footprint, lying.place, lying.height)
+                    return True
+        return False
+
+    def _candidates(self, body: Body) -> Iterable[_Lying]:
+        """Draw ways in which a body could lie; on a heap, the lowest first."""
+        if not self.table.heaped:
+            return self._turned(body)
+        several = [lying for _ in range(_COMPARED) for lying in self._turned(body)]
+        return sorted(several, key=lambda lying: lying.centre)
+
+    def _turned(self, body: Body) -> Iterator[_Lying]:
+        """Turn a body at random and yield places for it."""
+        rotation, lowest = self.table.draw_turning(self.rng, body.hull)
+        footprint = self._map.footprint(body.surface, rotation, lowest)
+        if footprint is None:
+            return
+        for _ in range(_PLACES):
+            drawn = self._draw_place()
+            if drawn is None:
+                continue
+            middle, cell = footprint.middle, self._map.cell
+            place = round(drawn[0] / cell) - middle[0], round(drawn[1] / cell) - middle[1]
+            height = self._map.height(footprint, place)
+            if height is None or not (self.table.heaped or self._map.is_free(footprint, place)):
+                continue
+            origin = np.array([place[0] * cell, place[1] * cell, height - lowest])
+            centre = origin[2] + float(rotation[2] @ body.hull.centre)
+            yield _Lying(make_transform(rotation, origin), footprint, place, height, centre)
+
+    def _draw_place(self) -> tuple[float, float] | None:
+        """Draw a point of the table, metres: in the heap's circle, or seen by a random pixel."""
+        rng = self.rng
+        if self.table.heaped:
+            # The root makes the points uniform over the circle's area.
+            radius, angle = self._radius * math.sqrt(rng.random()), rng.uniform(0, 2 * math.pi)
+            return radius * math.cos(angle), radius * math.sin(angle)
+        pixel = np.array([*(rng.uniform(0, 1, 2) * self.composition.size - 0.5), 1.0])
+        inverse_depth = float(self._inverse_depth @ pixel)
+        if inverse_depth < 1 / (_FARTHEST * self.T_cam_table[2, 3]):
+            return None
+        point = np.linalg.solve(self.composition.K, pixel) / inverse_depth
+        x, y, _ = self.T_cam_table[:3, :3].T @ (point - self.T_cam_table[:3, 3])
+        return float(x), float(y)

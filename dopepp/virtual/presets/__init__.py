@@ -1,0 +1,1 @@
+"""Typed descriptions of random scenes; every range is checked."""

@@ -1,0 +1,147 @@
+"""Random light: how many lamps, where, how strong and of which colour.
+
+To add a kind of light, extend :class:`Lighting` by its ranges and :meth:`Lighting.draw`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.checks import check_counts, check_number, check_range
+from dopepp.virtual.scene import Ambient, Light
+
+_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
+"""Luminance of linear sRGB (BT.709)."""
+
+_RGB_FROM_XYZ: Final = np.array(
+    [
+        [3.2404542, -1.5371385, -0.4985314],
+        [-0.9692660, 1.8760108, 0.0415560],
+        [0.0556434, -0.2040259, 1.0572252],
+    ]
+)
+"""CIE XYZ to linear sRGB (IEC 61966-2-1, white D65)."""
+
+_COLDEST_K: Final = 1667.0
+_HOTTEST_K: Final = 25000.0
+"""Where the approximation of the Planckian locus holds."""
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Ranges of light; intensities are what a white surface facing the light reflects, 1 clips.
+
+    Attributes:
+        num_lights: Smallest and largest number of point lights; the first casts shadows.
+        key_intensity: Of the first light.
+        fill_intensity: Of every other light.
+        ambient_intensity: Of the light from everywhere.
+        max_angle_deg: Largest angle between a light's direction and the camera's, as seen from
+            the scene; 0 is a flash light on the camera, 90 a light from the side. Over a plane,
+            the angle is taken from the plane's normal.
+        distance: Of a light from the scene, in units of the camera's distance.
+        temperature_k: Colour temperature of a lamp as a camera balanced for 6500 K sees it,
+            kelvin; low ones are warm.
+        tint: Largest relative deviation of a colour channel from that colour.
+        ground_share: Light from below over the light from above.
+    """
+
+    num_lights: tuple[int, int] = (1, 3)
+    key_intensity: tuple[float, float] = (0.45, 1.3)
+    fill_intensity: tuple[float, float] = (0.1, 0.4)
+    ambient_intensity: tuple[float, float] = (0.08, 0.4)
+    max_angle_deg: float = 75.0
+    distance: tuple[float, float] = (1.0, 5.0)
+    temperature_k: tuple[float, float] = (4000.0, 8500.0)
+    tint: float = 0.06
+    ground_share: tuple[float, float] = (0.3, 0.9)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_counts(self, "num_lights", 0, 8)
+        for name in ("key_intensity", "fill_intensity", "ambient_intensity"):
+            check_range(self, name, 0.0, 10.0, "1 = white")
+        check_number(self, "max_angle_deg", 0.0, 180.0, "degrees")
+        check_range(self, "distance", 0.1, 1000.0, "camera distances")
+        check_range(self, "temperature_k", _COLDEST_K, _HOTTEST_K, "kelvin")
+        check_number(self, "tint", 0.0, 0.9, "share")
+        check_range(self, "ground_share", 0.0, 1.0, "share")
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        centre: Float[np.ndarray, "3"],
+        normal: Float[np.ndarray, "3"] | None = None,
+    ) -> tuple[tuple[Light, ...], Ambient]:
+        """Draw point lights around a point of the scene, and the ambient light.
+
+        Args:
+            rng: Source of randomness.
+            centre: What the lights stand around, camera frame, metres.
+            normal: Of the supporting plane, camera frame; None where there is none.
+        """
+        towards = np.array([0.0, 0.0, -1.0]) if normal is None else normal
+        far = float(np.linalg.norm(centre))
+        lights = []
+        for number in range(int(rng.integers(self.num_lights[0], self.num_lights[1] + 1))):
+            reach = far * rng.uniform(*self.distance)
+            position = centre + reach * _in_cap(rng, towards, self.max_angle_deg)
+            strength = rng.uniform(*(self.fill_intensity if number else self.key_intensity))
+            lights.append(Light(_triple(position), _triple(strength * self._colour(rng)), reach))
+        if normal is None:
+            # Mostly from above and from behind the camera, as in a room.
+            towards = rng.normal(size=3) + np.array([0.0, -1.5, -0.5])
+            towards = towards / np.linalg.norm(towards)
+        above = rng.uniform(*self.ambient_intensity) * self._colour(rng)
+        below = above * rng.uniform(*self.ground_share)
+        return tuple(lights), Ambient(_triple(towards), _triple(above), _triple(below))
+
+    def _colour(self, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+        """Draw the linear RGB of a lamp of luminance about 1."""
+        # Equal steps of 1/T look equally different (mired), so it is what is uniform.
+        warm, cold = self.temperature_k
+        colour = black_body_rgb(1.0 / rng.uniform(1.0 / cold, 1.0 / warm))
+        return np.asarray(colour * (1 + rng.uniform(-self.tint, self.tint, 3)))
+
+
+def black_body_rgb(temperature_k: float) -> Float[np.ndarray, "3"]:
+    """Return the linear sRGB colour of luminance 1 of a black body (white at about 6500 K).
+
+    The chromaticity is the cubic approximation of the Planckian locus by Kim et al., "Design of
+    advanced color temperature control system", US patent 7024034 (2002), for 1667 to 25000 K.
+    Colours outside of sRGB's gamut lose their negative part.
+    """
+    t = 1e3 / temperature_k
+    if temperature_k <= 4000:
+        x = -0.2661239 * t**3 - 0.2343589 * t**2 + 0.8776956 * t + 0.179910
+    else:
+        x = -3.0258469 * t**3 + 2.1070379 * t**2 + 0.2226347 * t + 0.240390
+    if temperature_k <= 2222:
+        y = -1.1063814 * x**3 - 1.34811020 * x**2 + 2.18555832 * x - 0.20219683
+    elif temperature_k <= 4000:
+        y = -0.9549476 * x**3 - 1.37418593 * x**2 + 2.09137015 * x - 0.16748867
+    else:
+        y = 3.0817580 * x**3 - 5.87338670 * x**2 + 3.75112997 * x - 0.37001483
+    colour = np.maximum(_RGB_FROM_XYZ @ np.array([x / y, 1.0, (1 - x - y) / y]), 0.0)
+    return np.asarray(colour / (_LUMINANCE @ colour))
+
+
+def _in_cap(
+    rng: np.random.Generator, axis: Float[np.ndarray, "3"], angle_deg: float
+) -> Float[np.ndarray, "3"]:
+    """Draw a unit vector uniformly over the spherical cap around a unit axis."""
+    cosine = rng.uniform(np.cos(np.radians(angle_deg)), 1.0)
+    azimuth, sine = rng.uniform(0, 2 * np.pi), np.sqrt(1 - cosine**2)
+    helper = np.eye(3)[np.abs(axis).argmin()]
+    across = np.cross(axis, helper)
+    across /= np.linalg.norm(across)
+    around = np.cos(azimuth) * across + np.sin(azimuth) * np.cross(axis, across)
+    return np.asarray(cosine * axis + sine * around)
+
+
+def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

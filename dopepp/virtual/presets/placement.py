@@ -1,0 +1,282 @@
+"""How targets are turned and where they stand: the typed choices a preset makes.
+
+To add one, write a frozen dataclass with a ``draw`` method, a placement on :class:`Placement`, and
+name it in a preset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.checks import check_number
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import project
+from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
+
+_CENTRING_STEPS: Final = 10
+_CENTRED_PX: Final = 0.05
+"""Perspective moves a tilted part's box off its centre's image; a few steps bring it back."""
+
+_FARTHEST: Final = 1000.0
+"""Metres; nothing that a camera is to see is farther away."""
+
+_MAX_STEPS: Final = 80
+_SHARE_TOLERANCE: Final = 1e-4
+"""A filled share is found to a hundredth of a percent, far below a pixel."""
+
+FACING: Final = np.diag([1.0, -1.0, -1.0])
+"""Rotation that turns an object's +z face towards the camera, +x staying on the right."""
+
+
+class Turning(Protocol):
+    """Draws a target's orientation."""
+
+    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+        """Return a rotation from the object to the camera frame."""
+
+
+class Placement(Protocol):
+    """Draws a target's position."""
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        rotated_hull: Float[np.ndarray, "hull 3"],
+    ) -> Float[np.ndarray, "3"]:
+        """Return the object's origin in the camera frame, metres.
+
+        Args:
+            rng: Source of randomness.
+            K: Camera matrix, pixels.
+            size: Image (width, height), pixels.
+            rotated_hull: The object's extreme vertices, already turned into camera axes, metres.
+        """
+
+    def redraw(
+        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """Return what to try after a place at which the object is not well in the frame.
+
+        What a placement keeps of such a place has the distribution it was drawn from, however often
+        the camera does not see the object there.
+
+        Args:
+            rng: Source of randomness.
+            place: The last place tried, metres.
+
+        Returns:
+            Another place for the same orientation; None to draw both anew.
+        """
+        return None
+
+
+@dataclass(frozen=True)
+class FreeTurning:
+    """Any rotation, uniform over SO(3)."""
+
+    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+        """Return a rotation from the object to the camera frame."""
+        return random_rotation(rng)
+
+
+@dataclass(frozen=True)
+class FacingTurning:
+    """The part's +z face looks at the camera, tilted a little, then turned in the image plane.
+
+    ``R = R_z(in-plane) · R_(axis in the image plane)(tilt) · diag(1, −1, −1)``; the tilted axis is
+    uniform over the spherical cap, the in-plane angle uniform over its range.
+
+    Attributes:
+        in_plane_deg: Largest rotation about the optical axis to either side, degrees.
+        tilt_deg: Largest angle between the part's +z and the direction against the optical axis.
+    """
+
+    in_plane_deg: float = 45.0
+    tilt_deg: float = 40.0
+
+    def __post_init__(self) -> None:
+        """Check the angles."""
+        for name in ("in_plane_deg", "tilt_deg"):
+            check_number(self, name, 0.0, 180.0, "degrees")
+
+    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+        """Return a rotation from the object to the camera frame."""
+        in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
+        tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
+        azimuth = rng.uniform(0.0, 2 * np.pi)
+        axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        turned = rotation_vector_to_matrix(np.array([0.0, 0.0, in_plane]))
+        return np.asarray(turned @ rotation_vector_to_matrix(tilt * axis) @ FACING)
+
+
+@dataclass(frozen=True)
+class OffsetPlacement(Placement):
+    """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
+
+    Where the camera does not see all of the box, a place is moved along the optical axis until it
+    does: offsets across the axis and orientations keep their uniform distributions, and the depth
+    is uniform over those at which the object is seen there.
+
+    Attributes:
+        distance: Of the box's centre from the camera, metres.
+        axial: Largest offset along the optical axis to either side, metres.
+        lateral: Largest offset along image x and along image y to either side, metres.
+    """
+
+    distance: float = 0.20
+    axial: float = 0.10
+    lateral: float = 0.15
+
+    def __post_init__(self) -> None:
+        """Check that the box lies before the camera."""
+        for name in ("distance", "axial", "lateral"):
+            check_number(self, name, 0.0, _FARTHEST, "metres")
+        if not self.axial < self.distance:
+            raise UserError(
+                f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
+                "axial < distance, in metres",
+                "move the box of positions before the camera",
+            )
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        rotated_hull: Float[np.ndarray, "hull 3"],
+    ) -> Float[np.ndarray, "3"]:
+        """Return the object's origin in the camera frame, metres."""
+        x, y = rng.uniform(-self.lateral, self.lateral, 2)
+        return np.array([x, y, self._draw_depth(rng)])
+
+    def redraw(
+        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return the same offsets across the optical axis at another depth, metres."""
+        return np.array([place[0], place[1], self._draw_depth(rng)])
+
+    def _draw_depth(self, rng: np.random.Generator) -> float:
+        return self.distance + rng.uniform(-self.axial, self.axial)
+
+
+@dataclass(frozen=True)
+class DistancePlacement(Placement):
+    """Uniform in depth and, laterally, over the image.
+
+    Attributes:
+        nearest: Smallest depth of the object's origin, metres.
+        farthest: Largest depth, metres.
+        margin: Share of the image's width and height that the origin keeps from the border.
+    """
+
+    nearest: float = 0.5
+    farthest: float = 1.2
+    margin: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        for name in ("nearest", "farthest"):
+            check_number(self, name, 1e-6, _FARTHEST, "metres")
+        check_number(self, "margin", 0.0, 0.49, "share")
+        if self.nearest > self.farthest:
+            raise UserError(
+                f"nearest={self.nearest} and farthest={self.farthest} of DistancePlacement",
+                "nearest <= farthest, in metres",
+                "change the placement's range",
+            )
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        rotated_hull: Float[np.ndarray, "hull 3"],
+    ) -> Float[np.ndarray, "3"]:
+        """Return the object's origin in the camera frame, metres."""
+        depth = rng.uniform(self.nearest, self.farthest)
+        pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
+        return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]))
+
+
+@dataclass(frozen=True)
+class FillPlacement(Placement):
+    """The part fills a drawn share of the image and lies inside it.
+
+    The share is the larger of bounding-box width over image width and bounding-box height over
+    image height. The distance follows from it by iteration.
+
+    Attributes:
+        smallest: Smallest share.
+        largest: Largest share.
+    """
+
+    smallest: float = 0.60
+    largest: float = 0.95
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        for name in ("smallest", "largest"):
+            check_number(self, name, 1e-3, 1.0, "share of the image")
+        if self.smallest > self.largest:
+            raise UserError(
+                f"smallest={self.smallest} and largest={self.largest} of FillPlacement",
+                "smallest <= largest, shares of the image",
+                "change the placement's range",
+            )
+
+    def draw(
+        self,
+        rng: np.random.Generator,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        rotated_hull: Float[np.ndarray, "hull 3"],
+    ) -> Float[np.ndarray, "3"]:
+        """Return the object's origin in the camera frame, metres."""
+        share = rng.uniform(self.smallest, self.largest)
+        offset = rng.uniform(-0.5, 0.5, 2)
+        centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
+        pixel, hull = np.array(size) / 2 - 0.5, rotated_hull - centre
+        for _ in range(_CENTRING_STEPS):
+            ray = np.linalg.solve(K, [*pixel, 1.0])
+            depth = _depth_that_fills(share, ray, K, size, hull)
+            image = project(hull + depth * ray, K)
+            lower, upper = image.min(axis=0), image.max(axis=0)
+            # The bounding box moves as far as it has room; one that fills the image cannot move.
+            wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
+            missing = wanted - (lower + upper) / 2
+            if np.abs(missing).max() < _CENTRED_PX:
+                break
+            pixel = pixel + missing
+        return np.asarray(depth * ray - centre)
+
+
+def _depth_that_fills(
+    share: float,
+    ray: Float[np.ndarray, "3"],
+    K: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
+    centred_hull: Float[np.ndarray, "hull 3"],
+) -> float:
+    """Find the depth on a ray at which the hull's bounding box fills a share of the image."""
+    closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)
+    rays, rows, columns = centred_hull @ K[:2].T, ray @ K[:2].T, np.array(size, np.float64)
+    low, high = closest, np.inf
+    depth = 2 * closest + float(np.abs(centred_hull).max())
+    for step in range(_MAX_STEPS):
+        pixels = (rays + depth * rows) / (centred_hull[:, 2:] + depth)
+        filled = float(((pixels.max(axis=0) - pixels.min(axis=0)) / columns).max())
+        if abs(filled / share - 1) < _SHARE_TOLERANCE:
+            break
+        low, high = (depth, high) if filled > share else (low, depth)
+        # The share falls nearly as 1/depth. That guess alternates with bisection, because close
+        # to the camera it closes in from one side only.
+        depth *= filled / share
+        if step % 2 or not low < depth < high:
+            depth = (low + high) / 2 if np.isfinite(high) else 2 * low
+    return depth

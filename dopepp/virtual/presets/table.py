@@ -1,0 +1,188 @@
+"""The table: from where a camera sees a supporting plane, and how parts lie on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from dopepp.core.checks import check_flag, check_number, check_range
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.virtual.arrange.body import Hull
+from dopepp.virtual.backgrounds import Backgrounds
+from dopepp.virtual.scene import Plane
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+_FARTHEST: Final = 8.0
+"""The picture of the table ends at so many camera distances: there, another one begins."""
+
+
+_MIDDLE: Final = (0.35, 0.65)
+"""Where in the picture the camera looks, in widths and heights."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A supporting plane before a robot's camera.
+
+    Attributes:
+        distance: Of the camera from the point of the plane that it looks at, metres.
+        elevation_deg: Angle between the plane and the camera's line of sight; 90 looks straight
+            down.
+        roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
+        tilted_share: Share of objects that do not rest but lean over.
+        tilt_deg: By how much, degrees.
+        heaped: Whether objects are dropped onto a heap; otherwise each lies on the plane beside
+            the others.
+        heap_radius: Radius within which a heap's objects are dropped, in units of the largest
+            diameter of a target.
+        picture_width: Width of the plane that the background's picture covers, in camera
+            distances; beyond it the picture is mirrored.
+    """
+
+    distance: tuple[float, float] = (0.25, 0.60)
+    elevation_deg: tuple[float, float] = (30.0, 85.0)
+    roll_deg: float = 20.0
+    tilted_share: float = 0.2
+    tilt_deg: tuple[float, float] = (5.0, 30.0)
+    heaped: bool = False
+    heap_radius: tuple[float, float] = (0.3, 0.8)
+    picture_width: tuple[float, float] = (1.2, 2.4)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_range(self, "distance", 0.02, 100.0, "metres")
+        check_range(self, "elevation_deg", 10.0, 90.0, "degrees")
+        check_number(self, "roll_deg", 0.0, 180.0, "degrees")
+        check_number(self, "tilted_share", 0.0, 1.0, "share")
+        check_range(self, "tilt_deg", 0.0, 90.0, "degrees")
+        check_flag(self, "heaped")
+        check_range(self, "heap_radius", 0.0, 10.0, "diameters")
+        check_range(self, "picture_width", 0.1, 20.0, "camera distances")
+
+    def draw_view(self, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+        """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
+        distance, elevation = (
+            rng.uniform(*self.distance),
+            np.radians(rng.uniform(*self.elevation_deg)),
+        )
+        roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
+        sine, cosine = np.sin(elevation), np.cos(elevation)
+        level = np.array([[1, 0, 0], [0, -sine, -cosine], [0, cosine, -sine]])
+        rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, roll])) @ level
+        return make_transform(rotation, np.array([0.0, 0.0, distance]))
+
+    def draw_turning(
+        self, rng: np.random.Generator, hull: Hull
+    ) -> tuple[Float[np.ndarray, "3 3"], float]:
+        """Draw how an object lies: on one of its stable faces, any way round, or leaning.
+
+        Returns:
+            The rotation from the object to the table frame, and the height of the object's lowest
+            point relative to its origin, metres.
+        """
+        normals, shares = hull.rests
+        down = normals[int(np.searchsorted(np.cumsum(shares)[:-1], rng.random(), side="right"))]
+        turn, lean = rng.uniform(0, 2 * np.pi), rng.random() < self.tilted_share
+        azimuth, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*self.tilt_deg))
+        rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, turn])) @ _downwards(down)
+        if lean:
+            axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            rotation = rotation_vector_to_matrix(tilt * axis) @ rotation
+        return np.asarray(rotation), float((hull.vertices @ rotation[2]).min())
+
+    def draw_picture(
+        self,
+        rng: np.random.Generator,
+        backgrounds: Backgrounds,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        T_cam_table: Float[np.ndarray, "4 4"],
+    ) -> TablePicture:
+        """Draw a picture that lies on the plane and, if its end is in view, one for beyond it."""
+        width, height = size
+        picture = backgrounds.draw(rng, width, height)
+        metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
+        middle = rng.uniform(*_MIDDLE, 2) * size
+        angle, scale = rng.uniform(0, 2 * np.pi), width / metres
+        cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
+        picture_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
+        end = _FARTHEST * float(T_cam_table[2, 3])
+        in_view = _beyond(end, K, size, T_cam_table) is not None
+        surroundings = backgrounds.draw(rng, width, height) if in_view else None
+        return TablePicture(picture, picture_table, end, surroundings)
+
+
+@dataclass(frozen=True, eq=False)
+class TablePicture:
+    """What is to be seen on the plane, and beyond its end.
+
+    Attributes:
+        picture: Lies on the plane; beyond its borders it is mirrored.
+        picture_table: Homography from a point (x, y) of the table's frame, metres, to its pixels.
+        end: Depth from which on there is no plane, metres.
+        surroundings: What is there instead, an image of the camera; None where the plane goes on.
+    """
+
+    picture: Image
+    picture_table: Float[np.ndarray, "3 3"]
+    end: float
+    surroundings: Image | None
+
+    def seen(
+        self,
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        T_cam_table: Float[np.ndarray, "4 4"],
+    ) -> Image:
+        """Return what a camera sees where nothing lies on the plane."""
+        # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
+        image_table = K @ T_cam_table[:3, [0, 1, 3]]
+        image = cv2.warpPerspective(
+            self.picture,
+            self.picture_table @ np.linalg.inv(image_table),
+            size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REFLECT_101,
+        )
+        beyond = _beyond(self.end, K, size, T_cam_table)
+        if beyond is None or self.surroundings is None:
+            return np.asarray(image)
+        return np.where(beyond[..., None], self.surroundings, image)
+
+
+def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
+    """Return the plane z = 0 of the table's frame, in the camera frame."""
+    x, y, z = (float(value) for value in T_cam_table[:3, 2])
+    return Plane((x, y, z), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
+
+
+def _downwards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return a rotation that turns a unit direction to −z."""
+    helper = np.eye(3)[np.abs(direction).argmin()]
+    across = np.cross(helper, direction)
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(across, direction), -direction])
+
+
+def _beyond(
+    end: float,
+    K: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
+    T_cam_table: Float[np.ndarray, "4 4"],
+) -> Bool[np.ndarray, "height width"] | None:
+    """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
+    width, height = size
+    plane = plane_of(T_cam_table)
+    # A ray r (with z = 1) meets the plane at depth offset/(normal · r), and 1/depth is linear in
+    # the pixel.
+    slope = np.array(plane.normal) @ np.linalg.inv(K) / plane.offset
+    across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
+    if across.min() + down.min() >= 1 / end:
+        return None
+    return np.asarray(across + down[:, None] < 1 / end)

@@ -1,1 +1,0 @@
-"""The steps of the rasteriser: visibility, shadows, fragments, light, picture."""

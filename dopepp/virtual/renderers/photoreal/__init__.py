@@ -1,0 +1,1 @@
+"""The photoreal renderer: path tracing by Mitsuba 3 (extra ``photoreal``)."""

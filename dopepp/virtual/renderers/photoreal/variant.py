@@ -1,0 +1,219 @@
+"""Mitsuba, imported once a process in the fastest variant that runs on this machine.
+
+``llvm_ad_rgb`` compiles its kernels with the system's libLLVM and is several times faster than
+``scalar_rgb``, which needs nothing. A libLLVM that Mitsuba cannot work with (15 and older, as in
+Debian 12) ends the whole process, so each is first tried in a process of its own, and the outcome
+is kept in the user's cache folder for as long as library and Mitsuba stay the same.
+
+Environment variables:
+    ``DOPEPP_MITSUBA_VARIANT``: ``llvm_ad_rgb`` or ``scalar_rgb`` instead of the automatic choice.
+    ``DRJIT_LIBLLVM_PATH``: Mitsuba's own; the only library that is tried where it is set.
+    ``DOPEPP_RENDER_THREADS``: Threads to render with; by default one for each core that this
+    process may run on, and a single one in a worker that another Python process started.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from dopepp.core.errors import UserError
+
+_log = logging.getLogger(__name__)
+
+VARIANTS: Final = ("llvm_ad_rgb", "scalar_rgb")
+VARIANT_SETTING: Final = "DOPEPP_MITSUBA_VARIANT"
+LIBRARY_SETTING: Final = "DRJIT_LIBLLVM_PATH"
+THREADS_SETTING: Final = "DOPEPP_RENDER_THREADS"
+
+PLACES: Final = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so.*",
+    "/usr/lib64/libLLVM*.so.*",
+    "/usr/lib/libLLVM*.so.*",
+    "/opt/homebrew/opt/llvm/lib/libLLVM.dylib",
+)
+"""Where Debian, Fedora, Arch and Homebrew put libLLVM; the environment names one elsewhere."""
+
+_PROBE_SECONDS: Final = 60.0
+"""A library that takes longer is passed over this time, and tried again the next."""
+
+_MAX_CACHE_BYTES: Final = 1_000_000
+
+_PROBE: Final = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.cornell_box()
+scene["small-box"]["bsdf"] = {"type": "principled", "roughness": 0.3, "metallic": 0.5}
+print("mean", float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[0]))
+"""
+"""A small scene with most of what compiles in a real one."""
+
+
+def mitsuba() -> Any:
+    """Return the ``mitsuba`` module with its variant and threads set.
+
+    Raises:
+        UserError: It is not installed, a setting is wrong, or this process was forked from one
+            that has rendered, whose threads it lacks.
+    """
+    require("mitsuba")
+    pid = _start()
+    if pid != os.getpid():
+        raise UserError(
+            f"a process forked from one ({pid}) that has rendered with Mitsuba",
+            "workers that were spawned, or forked before the first image",
+            "start workers with multiprocessing.get_context('spawn')",
+        )
+    return import_module("mitsuba")
+
+
+def require(*packages: str) -> None:
+    """Check, without importing them, that packages of the extra are installed.
+
+    Raises:
+        UserError: One is missing.
+    """
+    for package in packages:
+        if find_spec(package) is None:
+            raise UserError(
+                f"renderer 'photoreal' without the package {package}",
+                "an installation with the extra photoreal",
+                "pip install 'dopepp[photoreal]'",
+            )
+
+
+def num_threads() -> int:
+    """Return the threads to render with.
+
+    Raises:
+        UserError: The environment variable is no positive number.
+    """
+    setting = os.environ.get(THREADS_SETTING)
+    if setting is not None:
+        if not setting.isdecimal() or int(setting) < 1:
+            raise UserError(f"{THREADS_SETTING}={setting!r}", "a number of at least 1", "change it")
+        return int(setting)
+    if multiprocessing.parent_process() is not None:
+        return 1
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+@cache
+def _start() -> int:
+    """Import Mitsuba in the chosen variant; return the process that did."""
+    library = _chosen_library()
+    loaded = "drjit" in sys.modules and os.environ.get(LIBRARY_SETTING) != str(library)
+    if library is not None and loaded:
+        _log.warning("Dr.Jit was imported before dopepp could choose its libLLVM: scalar_rgb")
+        library = None
+    if library is not None:
+        os.environ[LIBRARY_SETTING] = str(library)
+    module, drjit = import_module("mitsuba"), import_module("drjit")
+    module.set_variant("scalar_rgb" if library is None else "llvm_ad_rgb")
+    drjit.set_thread_count(num_threads())
+    _log.info("Mitsuba %s, %s, libLLVM %s", module.__version__, module.variant(), library)
+    return os.getpid()
+
+
+def _chosen_library() -> Path | None:
+    """Return the libLLVM to use; None for the scalar variant."""
+    wish = os.environ.get(VARIANT_SETTING)
+    if wish not in (None, *VARIANTS):
+        raise UserError(f"{VARIANT_SETTING}={wish!r}", ", ".join(VARIANTS), "change or unset it")
+    if wish == "scalar_rgb":
+        return None
+    libraries = candidates()
+    library = next((path for path in libraries if is_usable(path)), None)
+    if library is None and wish == "llvm_ad_rgb":
+        raise UserError(
+            f"{VARIANT_SETTING}={wish} with {', '.join(map(str, libraries)) or 'no libLLVM'}",
+            "a libLLVM that Mitsuba can work with",
+            f"install a newer LLVM, set {LIBRARY_SETTING}, or unset {VARIANT_SETTING}",
+        )
+    return library
+
+
+def candidates() -> list[Path]:
+    """Return the libLLVM files of this machine, the newest version first."""
+    setting = os.environ.get(LIBRARY_SETTING)
+    if setting:
+        return [Path(setting)]
+    found = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
+    return sorted(found, key=lambda path: (_version(path), path), reverse=True)
+
+
+def _version(library: Path) -> list[int]:
+    """Return the version in a library's name: libLLVM-17.so.1, libLLVM.so.19.1."""
+    return [int(number) for number in re.findall(r"\d+", library.name)]
+
+
+def is_usable(library: Path) -> bool:
+    """Tell whether Mitsuba renders with a libLLVM, from memory on disk or by trying it."""
+    try:
+        stat = library.stat()
+    except OSError:
+        return False
+    key = f"{library} {stat.st_mtime_ns} {stat.st_size} {version('mitsuba')} {version('drjit')}"
+    known = _read_cache()
+    if key not in known:
+        outcome = _probe(library)
+        if outcome is None:
+            return False
+        known[key] = outcome
+        _write_cache(known)
+    return known[key]
+
+
+def _probe(library: Path) -> bool | None:
+    """Render in a process of its own, which may die of it; None if it did not come to an end."""
+    environment = {**os.environ, LIBRARY_SETTING: str(library)}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True,
+            timeout=_PROBE_SECONDS, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        _log.warning("%s could not be tried: %s", library, error)
+        return None
+    usable = done.returncode == 0 and "mean" in done.stdout
+    _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
+    return usable
+
+
+def _cache_path() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "dopepp" / "mitsuba_libllvm.json"
+
+
+def _read_cache() -> dict[str, bool]:
+    """Return what is known of libraries; nothing if the file is missing or damaged."""
+    try:
+        with _cache_path().open("rb") as file:
+            known = json.loads(file.read(_MAX_CACHE_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(known, dict):
+        return {}
+    return {key: value for key, value in known.items() if isinstance(value, bool)}
+
+
+def _write_cache(known: dict[str, bool]) -> None:
+    # Imported here because it brings matplotlib along, which rendering does without.
+    from dopepp.core.files import write_whole
+
+    try:
+        write_whole(_cache_path(), json.dumps(known, indent=1).encode())
+    except OSError as error:
+        _log.warning("%s cannot be written, libLLVM will be tried again: %s", _cache_path(), error)

@@ -1,0 +1,325 @@
+"""The supporting plane: its depth, and the shadows that objects cast on its picture.
+
+The background shows the plane in full light. Where objects keep light from it, the background is
+multiplied by the share of light that is left, of the sky and of every lamp. A plane's points map
+to a shadow map, and to the grid of its sky, by homographies; so both are warped into the image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.virtual.renderers.raster.light import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.renderers.raster.shadow import ShadowMap, hidden_sky
+from dopepp.virtual.renderers.raster.visibility import NUM_COLOUR_SAMPLES, Box, scratch
+from dopepp.virtual.scene import NEAR, Plane, Scene
+
+_LAMP_ANGLE: Final = 0.04
+"""Diameter of a lamp as seen from the plane, radians; it makes a high object's shadow soft."""
+
+_SMOOTHING: Final = 0.7
+"""Smallest blur of a shadow on the plane, texels: the map's outlines are not anti-aliased."""
+
+_WIDEST: Final = 1 / 16
+"""Largest blur of a shadow on the plane, over the map's longer side."""
+
+_VISIBLE: Final = np.float32(0.005)
+"""Share of hidden light from which on a picture of 256 levels changes."""
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+def inverse_depth_of(plane: Plane, K: Array) -> Float[np.ndarray, "3"]:
+    """Return (a, b, c) with 1/z = a u + b v + c on the plane; positive in front of the camera."""
+    return np.asarray(np.linalg.solve(K.T, np.array(plane.normal, np.float64)) / plane.offset)
+
+
+@compiled()
+def clear_to_plane(
+    inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
+) -> None:
+    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen."""
+    height, width, num_samples = inverse_depth.shape
+    row = inverse_depth.reshape(height, width * num_samples)
+    steps = np.empty(width * num_samples, np.float32)
+    for i in range(width):
+        for s in range(num_samples):
+            steps[i * num_samples + s] = (
+                inverse[0] * (origin[0] + i + samples[s, 0]) + inverse[1] * samples[s, 1]
+            )
+    nearest = np.float32(1.0 / near)
+    for j in range(height):
+        start = np.float32(inverse[1] * (origin[1] + j) + inverse[2])
+        for k in range(steps.shape[0]):
+            value = start + steps[k]
+            row[j, k] = value if np.float32(0) < value <= nearest else np.float32(0)
+
+
+@compiled()
+def plane_depth(inverse: Array, near: float, depth: Array) -> None:
+    """Write the plane's depth at every pixel centre, metres; 0 where it is not seen."""
+    for j in range(depth.shape[0]):
+        for i in range(depth.shape[1]):
+            value = inverse[0] * i + inverse[1] * j + inverse[2]
+            depth[j, i] = 1.0 / value if 0.0 < value * near <= 1.0 else 0.0
+
+
+def darken_plane(
+    scene: Scene,
+    plane: Plane,
+    lights: Sequence[tuple[Array, ShadowMap]],
+    ambient: Array,
+    origin: tuple[int, int],
+    ids: Array,
+    image: Array,
+) -> None:
+    """Darken the plane's picture where objects keep light from it.
+
+    Args:
+        scene: Its camera and objects.
+        plane: The plane.
+        lights: Position (3) and linear RGB at one metre (3) of every light, and its shadow map.
+        ambient: Up direction (3), linear RGB from above (3) and from below (3).
+        origin: Image pixel (x, y) of the first element of ``ids``.
+        ids: Triangle ids per sample; pixels full of objects are left out.
+        image: The background, uint8, updated in place.
+    """
+    frame = _plane_frame(plane)
+    sky = hidden_sky(frame, scene.objects)
+    if sky is None:
+        return
+    grid, hidden = sky
+    box = _shadowed_box(scene, frame, grid, hidden.shape, lights)
+    if box is None:
+        return
+    inverse = inverse_depth_of(plane, scene.K)
+    # A pixel (u, v, 1) shows the plane's point K⁻¹ (u, v, 1) / (inverse · (u, v, 1)).
+    to_point = np.vstack([np.linalg.inv(scene.K), inverse])
+    to_cells = np.array([[1, 0, -grid[0]], [0, 1, -grid[1]], [0, 0, grid[2]]])
+    to_plane = np.vstack([frame[:2] @ to_point, inverse])
+    shades = scratch("shades", (1 + len(lights), box[3] - box[1], box[2] - box[0]), np.float32)
+    _warp(hidden, to_cells @ to_plane, box, shades[0])
+    for (_, shadow), shade in zip(lights, shades[1:], strict=True):
+        cast, margin = _cast(plane, shadow)
+        to_map = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ shadow.P
+        _warp(cast, to_map @ to_point, box, shade)
+    above = 0.5 + 0.5 * float(np.dot(plane.normal, ambient[:3]))
+    _darken(
+        box[:2], to_point.astype(np.float32), NEAR, np.array(plane.normal, np.float32), shades,
+        np.asarray(above * ambient[3:6] + (1 - above) * ambient[6:], np.float32),
+        np.array([light for light, _ in lights], np.float32).reshape(-1, 6),
+        np.array([shadow.P for _, shadow in lights], np.float32).reshape(-1, 3, 4),
+        SRGB_TO_LINEAR, LINEAR_TO_SRGB, CODE_STEPS, origin, ids, image,
+    )  # fmt: skip
+
+
+def _plane_frame(plane: Plane) -> Float[np.ndarray, "3 4"]:
+    """Return the rows that map camera-frame points to (x, y) on the plane and the height."""
+    normal = np.array(plane.normal, np.float64)
+    first = np.cross(np.eye(3)[np.abs(normal).argmin()], normal)
+    first /= np.linalg.norm(first)
+    rotation = np.stack([first, np.cross(normal, first), normal])
+    return np.asarray(np.column_stack([rotation, [0.0, 0.0, -plane.offset]]))
+
+
+def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
+    """Return the share of every texel that hides the plane from the light, penumbra included.
+
+    Returns:
+        The map with a margin around it for the penumbra, and the margin, texels.
+    """
+    P = shadow.P.astype(np.float64)
+    # In the map, too, the plane's 1/depth is linear: n · x = offset with x = M⁻¹ (depth (u, v, 1)
+    # − p), P = [M | p].
+    row = np.array(plane.normal) @ np.linalg.inv(P[:, :3])
+    span = plane.offset + float(row @ P[:, 3])
+    rows, columns = shadow.inverse_depth.shape[:2]
+    if abs(span) < 1e-12:
+        return np.zeros((rows, columns), np.float32), 0  # the light lies in the plane
+    ground = np.add.outer(
+        (row[1] * np.arange(rows) + row[2]) / span, row[0] * np.arange(columns) / span
+    )
+    drawn = shadow.inverse_depth[..., 0]
+    cast = (drawn > np.maximum(ground, 0.0)).astype(np.float32)
+    hit = (cast > 0) & (ground > 0)
+    if not hit.any():
+        return cast, 0
+    # Like triangles: the penumbra is as wide as the lamp seen from the object, times the gap.
+    gap = float(np.median(1 / ground[hit] - 1 / drawn[hit]))
+    texel = shadow.texel * float(np.median(1 / ground[hit]))
+    sigma = min(max(0.25 * _LAMP_ANGLE * gap / texel, _SMOOTHING), _WIDEST * max(rows, columns))
+    margin = math.ceil(3 * sigma)
+    cast = cv2.copyMakeBorder(cast, *4 * (margin,), cv2.BORDER_CONSTANT, value=0.0)
+    return np.asarray(cv2.GaussianBlur(cast, (0, 0), sigma)), margin
+
+
+def _warp(source: Array, to_source: Array, box: Box, out: Array) -> None:
+    """Write, at the pixels of a box, what a homography finds in an image; 0 beside it."""
+    shift = np.array([[1.0, 0.0, box[0]], [0.0, 1.0, box[1]], [0.0, 0.0, 1.0]])
+    size = (box[2] - box[0], box[3] - box[1])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    cv2.warpPerspective(source, to_source @ shift, size, dst=out, flags=flags)
+
+
+def _shadowed_box(
+    scene: Scene,
+    frame: Float[np.ndarray, "3 4"],
+    grid: Float[np.ndarray, "3"],
+    cells: tuple[int, ...],
+    lights: Sequence[tuple[Array, ShadowMap]],
+) -> Box | None:
+    """Bound the pixels of the plane that may be darker; None if there are none."""
+    size = scene.size
+    right, bottom = grid[0] + cells[1] * grid[2], grid[1] + cells[0] * grid[2]
+    corners = np.array([(x, y, 0.0) for x in (grid[0], right) for y in (grid[1], bottom)])
+    spots = [(corners - frame[:, 3]) @ frame[:, :3]]
+    for light, _ in lights:
+        for item in scene.objects:
+            hull = item.surface.hull @ item.T_cam_obj[:3, :3].T + item.T_cam_obj[:3, 3]
+            lamp = light[:3]
+            height, lamp_height = (
+                hull @ frame[2, :3] + frame[2, 3],
+                lamp @ frame[2, :3] + frame[2, 3],
+            )
+            above = height > 0
+            if not above.any() or lamp_height <= 0:
+                continue
+            if (height[above] >= 0.999 * lamp_height).any():
+                return 0, 0, *size  # the shadow has no end
+            stretch = lamp_height / (lamp_height - height[above])
+            spots.append(lamp + stretch[:, None] * (hull[above] - lamp))
+    points = np.concatenate(spots)
+    if (points[:, 2] <= NEAR).any():
+        return 0, 0, *size
+    pixels = points @ scene.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    low = np.clip(np.floor(pixels.min(axis=0)), 0, size).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
+    box = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return box if box[0] < box[2] and box[1] < box[3] else None
+
+
+@compiled(fastmath=True)
+def _darken(
+    corner: tuple[int, int],
+    to_point: Array,
+    near: float,
+    normal: Array,
+    shades: Array,
+    sky: Array,
+    lights: Array,
+    P: Array,
+    decode: Array,
+    encode: Array,
+    steps: int,
+    origin: tuple[int, int],
+    ids: Array,
+    image: Array,
+) -> None:
+    """Multiply the picture by the share of the plane's light that is left.
+
+    Args:
+        corner: Image pixel (x, y) of the first element of ``shades``.
+        to_point: Pixel to point and 1/z, shape (4, 3).
+        near: Metres before which nothing is seen.
+        normal: The plane's.
+        shades: Share that is hidden, of the sky and of every light, shape (1 + lights, h, w).
+        sky: Linear RGB of the sky's light on the plane.
+        lights: Position and linear RGB at one metre, shape (lights, 6).
+        P: Their shadow maps' projections, shape (lights, 3, 4).
+        decode: Code to linear light; encode: its inverse, in ``steps`` per unit.
+        encode: Idem.
+        steps: Idem.
+        origin: Image pixel (x, y) of the first element of ``ids``.
+        ids: Triangle ids per sample.
+        image: uint8, updated in place.
+    """
+    width = shades.shape[2]
+    total, lost = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+    for j in range(shades.shape[1]):
+        left, right = _dark_span(shades, j)
+        if left < right:
+            v = corner[1] + j
+            _light_row(corner, j, to_point, normal, shades, sky, lights, P, total, lost)
+            for i in range(left, right):
+                u = corner[0] + i
+                inverse = to_point[3, 0] * u + to_point[3, 1] * v + to_point[3, 2]
+                if not 0.0 < inverse * near <= 1.0 or _is_full(ids, v - origin[1], u - origin[0]):
+                    continue
+                for c in range(3):
+                    if lost[c, i] > _VISIBLE * total[c, i]:
+                        kept = max(_ONE - lost[c, i] / total[c, i], _ZERO)
+                        step = int(decode[image[v, u, c]] * kept * steps + 0.5)
+                        image[v, u, c] = np.uint8(encode[step] + 0.5)
+
+
+@compiled()
+def _dark_span(shades: Array, j: int) -> tuple[int, int]:
+    """Return the first column of a row where light is hidden, and the one after the last."""
+    left, right = shades.shape[2], 0
+    for k in range(shades.shape[0]):
+        for i in range(left):
+            if shades[k, j, i] > _VISIBLE:
+                left = i
+                break
+        for i in range(shades.shape[2] - 1, right - 1, -1):
+            if shades[k, j, i] > _VISIBLE:
+                right = i + 1
+                break
+    return left, right
+
+
+@compiled()
+def _is_full(ids: Array, j: int, i: int) -> bool:
+    """Tell whether objects cover all samples of a pixel."""
+    if not (0 <= j < ids.shape[0] and 0 <= i < ids.shape[1]):
+        return False
+    full = True
+    for s in range(NUM_COLOUR_SAMPLES):
+        full = full and ids[j, i, s] >= 0
+    return full
+
+
+@compiled(fastmath=True)
+def _light_row(
+    corner: tuple[int, int], j: int, to_point: Array, normal: Array, shades: Array, sky: Array,
+    lights: Array, P: Array, total: Array, lost: Array,
+) -> None:  # fmt: skip
+    """Sum up all light on a row of the plane's pixels, and what is hidden of it."""
+    fv = np.float32(corner[1] + j)
+    px, py = to_point[0, 1] * fv + to_point[0, 2], to_point[1, 1] * fv + to_point[1, 2]
+    pw, mx, my, mw = (
+        to_point[3, 1] * fv + to_point[3, 2], to_point[0, 0], to_point[1, 0], to_point[3, 0]
+    )  # fmt: skip
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    for c in range(3):
+        for i in range(total.shape[1]):
+            total[c, i] = sky[c]
+            lost[c, i] = sky[c] * shades[0, j, i]
+    for k in range(lights.shape[0]):
+        x0, y0, z0 = lights[k, 0], lights[k, 1], lights[k, 2]
+        red, green, blue = lights[k, 3], lights[k, 4], lights[k, 5]
+        a, b, c, d = P[k, 2, 0], P[k, 2, 1], P[k, 2, 2], P[k, 2, 3]
+        for i in range(total.shape[1]):
+            u = np.float32(corner[0] + i)
+            z = _ONE / (mw * u + pw)
+            x, y = (mx * u + px) * z, (my * u + py) * z
+            lx, ly, lz = x0 - x, y0 - y, z0 - z
+            facing = max(nx * lx + ny * ly + nz * lz, _ZERO)
+            square = lx * lx + ly * ly + lz * lz
+            strength = facing / (square * math.sqrt(square))
+            # A homography also maps what lies behind the light into its map.
+            shade = strength * shades[1 + k, j, i] if a * x + b * y + c * z + d > _ZERO else _ZERO
+            total[0, i] += strength * red
+            total[1, i] += strength * green
+            total[2, i] += strength * blue
+            lost[0, i] += shade * red
+            lost[1, i] += shade * green
+            lost[2, i] += shade * blue

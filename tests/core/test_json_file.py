@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import MAX_DEPTH, parse_json, read_json
+
+PLAIN = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLAIN, st.booleans(), st.sampled_from([None, 1]))
+def test_reads_what_json_writes(value: object, ascii_only: bool, indent: int | None) -> None:
+    text = json.dumps(value, ensure_ascii=ascii_only, indent=indent)
+    text = text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
+    assert parse_json(text, "here") == json.loads(text)
+    assert parse_json(b"\xef\xbb\xbf" + text.encode(), "here") == json.loads(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a":\n [1, NaN]}', "line 2, column 6: 'NaN', no finite number"),
+        ('["NaN Infinity", -Infinity]', "line 1, column 18: '-Infinity'"),
+        ("[1.0, 1e308, 1e999]", "line 1, column 14: '1e999'"),
+        ("[" + "9" * 400 + ".5]", "line 1, column 2: '9"),
+        ("[-1E+400]", "line 1, column 2: '-1E"),
+        ('{"12": 1, "2": {"x": 1, "12": 2, "x": 3}}', "key 'x' twice"),
+        ('{"a": 1, "a": 1}', "key 'a' twice"),
+        ('{"a": 1', "line 1, column 8"),
+        ("", "line 1, column 1"),
+        ("[1] 2", "Extra data"),
+        (b'{"a": "\xff"}', "byte 7 is no UTF-8"),
+        ("{'a': 1}", "line 1, column 2"),
+        ("[" * 200_000, "nested more than 64"),
+        ('{"a":' * 200_000, "nested more than 64"),
+        ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested more than 64"),
+        ('["]]]]", ' * 70 + "1" + "]" * 70, "nested more than 64"),
+        ("9" * 5000, "digit"),
+        ('"' + '\\"' * 300_000, "line 1"),
+        ('"\\', "line 1"),
+    ],
+    ids=lambda value: repr(value)[:20],
+)
+def test_refuses_in_one_line_with_the_place(text: str | bytes, message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        parse_json(text, "some/file.json")
+    assert "some/file.json" in str(caught.value)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_brackets_in_strings_are_no_nesting() -> None:
+    value = {"a": "[" * 500 + '\\"{{' * 50, "b": ["}"] * 3}
+    assert parse_json(json.dumps(value), "here") == value
+    deepest = "[" * MAX_DEPTH + "]" * MAX_DEPTH
+    assert parse_json(deepest, "here") == json.loads(deepest)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=60) | st.text("[]{}\":,\\ntrue1.e-NaInfy 'u", max_size=60))
+def test_any_bytes_give_a_value_or_a_user_error(content: bytes | str) -> None:
+    try:
+        value = parse_json(content, "here")
+    except UserError:
+        return
+    assert value == json.loads(content)
+
+
+def test_read_names_the_file_and_bounds_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "scene_gt.json"
+    with pytest.raises(UserError, match=r"scene_gt\.json, no such file"):
+        read_json(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_json(tmp_path)
+    path.write_text('{"0": [1, 2.5]}')
+    assert read_json(path) == {"0": [1, 2.5]}
+    assert read_json(path, max_bytes=15) == {"0": [1, 2.5]}
+    with pytest.raises(UserError, match=r"scene_gt\.json of .* MB; allowed: .* at most 1.4e-05 MB"):
+        read_json(path, max_bytes=14)

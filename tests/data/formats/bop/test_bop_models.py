@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.model_writer import vertex_normals, write_models
+from dopepp.data.formats.bop.models import bop_parts, parts_by_id, read_models
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.mesh.read import read_mesh, ycb_part
+from dopepp.parts.part import Mesh, make_part
+
+
+def cylinder() -> Mesh:
+    solid: Any = trimesh.creation.cylinder(0.02, 0.05, sections=24)
+    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
+
+
+def test_parts_come_back_with_symmetries_in_metres(tmp_path: Path) -> None:
+    flip = np.eye(4)
+    flip[:3, :3] = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    flip[:3, 3] = 0.001, -0.002, 0.003
+    axis = ((0.0, 0.0, 1.0), (0.01, 0.0, -0.02))
+    symmetric = make_part(
+        "Rolle Ø4", cylinder(), symmetries_discrete=flip[None], symmetries_continuous=(axis,)
+    )
+    write_models(tmp_path, [symmetric, servoholder()])
+    record = json.loads((tmp_path / "models" / "models_info.json").read_text("utf-8"))["1"]
+    assert record["name"] == "Rolle Ø4"
+    assert record["symmetries_discrete"][0][3::4] == pytest.approx([1, -2, 3, 1])
+    (entry,) = record["symmetries_continuous"]
+    assert entry["axis"] == [0, 0, 1]
+    assert entry["offset"] == pytest.approx([10, 0, -20])
+    assert record["diameter"] == pytest.approx(1000 * np.hypot(0.04, 0.05))
+    assert [record[f"min_{a}"] for a in "xyz"] == pytest.approx([-20, -20, -25])
+    assert [record[f"size_{a}"] for a in "xyz"] == pytest.approx([40, 40, 50])
+    read, plain = bop_parts(tmp_path)
+    assert read.symmetries_discrete is not None
+    np.testing.assert_allclose(read.symmetries_discrete, flip[None], atol=1e-12)
+    np.testing.assert_allclose(read.symmetries_continuous, [axis], atol=1e-12)
+    assert plain.symmetries_discrete is None
+    assert plain.symmetries_continuous == ()
+    np.testing.assert_allclose(read.cuboid, symmetric.cuboid, atol=1e-8)
+    assert len(read.points) == 2000
+    assert [part.name for part in bop_parts(tmp_path, ["servoholder"])] == ["servoholder"]
+
+
+def test_ply_is_read_by_trimesh_in_millimetres(tmp_path: Path) -> None:
+    write_models(tmp_path, [pivconnector()])
+    path = tmp_path / "models" / "obj_000001.ply"
+    loaded: Any = trimesh.load(path, process=False)
+    mesh = pivconnector().mesh
+    assert mesh is not None
+    np.testing.assert_allclose(loaded.vertices, 1000 * mesh.vertices, atol=1e-4)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
+    assert b"property float nx" in path.read_bytes()[:400]
+    np.testing.assert_allclose(read_mesh(path, unit="mm").vertices, mesh.vertices, atol=1e-7)
+
+
+def test_vertex_normals_are_weighted_by_angle() -> None:
+    box: Any = trimesh.creation.box((2, 2, 2))
+    normals = vertex_normals(np.asarray(box.vertices), np.asarray(box.faces))
+    # Two triangles or one at a corner of a face: only the angle makes all three axes equal.
+    np.testing.assert_allclose(normals, box.vertices / np.sqrt(3), atol=1e-12)
+
+
+def test_texture_round_trip(ycb_root: Path, tmp_path: Path) -> None:
+    part = ycb_part(ycb_root, "009_gelatin_box")
+    write_models(tmp_path, [part])
+    (read,) = bop_parts(tmp_path)
+    assert read.mesh is not None
+    assert part.mesh is not None
+    np.testing.assert_array_equal(read.mesh.texture, part.mesh.texture)
+    np.testing.assert_allclose(read.mesh.uv, part.mesh.uv, atol=1e-6)
+    np.testing.assert_allclose(read.mesh.vertices, part.mesh.vertices, atol=1e-7)
+
+
+def test_objects_without_a_name_are_called_after_their_file(tmp_path: Path) -> None:
+    write_models(tmp_path, [servoholder(), pivconnector()])
+    folder = tmp_path / "models"
+    path = folder / "models_info.json"
+    records = json.loads(path.read_text())
+    for record in records.values():
+        del record["name"]
+    records = {"1": records["1"], "12": records["2"]}
+    path.write_text(json.dumps(records))
+    (folder / "obj_000002.ply").rename(folder / "obj_000012.ply")
+    folder.rename(tmp_path / "models_eval")
+    parts = bop_parts(tmp_path)
+    assert [part.name for part in parts] == ["obj_000001", "obj_000012"]
+    assert {number: part.name for number, part in parts_by_id(tmp_path, parts).items()} == {
+        1: "obj_000001",
+        12: "obj_000012",
+    }
+    assert list(parts_by_id(tmp_path / "none", parts[1:])) == [12]
+    with pytest.raises(UserError, match=r"part 'servoholder'.*obj_000001, obj_000012"):
+        parts_by_id(tmp_path, [servoholder()])
+    with pytest.raises(UserError, match=r"part 'servoholder'.*obj_NNNNNN"):
+        parts_by_id(tmp_path / "none", [servoholder()])
+    with pytest.raises(UserError, match=r"data\.objects with 'x'.*obj_000001"):
+        bop_parts(tmp_path, ["x"])
+    with pytest.raises(UserError, match=r"no models_info\.json in models, models_cad"):
+        bop_parts(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        ({"diameter": -1}, "object 1: diameter of"),
+        ({"diameter": "3"}, "object 1: diameter: .*1 finite numbers"),
+        ({"diameter": 10**400}, "object 1: diameter"),
+        ({"name": ""}, "printable characters"),
+        ({"name": ["a"]}, "part name"),
+        ({"symmetries_discrete": [[1] * 15]}, "symmetries_discrete: .*16 finite numbers"),
+        ({"symmetries_discrete": [[2.0] * 16]}, "symmetries_discrete; .*rigid transforms"),
+        ({"symmetries_discrete": [[[1] * 4] * 4]}, "16 finite numbers"),
+        ({"symmetries_discrete": 3}, "symmetries_discrete; .*a list of at most"),
+        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, "axis other"),
+        ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "3 finite numbers"),
+        ([], "object 1; .*diameter and symmetries"),
+    ],
+)
+def test_damaged_models_info(record: object, message: str, tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "models_info.json").write_text(json.dumps({"1": record}))
+    with pytest.raises(UserError, match=message):
+        read_models(tmp_path)
+
+
+def test_numbers_and_names_must_be_unique(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    path = tmp_path / "models" / "models_info.json"
+    for text in ('{"1": {}, "01": {}}', '{"1": {"name": "a"}, "2": {"name": "a"}}'):
+        path.write_text(text)
+        with pytest.raises(UserError, match="two objects of one number or name"):
+            read_models(tmp_path)
+    path.write_text('{"a": {}}')
+    with pytest.raises(UserError, match="objects by number"):
+        read_models(tmp_path)
+
+
+def test_an_identity_is_no_symmetry_and_a_wrong_diameter_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_models(tmp_path, [servoholder()])
+    path = tmp_path / "models" / "models_info.json"
+    records = json.loads(path.read_text())
+    records["1"] |= {"symmetries_discrete": [np.eye(4).ravel().tolist()], "diameter": 90}
+    path.write_text(json.dumps(records))
+    (part,) = bop_parts(tmp_path)
+    assert part.symmetries_discrete is None
+    assert part.diameter == pytest.approx(servoholder().diameter, rel=1e-6)
+    assert "states a diameter of 0.09 m" in caplog.text

@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb, encode_png
+from dopepp.data.formats.bop.source import BopSource, share
+from dopepp.data.sample import Sample
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.parts.part import Part
+
+K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
+R = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+"""Row by row: x_cam = −y_obj, y_cam = x_obj."""
+
+
+def block(number: int) -> Part:
+    """Return a 40 × 20 × 10 mm block called as BOP's files are."""
+    half = np.array([0.02, 0.01, 0.005])
+    cuboid = cuboid_keypoints(-half, half)
+    return Part(f"obj_{number:06d}", cuboid, float(2 * np.linalg.norm(half)), cuboid[:8])
+
+
+def truth(number: int, t: tuple[float, float, float] = (5.0, -10.0, 250.0)) -> dict[str, Any]:
+    return {"cam_R_m2c": list(R), "cam_t_m2c": list(t), "obj_id": number}
+
+
+class Scene:
+    """Writes a scene by hand with literal numbers, without the package's own writer."""
+
+    def __init__(self, root: Path, split: str = "test", number: int = 1) -> None:
+        self.root, self.folder = root, root / split / f"{number:06d}"
+        self.folder.mkdir(parents=True)
+
+    def annotate(self, truths: dict[str, Any], fractions: dict[str, list[float]] | None) -> None:
+        cameras = {key: {"cam_K": K, "depth_scale": 0.5} for key in truths}
+        self.json("scene_camera", cameras)
+        self.json("scene_gt", truths)
+        if fractions is not None:
+            infos = {k: [{"visib_fract": f} for f in row] for k, row in fractions.items()}
+            self.json("scene_gt_info", infos)
+
+    def json(self, name: str, value: object) -> None:
+        (self.folder / f"{name}.json").write_text(json.dumps(value))
+
+    def image(self, name: str, pixels: np.ndarray) -> None:
+        path = self.folder / name
+        path.parent.mkdir(exist_ok=True)
+        if pixels.ndim == 3:
+            pixels = pixels[..., ::-1]
+        assert cv2.imwrite(str(path), pixels)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """Two images: one with two blocks, one without."""
+    made = Scene(tmp_path)
+    made.annotate({"3": [truth(9), truth(2)], "11": []}, {"3": [0.25, 0.75], "11": []})
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[..., 0] = 200
+    for stem in ("000003", "000011"):
+        made.image(f"rgb/{stem}.png", picture)
+        made.image(f"depth/{stem}.png", np.full((48, 64), 500, np.uint16))
+    mask = np.zeros((48, 64), np.uint8)
+    mask[10:20, 30:40] = 255
+    made.image("mask_visib/000003_000001.png", mask)
+    return made
+
+
+def test_conventions_in_literal_numbers(scene: Scene) -> None:
+    source = BopSource(scene.root, [block(2)], "test")
+    assert len(source) == 2
+    sample = source.sample(0)
+    (instance,) = sample.instances
+    expected = np.array([[0, -1, 0, 0.005], [1, 0, 0, -0.010], [0, 0, 1, 0.250], [0, 0, 0, 1]])
+    np.testing.assert_allclose(instance.T_cam_obj, expected, atol=1e-15)
+    np.testing.assert_array_equal(sample.K, np.reshape(K, (3, 3)))
+    # The centre projects to fx·x/z + cx = 100·5/250 + 31.5 and 101·(−10)/250 + 23.5.
+    np.testing.assert_allclose(instance.keypoints[8], [33.5, 19.46], atol=1e-12)
+    projected, _ = cv2.projectPoints(
+        1000 * block(2).cuboid,
+        Rotation.from_matrix(np.reshape(R, (3, 3))).as_rotvec(),
+        np.array([5.0, -10.0, 250.0]),
+        np.reshape(K, (3, 3)),
+        None,
+    )
+    np.testing.assert_allclose(instance.keypoints, projected[:, 0], atol=1e-9)
+    assert instance.visible_fraction == 0.75
+    assert instance.mask is not None
+    assert instance.mask.sum() == 100
+    assert instance.mask[10, 30]
+    assert sample.depth is not None
+    np.testing.assert_allclose(sample.depth, 0.25)  # 500 units of 0.5 mm
+    assert (sample.image[..., 0] == 200).all()  # red
+    assert (sample.source, sample.key) == ("bop/test", "000001/000003")
+    empty = source.sample(1)
+    assert (empty.instances, empty.key) == ([], "000001/000011")
+    assert source.contains("obj_000002")
+    assert not source.contains("obj_000009")
+    (info,) = source.describe()
+    assert info.num_instances == {"obj_000002": 1}
+    assert info.identity["left_out"] == {"other_objects": 1, "behind_the_camera": 0}
+    copied = pickle.loads(pickle.dumps(source)).sample(0)
+    np.testing.assert_array_equal(copied.image, sample.image)
+    assert BopSource(scene.root, [block(2)], "test", read_depth=False).sample(0).depth is None
+
+
+def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, "val", 7)
+    scene.annotate({"0": [truth(1)], "1": [truth(1)]}, None)
+    grey = np.tile(np.arange(64, dtype=np.uint8), (48, 1))
+    scene.image("gray/000000.tif", grey)
+    Image.fromarray(grey).save(scene.folder / "gray" / "000001.jpg", quality=95)
+    depth = np.full((48, 64), 40_000, np.uint16)
+    depth[0, 0] = 0
+    scene.image("depth/000000.tif", depth)
+    scene.image("depth/000001.png", depth)
+    source = BopSource(tmp_path, [block(1)], "val")
+    for index in (0, 1):
+        sample = source.sample(index)
+        assert np.abs(sample.image - grey[..., None].astype(int)).max() <= 3 * index
+        assert sample.depth is not None
+        np.testing.assert_allclose(sample.depth, depth * 0.0005, rtol=1e-6)
+        assert sample.instances[0].mask is None
+
+
+def test_fraction_is_estimated_where_it_is_not_stated(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    half_out = truth(1, (-78.75, 0.0, 250.0))  # its centre is on the left border, pixel −½ + ½
+    scene.annotate({"0": [truth(1), half_out]}, None)
+    scene.image("rgb/000000.png", np.zeros((48, 64, 3), np.uint8))
+    mask = np.zeros((48, 64), np.uint8)
+    mask[15:20, 30:35] = 1
+    scene.image("mask_visib/000000_000000.png", mask)
+    source = BopSource(tmp_path, [block(1)], "test")
+    masked, bare = source.sample(0).instances
+    hull = cv2.contourArea(cv2.convexHull(masked.keypoints[:8].astype(np.float32)))
+    assert masked.visible_fraction == pytest.approx(25 / hull)
+    assert bare.visible_fraction == pytest.approx(0.5, abs=0.06)
+    assert "estimated" in str(source.describe()[0].identity["visible_fractions"])
+
+
+def test_scenes_images_targets_and_shares(tmp_path: Path) -> None:
+    for number in (2, 10):
+        scene = Scene(tmp_path, "train_pbr", number)
+        scene.annotate({str(i): [truth(1)] for i in (0, 2, 10, 1)}, None)
+        for i in (0, 1, 2, 10):
+            scene.image(f"rgb/{i:06d}.jpg", np.zeros((48, 64, 3), np.uint8))
+    (tmp_path / "train_pbr" / "notes").mkdir()
+
+    def keys(**options: Any) -> list[str]:
+        source = BopSource(tmp_path, [block(1)], "train_pbr", **options)
+        return [source.sample(i).key for i in range(len(source))]
+
+    everything = keys()
+    assert everything == [f"{s:06d}/{i:06d}" for s in (2, 10) for i in (0, 1, 2, 10)]
+    assert keys(part_of=(0, 0.8)) + keys(part_of=(0.8, 0.9)) + keys(part_of=(0.9, 1)) == everything
+    targets = [{"scene_id": 10, "im_id": i, "obj_id": 1, "inst_count": 1} for i in (10, 0, 0)]
+    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(targets))
+    assert keys(targets="test_targets_bop19.json") == ["000010/000000", "000010/000010"]
+    with pytest.raises(UserError, match=r"no image in the share 0 – 0\.01 of 8 images"):
+        keys(part_of=(0, 0.01))
+    (tmp_path / "test_targets_bop19.json").write_text('[{"scene_id": "1", "im_id": 3}]')
+    with pytest.raises(UserError, match="target 0 with scene_id and im_id"):
+        keys(targets="test_targets_bop19.json")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 200), st.lists(st.floats(0.01, 0.99), max_size=4, unique=True))
+def test_shares_are_disjoint_and_complete(num_items: int, inner: list[float]) -> None:
+    bounds = [0.0, *sorted(inner), 1.0]
+    taken: list[int] = []
+    for first, last in pairwise(bounds):
+        try:
+            taken += range(num_items)[share(num_items, (first, last), "x")]
+        except UserError:
+            continue
+    assert taken == list(range(num_items))
+    with pytest.raises(ValueError, match="ascending"):
+        share(num_items, (0.5, 0.5), "x")
+
+
+def test_absent_images_and_objects_behind_the_camera_are_counted(
+    scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    (scene.folder / "rgb" / "000011.png").unlink()
+    scene.json("scene_gt", {"3": [truth(2, (0, 0, -50.0)), truth(2)], "99": [truth(2)]})
+    scene.json("scene_gt_info", {"3": [{"visib_fract": 0.0}] * 2, "99": [{"visib_fract": 1}]})
+    source = BopSource(scene.root, [block(2)], "test")
+    assert [len(source.sample(i).instances) for i in range(len(source))] == [1]
+    assert source.sample(0).instances[0].mask is not None  # number 1 of the list
+    assert "1 of 2 listed images are absent" in caplog.text
+    assert "1 images have ground truth and no camera" in caplog.text
+    assert "0 objects that are none of the parts and 1 behind the camera" in caplog.text
+
+
+def test_matrices_may_be_nested_and_numbers_whole(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    nested = truth(1) | {"cam_R_m2c": np.reshape(R, (3, 3)).tolist(), "cam_t_m2c": [[0], [0], [9]]}
+    scene.annotate({"0": [nested]}, {"0": [1]})
+    scene.image("rgb/000000.png", np.zeros((48, 64, 3), np.uint8))
+    (instance,) = BopSource(tmp_path, [block(1)], "test").sample(0).instances
+    np.testing.assert_allclose(instance.T_cam_obj[:3, 3], [0, 0, 0.009])
+    np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
+
+
+BAD: list[tuple[str, object, str]] = [
+    ("scene_gt", {"3": [truth(2) | {"cam_R_m2c": [1] * 9}]}, r"image 3, object 0: cam_R_m2c"),
+    ("scene_gt", {"3": [truth(2) | {"cam_R_m2c": [1] * 8}]}, r"cam_R_m2c: .*9 finite numbers"),
+    ("scene_gt", {"3": [truth(2) | {"cam_R_m2c": [1e300] * 9}]}, r"a rotation matrix"),
+    ("scene_gt", {"3": [truth(2) | {"cam_t_m2c": ["0", "0", "1"]}]}, r"cam_t_m2c: .*3 finite"),
+    ("scene_gt", {"3": [truth(2) | {"cam_t_m2c": [0, 0, 1e30]}]}, r"cam_t_m2c \[.*millimetres"),
+    ("scene_gt", {"3": [truth(2), {"obj_id": 2}]}, r"object 1: cam_R_m2c: None"),
+    ("scene_gt", {"3": [truth(2) | {"obj_id": 1.5}]}, r"obj_id 1.5"),
+    ("scene_gt", {"3": [truth(2) | {"obj_id": [10**400]}]}, r"obj_id: .*1 finite"),
+    ("scene_gt", {"3": [7]}, r"object 0: cam_R_m2c"),
+    ("scene_gt", {"3": {"a": 1}}, r"scene_gt.json: image 3; .*a list of objects"),
+    ("scene_gt", {"a": []}, r"scene_gt.json: image 'a'"),
+    ("scene_gt", {"3": [], "03": []}, r"scene_gt.json: image '03'.*once"),
+    ("scene_gt", [], r"scene_gt.json; .*images by number"),
+    ("scene_gt_info", {"3": [{"visib_fract": 1}]}, r"image 3 with 1 objects; .* 2, as many"),
+    ("scene_gt_info", {"11": []}, r"image 3 with nan objects"),
+    ("scene_gt_info", {"3": [{"visib_fract": 1.5}] * 2, "11": []}, r"visib_fract 1.5"),
+    ("scene_camera", {"3": {"cam_K": K[:8]}}, r"scene_camera.json: image 3: cam_K: .*9 finite"),
+    ("scene_camera", {"3": {"cam_K": K, "depth_scale": 0}}, r"depth_scale 0.0"),
+    ("scene_camera", {"3": {"cam_K": K, "depth_scale": "1"}}, r"depth_scale: .*1 finite"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), BAD)
+def test_bad_annotation_is_refused_at_opening(
+    scene: Scene, name: str, value: object, message: str
+) -> None:
+    if name == "scene_gt":
+        (scene.folder / "scene_gt_info.json").unlink()
+    scene.json(name, value)
+    with pytest.raises(UserError, match=message) as caught:
+        BopSource(scene.root, [block(2)], "test")
+    assert f"{scene.folder}" in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("text", ['{"3": NaN}', "[" * 5000, '{"3": [], "3": []}', '{"3'])
+@pytest.mark.parametrize("name", ["scene_camera", "scene_gt", "scene_gt_info"])
+def test_hostile_json(scene: Scene, name: str, text: str) -> None:
+    (scene.folder / f"{name}.json").write_text(text)
+    with pytest.raises(UserError, match=f"{name}.json"):
+        BopSource(scene.root, [block(2)], "test")
+
+
+def test_bad_images_are_named(scene: Scene) -> None:
+    def refused(match: str, **options: Any) -> None:
+        with pytest.raises(UserError, match=match):
+            BopSource(scene.root, [block(2)], "test", **options).sample(0)
+
+    small = np.zeros((10, 10), np.uint8)
+    scene.image("mask_visib/000003_000001.png", small)
+    refused(r"mask_visib/000003_000001.png: 10×10 pixels; allowed: 64×48")
+    (scene.folder / "mask_visib" / "000003_000001.png").unlink()
+    scene.image("depth/000003.png", small)
+    refused(r"depth/000003.png: 10×10 pixels; allowed: 64×48")
+    (scene.folder / "depth" / "000003.png").unlink()
+    refused(r"depth/000003.png: No such file")
+    content = (scene.folder / "rgb" / "000003.png").read_bytes()
+    (scene.folder / "rgb" / "000003.png").write_bytes(content[:-40])
+    refused(r"rgb/000003.png: .* bytes")
+    (scene.folder / "rgb" / "000003.jpg").write_bytes(content)
+    refused(r"image 3 as rgb/000003.* and rgb/000003.*one file an image")
+    (scene.folder / "rgb" / "000003.png").unlink()
+    scene.json("scene_camera", {"3": {"cam_K": K}, "11": {"cam_K": K}})
+    scene.image("depth/000003.png", np.zeros((48, 64), np.uint16))
+    refused(r"depth/000003.png: no depth_scale")
+    far = [*K[:2], 500.0, *K[3:]]
+    scene.json("scene_camera", {"3": {"cam_K": far}, "11": {"cam_K": K}})
+    refused(r"K with .*cx=500.*image 3", read_depth=False)
+
+
+def test_wrong_folders_are_named(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"train_pbr, which is no folder; allowed: one of \['test"):
+        BopSource(scene.root, [block(2)], "train_pbr")
+    (tmp_path / "empty" / "test").mkdir(parents=True)
+    with pytest.raises(UserError, match="which has no scene"):
+        BopSource(tmp_path / "empty", [block(2)], "test")
+    for path in (scene.folder / "rgb").iterdir():
+        path.unlink()
+    with pytest.raises(UserError, match=r"no image under .* \(2 listed\)"):
+        BopSource(scene.root, [block(2)], "test")
+    (scene.folder / "scene_camera.json").unlink()
+    with pytest.raises(UserError, match=r"scene_camera\.json, no such file"):
+        BopSource(scene.root, [block(2)], "test")
+
+
+def _saved(image: Image.Image, name: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, name, **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
+@pytest.mark.parametrize("name", ["PNG", "JPEG", "TIFF"])
+def test_an_image_cut_short_is_refused(name: str) -> None:
+    rng = np.random.default_rng(0)
+    picture = Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8))
+    content = _saved(picture, name)
+    assert decode_rgb(content, "x").shape == (40, 50, 3)
+    for length in (0, 1, 10, len(content) // 2, len(content) - 30):
+        with pytest.raises(UserError, match=r"image some/file\.x"):
+            decode_rgb(content[:length], "some/file.x")
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
+def test_other_formats_channels_and_bombs_are_refused() -> None:
+    grey = Image.fromarray(np.zeros((4, 5), np.uint8))
+    with pytest.raises(UserError, match="cannot identify"):
+        decode_rgb(_saved(grey, "GIF"), "x")
+    with pytest.raises(UserError, match="10000×10000 pixels"):
+        decode_rgb(_saved(Image.new("1", (10_000, 10_000)), "PNG"), "x")
+    with pytest.raises(UserError, match="type I;16"):
+        decode_rgb(encode_png(np.zeros((4, 5), np.uint16)), "x")
+    with pytest.raises(UserError, match="type RGB"):
+        decode_depth(encode_png(np.zeros((4, 5, 3), np.uint8)), "x", 1.0, (4, 5))
+    with pytest.raises(UserError, match="type RGB"):
+        decode_mask(encode_png(np.zeros((4, 5, 3), np.uint8)), "x", (4, 5))
+    assert decode_rgb(_saved(grey.convert("P"), "PNG"), "x").shape == (4, 5, 3)
+    assert decode_rgb(_saved(grey.convert("RGBA"), "PNG"), "x").shape == (4, 5, 3)
+    assert not decode_mask(_saved(grey.convert("1"), "PNG"), "x", (4, 5)).any()
+
+
+@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=80), st.sampled_from([decode_rgb]))
+def test_any_bytes_are_an_image_or_a_user_error(
+    content: bytes, decode: Callable[[bytes, str], np.ndarray]
+) -> None:
+    for prefix in (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0"):
+        with pytest.raises(UserError):
+            decode(prefix + content, "x")
+
+
+def test_samples_are_plain(scene: Scene) -> None:
+    sample: Sample = BopSource(scene.root, [block(2)], "test").sample(0)
+    assert sample.image.flags.writeable
+    assert sample.instances[0].T_cam_obj.flags.writeable

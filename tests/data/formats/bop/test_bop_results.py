@@ -1,0 +1,154 @@
+"""BOP challenge CSVs: as the BOP toolkit writes them, back again, and as nobody should."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop import results as bop_results
+from dopepp.data.formats.bop.results import PoseResult, read_results, results_name, write_results
+
+HEADER = "scene_id,im_id,obj_id,score,R,t,time"
+R = "1 0 0 0 0 -1 0 1 0"
+GOOD = f"1,4,2,0.75,{R},-10.5 20 812.25,0.5"
+
+BY_HAND = f"""{HEADER}
+{GOOD}
+1,4,2,0.25,1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0,1e2 -2.5E+1 +900.,0.5
+48,1000,21,-3,  0 -1 0  1 0 0  0 0 1 , 0 0 1500,-1
+"""
+
+
+def write(folder: Path, content: str | bytes) -> Path:
+    path = folder / "method_set-test.csv"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def test_a_file_in_the_toolkits_format(tmp_path: Path) -> None:
+    first, second, third = read_results(write(tmp_path, BY_HAND), {2, 21})
+    assert (first.scene_id, first.im_id, first.obj_id, first.score) == (1, 4, 2, 0.75)
+    expected = np.array([[1, 0, 0, -0.0105], [0, 0, -1, 0.02], [0, 1, 0, 0.81225], [0, 0, 0, 1]])
+    np.testing.assert_allclose(first.T_cam_obj, expected, atol=1e-15)
+    np.testing.assert_allclose(second.T_cam_obj[:3, 3], [0.1, -0.025, 0.9], atol=1e-15)
+    assert (first.seconds, third.seconds) == (0.5, -1)
+    assert (third.scene_id, third.im_id, third.obj_id, third.score) == (48, 1000, 21, -3)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        f"{HEADER}\r\n{GOOD}\r\n",
+        f"\ufeff{HEADER}\n\n{GOOD}\n\n",
+        f"scene_id, im_id, obj_id, score, R, t, time\n{GOOD.replace(',', ' , ')}",
+    ],
+)
+def test_header_blanks_and_line_ends_may_vary(content: str, tmp_path: Path) -> None:
+    (result,) = read_results(write(tmp_path, content), {2})
+    assert (result.im_id, result.score, result.seconds) == (4, 0.75, 0.5)
+
+
+def test_a_header_alone_is_a_method_that_found_nothing(tmp_path: Path) -> None:
+    assert read_results(write(tmp_path, HEADER + "\n"), {1}) == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 12))
+def test_what_is_written_is_read_back(
+    seed: int, count: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    rng = np.random.default_rng(seed)
+    results = []
+    for number in range(count):
+        T: NDArray[np.float64] = np.eye(4)
+        T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+        T[:3, 3] = rng.normal([0, 0, 1], 0.2)
+        results.append(PoseResult(number // 5, number % 5, 1 + number % 3, rng.normal(), T, 0.1))
+    path = tmp_path_factory.mktemp("results") / "out.csv"
+    write_results(path, results)
+    assert path.read_text().splitlines()[0] == HEADER
+    for one, back in zip(results, read_results(path, {1, 2, 3}), strict=True):
+        np.testing.assert_allclose(back.T_cam_obj, one.T_cam_obj, rtol=0, atol=1e-12)
+        assert vars(back) | {"T_cam_obj": 0} == vars(one) | {"T_cam_obj": 0}
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1,4,2,0.75", r"line 2 with 4 fields; allowed: 7: scene_id,im_id"),
+        (GOOD + ",", r"line 2 with 8 fields"),
+        (GOOD.replace("1,4", "x,4", 1), r"line 2: scene_id 'x'; allowed: a whole number"),
+        (GOOD.replace("1,4", "-1,4", 1), r"line 2: scene_id '-1'"),
+        (GOOD.replace("1,4", "1,4.5", 1), r"line 2: im_id '4\.5'"),
+        (GOOD.replace("1,4", "1,99999999999", 1), r"line 2: im_id"),
+        (GOOD.replace(",2,", ",7,", 1), r"line 2: obj_id 7; allowed: the data set's objects: 2, 3"),
+        (GOOD.replace("0.75", "nan"), r"line 2: score: 'nan'; allowed: finite numbers"),
+        (GOOD.replace("0.75", "1e999"), r"line 2: score: '1e999'"),
+        (GOOD.replace("0.75", "1_0"), r"line 2: score: '1_0'"),
+        (GOOD.replace("0.75", ""), r"line 2: score with 0: ''; allowed: 1 number"),
+        (GOOD.replace(R, "1 0 0 0 1 0 0 0"), r"line 2: R with 8: .*; allowed: 9 numbers"),
+        (GOOD.replace(R, "[1 0 0 0 1 0 0 0 1]"), r"line 2: R: '\[1'"),
+        (GOOD.replace(R, "1 0 0 0 1 0 0 0 -1"), r"line 2: R .*; allowed: a rotation matrix"),
+        (GOOD.replace(R, "1.002 0 0 0 1 0 0 0 1"), r"line 2: R .*within 1e-3"),
+        (GOOD.replace(R, "1e200 0 0 0 1 0 0 0 1"), r"line 2: R .*a rotation matrix"),
+        (GOOD.replace("-10.5 20", "20"), r"line 2: t with 2: '20 812\.25'; allowed: 3 numbers"),
+        (GOOD.replace("-10.5", "NaN"), r"line 2: t: 'NaN'"),
+        (GOOD.replace("-10.5", "1e12"), r"line 2: t .*; allowed: millimetres"),
+        (GOOD.replace("812.25,0.5", "812.25,-2"), r"line 2: time '-2'; allowed: seconds, or -1"),
+        (GOOD.replace("812.25,0.5", "812.25,inf"), r"line 2: time: 'inf'"),
+        (GOOD.replace("-10.5 20 812.25", "-0.01 0.02 0.81"), r"line 2: t of length 0\.81.*metres"),
+        (GOOD.replace("-10.5 20 812.25", "0 0 812250"), r"line 2: t of length 8\.\d+e\+05.*more"),
+        (f"{GOOD}\n1,5,2,0.75,{R},0 0 700,1\n{GOOD}", r"line 4, which repeats line 2;.*once"),
+        (GOOD + "é", r"line 2, which is no ASCII text"),
+        (GOOD.replace("0.75", "0" * 5000), r"line 2 of more than 4096 bytes"),
+        (HEADER, r"line 2: scene_id 'scene_id'"),
+    ],
+)
+def test_a_wrong_line_is_named(line: str, message: str, tmp_path: Path) -> None:
+    path = write(tmp_path, f"{HEADER}\n{line}\n")
+    with pytest.raises(UserError, match=message) as error:
+        read_results(path, {2, 3})
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600 + len(str(path))
+
+
+def test_the_same_pose_twice_with_another_score_is_none(tmp_path: Path) -> None:
+    again = GOOD.replace("0.75", "0.7")
+    assert len(read_results(write(tmp_path, f"{GOOD}\n{again}"), {2})) == 2
+
+
+def test_what_is_no_such_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in (tmp_path / "none.csv", tmp_path):
+        with pytest.raises(UserError, match=r"no such file"):
+            read_results(path, {1})
+    with pytest.raises(UserError, match=r"which is empty"):
+        read_results(write(tmp_path, ""), {1})
+    with pytest.raises(UserError, match=r"line 1"):
+        read_results(write(tmp_path, b"\x89PNG\r\n\x1a\n" + bytes(10_000)), {1})
+    monkeypatch.setattr(bop_results, "MAX_ROWS", 2)
+    lines = [GOOD.replace("0.75", f"0.{number}") for number in (1, 2, 3)]
+    with pytest.raises(UserError, match=r"line 3; allowed: at most 2 poses"):
+        read_results(write(tmp_path, "\n".join(lines)), {2})
+
+
+@pytest.mark.parametrize(
+    ("method", "dataset", "split", "name"),
+    [
+        ("dopepp", "lmo", "test", "dopepp_lmo-test.csv"),
+        ("a (baseline)", "ycb_video", "train_pbr", "a-baseline_ycbvideo-train-pbr.csv"),
+        ("a/../b_c", "../..", "", "a-..-b-c_data-test.csv"),
+        ("_", "-", "/", "method_data-test.csv"),
+    ],
+)  # fmt: skip
+def test_file_names_have_bops_three_parts(method: str, dataset: str, split: str, name: str) -> None:
+    assert results_name(method, dataset, split) == name
+    assert name.count("_") == 1

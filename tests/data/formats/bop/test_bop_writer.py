@@ -1,0 +1,267 @@
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.labels import make_labels
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.writer import STAGING, BopWriter
+from dopepp.data.sample import Instance, Sample
+from dopepp.data.sources.rendered import rendered_sample
+from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.surface import make_surface
+
+NUM_IMAGES = 4
+
+
+@pytest.fixture(scope="module")
+def parts() -> list[Part]:
+    return [servoholder(), pivconnector()]
+
+
+@pytest.fixture(scope="module")
+def samples(parts: list[Part]) -> list[Sample]:
+    factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=4)
+    return [rendered_sample(factory.render(0, i), "virtual", str(i)) for i in range(NUM_IMAGES)]
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def test_round_trip(parts: list[Part], samples: list[Sample], tmp_path: Path) -> None:
+    writer = BopWriter(tmp_path, parts)
+    writer.prepare()
+    for index, sample in enumerate(samples):
+        writer.write(index, sample)
+    writer.finalize(0, range(NUM_IMAGES))
+    source = BopSource(tmp_path, bop_parts(tmp_path), "train_pbr")
+    assert len(source) == NUM_IMAGES
+    assert sum(len(sample.instances) for sample in samples) > 2 * NUM_IMAGES
+    for index, sample in enumerate(samples):
+        read = source.sample(index, epoch=3)
+        assert read.key == f"000000/{index:06d}"
+        np.testing.assert_array_equal(read.image, sample.image)
+        np.testing.assert_array_equal(read.K, sample.K)
+        assert read.depth is not None
+        assert sample.depth is not None
+        assert np.abs(read.depth - sample.depth).max() <= 0.5001e-4  # half of 0.1 mm
+        for instance, expected in zip(read.instances, sample.instances, strict=True):
+            assert instance.label == expected.label
+            np.testing.assert_allclose(instance.T_cam_obj, expected.T_cam_obj, atol=1e-12)
+            np.testing.assert_allclose(instance.keypoints, expected.keypoints, atol=1e-4)
+            np.testing.assert_array_equal(instance.mask, expected.mask)
+            assert instance.visible_fraction == expected.visible_fraction
+    (info,) = source.describe()
+    assert sum(info.num_instances.values()) == sum(len(s.instances) for s in samples)
+    assert info.identity["visible_fractions"] == "scene_gt_info.json"
+
+
+def test_bytes_do_not_depend_on_the_order_of_writing(
+    parts: list[Part], samples: list[Sample], tmp_path: Path
+) -> None:
+    one, other = BopWriter(tmp_path / "one", parts), BopWriter(tmp_path / "other", parts)
+    for writer in (one, other):
+        writer.prepare()
+        writer.prepare()
+    for index in (0, 1, 1002, 1003):
+        one.write(index, samples[index % 1000])
+    for chunk in (0, 1):
+        one.finalize(chunk, [0, 1, 1002, 1003][2 * chunk : 2 * chunk + 2])
+    for index in (1003, 1, 1002, 0):
+        other.write(index, samples[index % 1000])
+        other.finalize(index // 1000, [index])
+        other.finalize(index // 1000, [index])
+    assert contents(tmp_path / "one") == contents(tmp_path / "other")
+    assert not list((tmp_path / "one").rglob(".*"))
+    assert other.written(1) == {1002, 1003}
+    assert other.written(2) == set()
+
+
+def test_goes_on_after_being_killed(
+    parts: list[Part], samples: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = BopWriter(tmp_path / "whole", parts)
+    whole.prepare()
+    for index, sample in enumerate(samples):
+        whole.write(index, sample)
+    whole.finalize(0, range(NUM_IMAGES))
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    root = tmp_path / "killed"
+    first = BopWriter(root, parts)
+    first.prepare()
+    first.write(2, samples[2])
+    first.finalize(0, [2])
+    first.write(0, samples[0])
+    with monkeypatch.context() as patch:
+        patch.setattr("dopepp.data.formats.bop.writer.stage", die)
+        with pytest.raises(KeyboardInterrupt):
+            first.write(1, samples[1])  # all of its images, and no marker
+    assert BopWriter(root, parts).written(0) == {0, 2}
+    with monkeypatch.context() as patch:
+        patch.setattr(BopWriter, "_write_camera", die)
+        with pytest.raises(KeyboardInterrupt):
+            BopWriter(root, parts).finalize(0, [0])
+    assert len(list((root / "train_pbr/000000" / STAGING).glob("*.json"))) == 1
+    again = BopWriter(root, parts)
+    assert again.written(0) == {0, 2}
+    for index in {0, 1, 2, 3} - again.written(0):
+        again.write(index, samples[index])
+    again.finalize(0, range(NUM_IMAGES))
+    again.finalize(0, range(NUM_IMAGES))
+    assert contents(root) == contents(tmp_path / "whole")
+
+
+def _write_and_seal(root: Path, parts: list[Part], samples: list[Sample], first: int) -> None:
+    writer = BopWriter(root, parts)
+    for index in range(first, 40, 2):
+        writer.write(index, samples[index % NUM_IMAGES])
+        writer.finalize(0, [index])
+
+
+@pytest.mark.ddp
+def test_two_processes_seal_one_scene(
+    parts: list[Part], samples: list[Sample], tmp_path: Path
+) -> None:
+    BopWriter(tmp_path, parts).prepare()
+    context = multiprocessing.get_context("fork")
+    processes = [
+        context.Process(target=_write_and_seal, args=(tmp_path, parts, samples, first))
+        for first in (0, 1)
+    ]
+    for process in processes:
+        process.start()
+    killed = context.Process(target=_write_and_seal, args=(tmp_path, parts, samples, 0))
+    killed.start()
+    while not BopWriter(tmp_path, parts).written(0):
+        pass
+    assert killed.pid is not None
+    os.kill(killed.pid, signal.SIGKILL)
+    for process in [*processes, killed]:
+        process.join()
+    assert [process.exitcode for process in processes] == [0, 0]
+    assert BopWriter(tmp_path, parts).written(0) == set(range(40))
+    records = json.loads((tmp_path / "train_pbr/000000/scene_gt.json").read_text())
+    assert list(records) == [str(index) for index in range(40)]
+
+
+def test_annotation_of_a_plate_in_literal_numbers(tmp_path: Path) -> None:
+    # A plate of 40 × 20 mm that faces the camera at 200 mm: 0.2 px/mm·200 → 20 px × 10 px.
+    part = make_part("plate", _box((0.040, 0.020, 0.002)))
+    T = np.eye(4)
+    T[:3, 3] = 0.0, 0.0, 0.201
+    K = camera_matrix(100.0, 100.0, 15.5, 11.5)
+    visible = np.zeros((24, 32), bool)
+    visible[7:17, 10:20] = True  # the left half
+    depth = np.where(visible, 0.2, 0.0).astype(np.float32)
+    depth[7:17, 20:26] = 0.15  # something before the right half
+    depth[0, 0] = 70.0  # beyond the scale
+    instance = Instance("plate", T, project_keypoints(part.cuboid, T, K), 0.5, visible)
+    sample = Sample(np.zeros((24, 32, 3), np.uint8), K, [instance], depth)
+    labels = make_labels(sample, {"plate": 7}, {"plate": (part, make_surface(part.mesh))})
+    assert labels.camera == {
+        "cam_K": [100.0, 0.0, 15.5, 0.0, 100.0, 11.5, 0.0, 0.0, 1.0],
+        "depth_scale": 0.1,
+    }
+    (truth,) = labels.truths
+    assert truth["obj_id"] == 7
+    assert truth["cam_R_m2c"] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    np.testing.assert_allclose(truth["cam_t_m2c"], [0, 0, 201], atol=1e-12)
+    (info,) = labels.infos
+    # Columns 15.5 ± 10 are pixels 6 – 25, rows 11.5 ± 5 pixels 7 – 16.
+    assert info == {
+        "bbox_obj": [6, 7, 19, 9],
+        "bbox_visib": [10, 7, 9, 9],
+        "px_count_all": 200,
+        "px_count_valid": 160,
+        "px_count_visib": 100,
+        "visib_fract": 0.5,
+    }
+    assert labels.depth[10, 12] == 2000
+    assert labels.depth[10, 22] == 1500
+    assert labels.depth[0, 0] == 0
+    writer = BopWriter(tmp_path, [part])
+    writer.prepare()
+    writer.write(0, sample)
+    writer.finalize(0, [0])
+    assert json.loads((tmp_path / "camera.json").read_text()) == {
+        "cx": 15.5, "cy": 11.5, "depth_scale": 0.1, "fx": 100.0, "fy": 100.0,
+        "height": 24, "width": 32,
+    }  # fmt: skip
+    mask = cv2.imread(str(tmp_path / "train_pbr/000000/mask/000000_000000.png"), -1)
+    assert mask.dtype == np.uint8
+    assert set(np.unique(mask)) == {0, 255}
+    assert (mask[7:17, 6:26] == 255).all()
+    png = cv2.imread(str(tmp_path / "train_pbr/000000/depth/000000.png"), -1)
+    assert png.dtype == np.uint16
+    np.testing.assert_array_equal(png, labels.depth)
+
+
+def test_truncated_hidden_and_far_objects() -> None:
+    part = make_part("plate", _box((0.040, 0.020, 0.002)))
+    surfaces = {"plate": (part, make_surface(part.mesh))}
+    K = camera_matrix(100.0, 100.0, 15.5, 11.5)
+    T = np.eye(4)
+    T[:3, 3] = -0.0305, 0.0, 0.201  # columns −9.75 … 10.25
+    visible = np.zeros((24, 32), bool)
+    visible[7:17, :11] = True
+    hidden = np.zeros_like(visible)
+    depth = np.where(visible, 20.0, 0.0).astype(np.float32)
+    keypoints = project_keypoints(part.cuboid, T, K)
+    instances = [
+        Instance("plate", T, keypoints, 0.5, visible),
+        Instance("plate", T, keypoints, 0.0, hidden),
+    ]
+    image = np.zeros((24, 32, 3), np.uint8)
+    labels = make_labels(Sample(image, K, instances, depth), {"plate": 1}, surfaces)
+    assert labels.infos[0]["bbox_obj"] == [-9, 7, 19, 9]
+    assert labels.infos[0]["bbox_visib"] == [0, 7, 10, 9]
+    assert labels.infos[0]["px_count_all"] == 200
+    assert labels.infos[1]["bbox_obj"] == labels.infos[1]["bbox_visib"] == [-1, -1, -1, -1]
+    assert labels.infos[1]["px_count_visib"] == 0
+    # 20 m do not fit into 16 bits of 0.1 mm.
+    assert labels.camera["depth_scale"] == 1.0
+    assert labels.depth[10, 5] == 20_000
+    with pytest.raises(ValueError, match="without depth"):
+        make_labels(Sample(image, K, instances), {"plate": 1}, surfaces)
+    bare = [Instance("plate", T, keypoints)]
+    with pytest.raises(ValueError, match="without a mask"):
+        make_labels(Sample(image, K, bare, depth), {"plate": 1}, surfaces)
+    with pytest.raises(ValueError, match="'plate'"):
+        make_labels(Sample(image, K, instances, depth), {"other": 1}, surfaces)
+
+
+def test_refuses_a_folder_of_something_else(parts: list[Part], tmp_path: Path) -> None:
+    BopWriter(tmp_path / "a", parts).prepare()
+    with pytest.raises(UserError, match=r"models_info\.json, written for other parts"):
+        BopWriter(tmp_path / "a", parts[:1]).prepare()
+    (tmp_path / "b" / "train_pbr").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"has train_pbr/ and no models"):
+        BopWriter(tmp_path / "b", parts).prepare()
+    bare = Part("bare", parts[0].cuboid, 0.1, parts[0].points)
+    with pytest.raises(UserError, match="part bare without a mesh"):
+        BopWriter(tmp_path / "c", [bare]).prepare()
+    assert not (tmp_path / "c").exists()
+
+
+def _box(extents: tuple[float, float, float]) -> Mesh:
+    box: Any = trimesh.creation.box(extents)
+    return Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32))

@@ -1,0 +1,628 @@
+"""NDDS: written and read back, and read as others write it (synthesised with SciPy and OpenCV)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.ndds.writer import NddsWriter
+from dopepp.data.sample import Instance, Sample
+from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.parts.part import Mesh, Part, make_part
+
+WIDTH, HEIGHT = 160, 120
+K = camera_matrix(180.0, 181.0, 79.0, 60.5)
+SIGNS = np.array([(x, y, z) for z in (1, -1) for x, y in ((1, -1), (-1, -1), (-1, 1), (1, 1))])
+"""NDDS's corner order, from the readme of Falling Things."""
+
+
+def make_box(name: str, sides: tuple[float, float, float], centre: tuple[float, ...]) -> Part:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    vertices = np.array(centre) + corners * np.array(sides) / 2
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
+    return make_part(name, Mesh(vertices, faces.astype(np.int32)), points=vertices)
+
+
+BOX = make_box("box", (0.08, 0.05, 0.03), (0.01, -0.02, 0.005))
+CUBE = make_box("cube", (0.06, 0.06, 0.06), (0.0, 0.0, 0.0))
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, 3] = [*rng.uniform(-0.04, 0.04, 2), rng.uniform(0.35, 0.6)]
+    return T
+
+
+def make_sample(seed: int, parts: tuple[Part, ...] = (BOX, CUBE)) -> Sample:
+    rng = np.random.default_rng(seed)
+    instances = []
+    taken = np.zeros((HEIGHT, WIDTH), bool)
+    for part in parts:
+        T = random_pose(rng)
+        keypoints = project_keypoints(part.cuboid, T, K)
+        canvas = np.zeros((HEIGHT, WIDTH), np.uint8)
+        cv2.fillConvexPoly(canvas, cv2.convexHull(np.rint(keypoints[:8]).astype(np.int32)), 1)
+        mask = (canvas > 0) & ~taken
+        taken |= mask
+        instances.append(Instance(part.name, T, keypoints, float(rng.uniform(0.2, 1)), mask))
+    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    depth = rng.uniform(0.3, 3, (HEIGHT, WIDTH)).astype(np.float32)
+    depth[0] = 0
+    return Sample(image, K, instances, depth)
+
+
+# --- our own files ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> tuple[Path, list[Sample]]:
+    writer = NddsWriter(tmp_path / "set", [BOX, CUBE])
+    writer.prepare()
+    samples = [make_sample(seed) for seed in range(4)]
+    for index, sample in enumerate(samples):
+        writer.write(index, sample)
+    writer.finalize(0, range(4))
+    return tmp_path / "set", samples
+
+
+def test_round_trip(written: tuple[Path, list[Sample]]) -> None:
+    root, samples = written
+    source = NddsSource(root, [BOX, CUBE])
+    assert len(source) == 4
+    for index, sample in enumerate(samples):
+        back = source.sample(index, epoch=7)
+        np.testing.assert_array_equal(back.image, sample.image)
+        np.testing.assert_array_equal(back.K, sample.K)
+        assert back.depth is not None
+        np.testing.assert_allclose(back.depth, sample.depth, atol=0.51e-4)
+        assert (back.key, back.source) == (f"{index:06d}", "ndds/set")
+        for one, other in zip(back.instances, sample.instances, strict=True):
+            assert one.label == other.label
+            np.testing.assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-12)
+            np.testing.assert_allclose(one.keypoints, other.keypoints, atol=1e-9)
+            assert one.visible_fraction == other.visible_fraction
+            np.testing.assert_array_equal(one.mask, other.mask)
+
+
+def test_fields_agree_with_their_documentation(written: tuple[Path, list[Sample]]) -> None:
+    root, samples = written
+    record = json.loads((root / "000001.json").read_text())
+    P = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])
+    for item, instance in zip(record["objects"], samples[1].instances, strict=True):
+        R, t = instance.T_cam_obj[:3, :3], instance.T_cam_obj[:3, 3]
+        np.testing.assert_allclose(
+            Rotation.from_quat(item["quaternion_xyzw"]).as_matrix(), R, atol=1e-12
+        )
+        np.testing.assert_allclose(item["location"], 100 * t, atol=1e-10)
+        # The readme of Falling Things: the rotation is Aᵀ·P of the stored matrix A.
+        A = np.array(item["pose_transform"])
+        np.testing.assert_allclose(A[:3, :3].T @ P, R, atol=1e-12)
+        np.testing.assert_allclose(A[3], [*(100 * t), 1], atol=1e-10)
+        part = {"box": BOX, "cube": CUBE}[item["class"]]
+        half, centre = np.ptp(part.cuboid, axis=0) / 2, part.cuboid[8]
+        corners = 100 * ((centre + SIGNS * half) @ R.T + t)
+        np.testing.assert_allclose(item["cuboid"], corners, atol=1e-9)
+        np.testing.assert_allclose(item["cuboid_centroid"], 100 * (R @ centre + t), atol=1e-9)
+        pixels, _ = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), K, None)
+        np.testing.assert_allclose(item["projected_cuboid"], pixels[:, 0], atol=1e-6)
+        assert instance.mask is not None
+        x, y, width, height = cv2.boundingRect(instance.mask.astype(np.uint8))
+        assert item["bounding_box"]["top_left"] == [y, x]
+        assert item["bounding_box"]["bottom_right"] == [y + height - 1, x + width - 1]
+    camera = json.loads((root / "_camera_settings.json").read_text())["camera_settings"][0]
+    assert camera["intrinsic_settings"]["fx"] == 180.0
+    assert camera["captured_image_size"] == {"width": WIDTH, "height": HEIGHT}
+    exported = json.loads((root / "_object_settings.json").read_text())["exported_objects"]
+    np.testing.assert_allclose(exported[0]["cuboid_dimensions"], [8, 5, 3])
+
+
+def test_interrupted_writing_goes_on(tmp_path: Path) -> None:
+    writer = NddsWriter(tmp_path, [BOX, CUBE])
+    writer.prepare()
+    writer.write(3, make_sample(3))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    (tmp_path / "000004.png").write_bytes(b"half an image")  # killed before its annotation
+    again = NddsWriter(tmp_path, [BOX, CUBE])
+    again.prepare()
+    assert again.written(0) == {3}
+    assert again.written(1) == set()
+    again.write(4, make_sample(4))
+    again.write(3, make_sample(3))
+    assert again.written(0) == {3, 4}
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+    again.write(1_234_567, make_sample(5))
+    assert again.written(1234) == {1_234_567}
+
+
+def test_settings_are_written_for_one_camera_only(tmp_path: Path) -> None:
+    writer = NddsWriter(tmp_path, [BOX, CUBE])
+    writer.prepare()
+    other = make_sample(1)
+    other.K = camera_matrix(200.0, 200.0, 79.0, 60.0)
+    writer.write(0, make_sample(0))
+    writer.write(1, other)
+    writer.finalize(0, [0, 1])
+    assert not (tmp_path / "_camera_settings.json").exists()
+    writer.finalize(0, [0])
+    assert (tmp_path / "_camera_settings.json").exists()
+
+
+def test_writer_refuses_foreign_folders(tmp_path: Path) -> None:
+    NddsWriter(tmp_path / "a", [BOX]).prepare()
+    NddsWriter(tmp_path / "a", [BOX]).prepare()
+    with pytest.raises(UserError, match=r"_object_settings\.json of other parts"):
+        NddsWriter(tmp_path / "a", [CUBE]).prepare()
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "holiday.jpg").touch()
+    with pytest.raises(UserError, match=r"holiday\.jpg in .*/b, which no NDDS writer"):
+        NddsWriter(tmp_path / "b", [BOX]).prepare()
+
+
+def test_samples_without_masks_depth_or_instances(tmp_path: Path) -> None:
+    writer = NddsWriter(tmp_path, [BOX])
+    writer.prepare()
+    bare = make_sample(0, (BOX,))
+    bare.depth, bare.instances[0].mask = None, None
+    empty = make_sample(1, ())
+    writer.write(0, bare)
+    writer.write(1, empty)
+    source = NddsSource(tmp_path, [BOX])
+    assert source.sample(0).depth is None
+    assert source.sample(0).instances[0].mask is None
+    assert source.sample(1).instances == []
+
+
+def test_corner_behind_the_camera_survives(tmp_path: Path) -> None:
+    sample = make_sample(0, (BOX, BOX))
+    T = sample.instances[0].T_cam_obj
+    T[:3, 3] = [0, 0, 0.02]
+    sample.instances[0].keypoints = project_keypoints(BOX.cuboid, T, K)
+    assert np.isnan(sample.instances[0].keypoints).any()
+    writer = NddsWriter(tmp_path, [BOX])
+    writer.prepare()
+    for index in range(3):
+        writer.write(index, sample if index == 0 else make_sample(index, (BOX,)))
+    back = NddsSource(tmp_path, [BOX]).sample(0).instances[0]
+    np.testing.assert_allclose(back.T_cam_obj, T, atol=1e-12)
+    np.testing.assert_allclose(back.keypoints, sample.instances[0].keypoints, atol=1e-6)
+
+
+# --- files in the wild -----------------------------------------------------------------------
+
+
+class Wild:
+    """Writes NDDS the way others do; knows nothing of the package's own writer."""
+
+    def __init__(self, root: Path, **habits: Any) -> None:
+        self.root, self.poses = root, {}
+        self.order = habits.get("order", "xyzw")
+        self.scale = {"cm": 100.0, "m": 1.0, "mm": 1000.0}[habits.get("unit", "cm")]
+        self.opengl = habits.get("opengl", False)
+        self.names = habits.get("names", "{:06d}")
+        self.suffix = habits.get("suffix", ".png")
+        self.own_camera = habits.get("own_camera", True)
+        self.nine = habits.get("nine", False)
+        self.noise = habits.get("noise", 0.0)
+        self.F = habits.get("fixed")  # rigid 4×4, mesh to object frame, metres
+        self.front_x = habits.get("front_x", False)
+        self.visibility = habits.get("visibility", 1)
+        self.rng = np.random.default_rng(0)
+        root.mkdir(parents=True, exist_ok=True)
+
+    def item(self, number: int, *parts: Part, label: str | None = None) -> Path:
+        stem = self.names.format(number)
+        objects = []
+        for part in parts:
+            T = random_pose(self.rng)
+            self.poses.setdefault(stem, []).append(T)
+            objects.append(self.object(part, T, label or part.name))
+        camera: dict[str, Any] = {"location_worldframe": [1, 2, 3]}
+        if self.own_camera:
+            camera["intrinsics"] = {"fx": 180.0, "fy": 181.0, "cx": 79.0, "cy": 60.5}
+        path = self.root / f"{stem}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"camera_data": camera, "objects": objects}))
+        image = self.rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        cv2.imwrite(str(self.root / f"{stem}{self.suffix}"), image)
+        return path
+
+    def object(self, part: Part, T: np.ndarray, label: str) -> dict[str, Any]:
+        assert part.mesh is not None
+        F = np.eye(4) if self.F is None else self.F
+        T_file = T @ np.linalg.inv(F)
+        vertices = part.mesh.vertices @ F[:3, :3].T + F[:3, 3]
+        A = np.eye(3)
+        if self.front_x:  # corners as seen along x, with z up; the pose is the mesh's
+            A = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+        turned = vertices @ A.T
+        low, high = turned.min(axis=0), turned.max(axis=0)
+        corners = ((low + high) / 2 + SIGNS * (high - low) / 2) @ A
+        corners_cam = corners @ T_file[:3, :3].T + T_file[:3, 3]
+        points = np.vstack([corners_cam, corners_cam.mean(axis=0)])
+        pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, None)[0][:, 0]
+        pixels = pixels + self.rng.normal(0, 1, pixels.shape) * self.noise
+        D = np.diag([1.0, -1.0, -1.0]) if self.opengl else np.eye(3)
+        quaternion = Rotation.from_matrix(D @ T_file[:3, :3]).as_quat()
+        if self.order == "wxyz":
+            quaternion = quaternion[[3, 0, 1, 2]]
+        record = {
+            "class": label,
+            "location": (self.scale * (D @ T_file[:3, 3])).tolist(),
+            "quaternion_xyzw": quaternion.tolist(),
+            "projected_cuboid": pixels[: 9 if self.nine else 8].tolist(),
+        }
+        if not self.nine:
+            record["projected_cuboid_centroid"] = pixels[8].tolist()
+            record["cuboid_centroid"] = (self.scale * points[8]).tolist()
+        if self.visibility is not None:
+            record["visibility"] = self.visibility
+        return record
+
+    def settings(self, *labels: str, scale: float = 100.0) -> None:
+        F = np.eye(4) if self.F is None else self.F
+        matrix = F.copy()
+        matrix[:3, :3] *= scale
+        matrix[:3, 3] *= self.scale
+        stored = matrix.T.tolist()
+        entries = [
+            {"class": label, "segmentation_class_id": 12 * n, "fixed_model_transform": stored}
+            for n, label in enumerate(labels, 1)
+        ]
+        content = {"exported_object_classes": list(labels), "exported_objects": entries}
+        (self.root / "_object_settings.json").write_text(json.dumps(content))
+
+    def cameras(self, *names: str) -> None:
+        intrinsics = {
+            "resX": WIDTH,
+            "resY": HEIGHT,
+            "fx": 180,
+            "fy": 181,
+            "cx": 79,
+            "cy": 60.5,
+            "s": 0,
+        }
+        cameras = [{"name": name, "intrinsic_settings": intrinsics} for name in names]
+        (self.root / "_camera_settings.json").write_text(json.dumps({"camera_settings": cameras}))
+
+
+def assert_read(wild: Wild, source: NddsSource, atol: float = 1e-6) -> None:
+    for index in range(len(source)):
+        sample = source.sample(index)
+        for instance, T in zip(sample.instances, wild.poses[sample.key], strict=True):
+            np.testing.assert_allclose(instance.T_cam_obj, T, atol=atol)
+            part = {"box": BOX, "cube": CUBE}[instance.label]
+            expected = cv2.projectPoints(
+                part.cuboid, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], K, None
+            )
+            np.testing.assert_allclose(instance.keypoints, expected[0][:, 0], atol=0.01)
+
+
+QUARTER = np.array([[0, -1, 0, 0.02], [0, 0, -1, 0.05], [1, 0, 0, -0.01], [0, 0, 0, 1.0]])
+SLANTED = np.eye(4)
+SLANTED[:3, :3] = Rotation.from_euler("xyz", [80, 23, -12], degrees=True).as_matrix()
+SLANTED[:3, 3] = [0.013, -0.04, 0.02]
+
+
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+@pytest.mark.parametrize("unit", ["cm", "m", "mm"])
+@pytest.mark.parametrize(
+    ("habits", "frame"),
+    [
+        ({}, "mesh"),
+        ({"opengl": True, "nine": True}, "mesh"),
+        ({"front_x": True, "nine": True}, "mesh, front x"),
+        ({"front_x": True, "nine": True, "opengl": True}, "mesh, front x"),
+        ({"fixed": QUARTER}, "fixed"),
+        ({"fixed": SLANTED}, "fixed"),
+    ],
+    ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"],
+)
+def test_every_habit_is_found(
+    tmp_path: Path,
+    order: str,
+    unit: str,
+    habits: dict[str, Any],
+    frame: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    wild = Wild(tmp_path, order=order, unit=unit, **habits)
+    for number in range(3):
+        wild.item(number, BOX, CUBE)
+    if "fixed" in habits:
+        wild.settings("box", "cube")
+    with caplog.at_level(logging.INFO):
+        source = NddsSource(tmp_path, [BOX, CUBE])
+    assert_read(wild, source)
+    found = source.finding.convention
+    expected = (order, unit, "opengl" if habits.get("opengl") else "opencv", frame)
+    assert (found.quaternion, found.unit, found.camera, found.frame) == expected
+    assert f"quaternion {','.join(order)}, lengths in {unit}" in caplog.text
+    (info,) = source.describe()
+    assert str(found) == info.identity["convention"]
+
+
+@given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))
+@settings(max_examples=25, deadline=None)
+def test_a_single_instance_is_enough(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, order: str
+) -> None:
+    wild = Wild(tmp_path_factory.mktemp("one"), order=order)
+    wild.rng = np.random.default_rng(seed)
+    wild.item(0, CUBE)
+    assert_read(wild, NddsSource(wild.root, [CUBE]))
+
+
+def test_falling_things(tmp_path: Path) -> None:
+    """Its folders, names, two cameras, classes with _16k, segmentation and depth."""
+    wild = Wild(
+        tmp_path / "mixed" / "kitchen_0",
+        names="{:06d}.left", suffix=".jpg", own_camera=False, fixed=SLANTED, visibility=0.75,
+    )  # fmt: skip
+    for number in range(3):
+        wild.item(number, BOX, label="box_16k")
+        stem = f"{number:06d}.left"
+        seg = np.zeros((HEIGHT, WIDTH), np.uint8)
+        seg[20:60, 30:90] = 12
+        cv2.imwrite(str(wild.root / f"{stem}.seg.png"), seg)
+        depth = np.full((HEIGHT, WIDTH), 5000, np.uint16)
+        cv2.imwrite(str(wild.root / f"{stem}.depth.png"), depth)
+    wild.settings("box_16k")
+    wild.cameras("left", "right")
+    source = NddsSource(tmp_path, [BOX])
+    sample = source.sample(1)
+    (instance,) = sample.instances
+    assert (sample.key, instance.label) == ("mixed/kitchen_0/000001.left", "box")
+    np.testing.assert_allclose(instance.T_cam_obj, wild.poses["000001.left"][0], atol=1e-6)
+    assert instance.mask is not None
+    assert instance.mask.sum() == 40 * 60
+    assert instance.visible_fraction == pytest.approx(0.75)
+    assert sample.depth is not None
+    np.testing.assert_allclose(sample.depth, 0.5)
+    assert NddsSource(tmp_path, [BOX], read_depth=False).sample(0).depth is None
+
+
+def test_models_moved_to_their_centre(tmp_path: Path) -> None:
+    """The pose is of the mesh moved by its box's centre, which no file states."""
+    centre = np.eye(4)
+    centre[:3, 3] = -BOX.cuboid[8]
+    wild = Wild(tmp_path, fixed=centre, unit="m")
+    for number in range(4):
+        wild.item(number, BOX)
+    source = NddsSource(tmp_path, [BOX])
+    assert source.finding.convention.frame == "centred"
+    assert_read(wild, source)
+
+
+def test_noise_in_the_projections(tmp_path: Path) -> None:
+    wild = Wild(tmp_path, order="wxyz", noise=1.5)
+    for number in range(20):
+        wild.item(number, BOX, CUBE)
+    source = NddsSource(tmp_path, [BOX, CUBE])
+    assert source.finding.convention.quaternion == "wxyz"
+    assert 0.5 < source.finding.error_px < 3
+    assert_read(wild, source)
+
+
+def test_orders_that_cannot_be_told_apart_are_said(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    path = wild.item(0, BOX)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
+    T[:3, 3] = [0.01, 0.0, 0.4]
+    record = json.loads(path.read_text())
+    record["objects"] = [wild.object(BOX, T, "box")]
+    path.write_text(json.dumps(record))
+    source = NddsSource(tmp_path, [BOX])
+    np.testing.assert_allclose(source.sample(0).instances[0].T_cam_obj, T, atol=1e-6)
+    assert "the same poses so far with: quaternion w,x,y,z" in str(source.finding)
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    record = json.loads(path.read_text())
+    change(record["objects"][0])
+    path.write_text(json.dumps(record))
+
+
+def test_an_item_that_contradicts_the_others(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    paths = [wild.item(number, BOX) for number in range(12)]
+    edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
+    source = NddsSource(tmp_path, [BOX])
+    source.sample(6)
+    with pytest.raises(UserError, match=r"000007\.json: objects\[0\]\.projected_cuboid: .* px"):
+        source.sample(7)
+
+
+def test_no_convention_fits(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    for number in range(4):
+        wild.item(number, BOX)
+    inch = make_box("box", (0.2, 0.127, 0.076), (0.025, -0.05, 0.0127))
+    with pytest.raises(UserError, match=r"no known convention fits.* px: quaternion .*, lengths"):
+        NddsSource(tmp_path, [inch])
+
+
+def test_half_the_files_in_each_order(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    paths = [wild.item(number, BOX) for number in range(8)]
+    for path in paths[:4]:
+        edit(path, lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
+    with pytest.raises(UserError, match="convention"):
+        NddsSource(tmp_path, [BOX])
+
+
+def test_visible_fraction_of_a_truncated_object(tmp_path: Path) -> None:
+    for visibility in (1, 0.5, -1, None):
+        wild = Wild(tmp_path / str(visibility), visibility=visibility)
+        path = wild.item(0, BOX)
+        T = np.eye(4)
+        # The centre of the face towards the camera is on the left border.
+        T[:3, 3] = [(-0.5 - 79.0) / 180 * 0.4 - BOX.cuboid[8, 0], 0, 0.4]
+        record = json.loads(path.read_text())
+        record["objects"] = [wild.object(BOX, T, "box")]
+        path.write_text(json.dumps(record))
+        (instance,) = NddsSource(wild.root, [BOX]).sample(0).instances
+        expected = 0.5 * (0.5 if visibility == 0.5 else 1)
+        assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
+
+
+def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    for number in range(3):
+        wild.item(number, BOX, CUBE)
+
+    def behind(item: dict[str, Any]) -> None:
+        item["location"][2] *= -1
+        item["visibility"] = 0
+
+    edit(tmp_path / "000002.json", behind)
+    source = NddsSource(tmp_path, [BOX])
+    (info,) = source.describe()
+    assert info.num_instances == {"box": 2}
+    assert info.identity["left out"] == {"box, behind the camera": 1, "cube": 3}
+    assert source.sample(2).instances == []
+    assert [i.label for i in source.sample(0).instances] == ["box"]
+    assert source.contains("box")
+    assert not source.contains("cube")
+    renamed = NddsSource(
+        tmp_path, [make_box("dice", (0.06,) * 3, (0.0,) * 3)], classes={"cube": "dice"}
+    )
+    assert [i.label for i in renamed.sample(0).instances] == ["dice"]
+    with pytest.raises(UserError, match=r"classes of the parts \['dice'\]"):
+        NddsSource(tmp_path, [BOX], classes={"cube": "dice"})
+    with pytest.raises(UserError, match=r"of the parts dice.*other classes: .*box \(3\)"):
+        NddsSource(tmp_path, [make_box("dice", (0.06,) * 3, (0.0,) * 3)])
+
+
+def test_shares_are_disjoint_and_complete(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    for number in range(10):
+        wild.item(number, BOX)
+    train = NddsSource(tmp_path, [BOX], part_of=(0, 0.75))
+    val = NddsSource(tmp_path, [BOX], part_of=(0.75, 1))
+    assert train.items + val.items == NddsSource(tmp_path, [BOX]).items
+    assert train.describe()[0].identity["items"] != val.describe()[0].identity["items"]
+    with pytest.raises(UserError, match="no image in the share"):
+        NddsSource(tmp_path, [BOX], part_of=(0.01, 0.02))
+
+
+def set_to(field: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda item: item.__setitem__(field, value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (set_to("location", [1, 2]), r"objects\[0\]\.location: \[1, 2\]"),
+        (set_to("location", "here"), r"objects\[0\]\.location: 'here'"),
+        (set_to("location", [10**400, 0, 1]), r"objects\[0\]\.location"),
+        (set_to("location", [0, 0, 1e300]), r"objects\[0\]\.location"),
+        (set_to("quaternion_xyzw", [0, 0, 0, 0]), "quaternion of norm 1"),
+        (set_to("quaternion_xyzw", [{}, 0, 0, 1]), r"quaternion_xyzw: \[\{\}"),
+        (lambda item: item.pop("quaternion_xyzw"), "quaternion_xyzw: nothing"),
+        (lambda item: item.pop("location"), "location: nothing"),
+        (lambda item: item.pop("class"), r"objects\[0\]\.class"),
+        (set_to("projected_cuboid", [[1, 2]]), "projected_cuboid: 1 points"),
+        (set_to("visibility", 3), "visibility: 3"),
+        (set_to("visibility", "yes"), r"visibility: \['yes'\]"),
+        (lambda item: item["location"].__setitem__(2, -40.0), r"behind the camera \(z = -0\.4 m\)"),
+    ],
+)
+def test_bad_fields_are_one_line(
+    tmp_path: Path, change: Callable[[dict[str, Any]], Any], message: str
+) -> None:
+    wild = Wild(tmp_path)
+    for number in range(200):
+        wild.item(number, BOX) if number in (0, 100) else None
+    path = wild.item(1, BOX)
+    source = NddsSource(tmp_path, [BOX])
+    edit(path, change)
+    with pytest.raises(UserError, match=message) as caught:
+        source.sample(1)
+    assert "000001.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"objects": [', "JSON"),
+        ('{"objects": NaN}', "NaN"),
+        ("[" * 10_000, "nested"),
+        ("[]", "top level: list"),
+        ('{"objects": 4}', "objects: int"),
+        ('{"objects": [4]}', r"objects\[0\]\.class: 4"),
+        ("", "JSON"),
+    ],
+)
+def test_damaged_annotation(tmp_path: Path, content: str, message: str) -> None:
+    wild = Wild(tmp_path)
+    path = wild.item(0, BOX)
+    source = NddsSource(tmp_path, [BOX])
+    path.write_text(content)
+    with pytest.raises(UserError, match=message):
+        source.sample(0)
+    with pytest.raises(UserError, match=message):
+        NddsSource(tmp_path, [BOX])
+
+
+def test_missing_camera_images_and_folders(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    wild = Wild(tmp_path / "set", own_camera=False)
+    wild.item(0, BOX)
+    with pytest.raises(UserError, match=r"camera_data\.intrinsics: 0 cameras.*_camera_settings"):
+        NddsSource(wild.root, [BOX])
+    wild.cameras("one", "two")
+    with pytest.raises(UserError, match=r"camera_data\.intrinsics: 2 cameras"):
+        NddsSource(wild.root, [BOX])
+    wild.cameras("one")
+    wild.item(1, BOX)
+    (wild.root / "000001.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        assert len(NddsSource(wild.root, [BOX])) == 1
+    assert "1 annotations have no image" in caplog.text
+    for folder in (tmp_path / "nowhere", tmp_path):
+        if folder == tmp_path:
+            (wild.root / "000000.png").unlink()
+        with pytest.raises(UserError, match="without one annotated image"):
+            NddsSource(folder, [BOX])
+
+
+def test_image_of_another_size_than_its_camera(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    wild.item(0, BOX)
+    cv2.imwrite(str(tmp_path / "000000.png"), np.zeros((40, 50, 3), np.uint8))
+    with pytest.raises(UserError, match=r"for the 50×40 image of .*000000\.json"):
+        NddsSource(tmp_path, [BOX]).sample(0)
+
+
+def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path: Path) -> None:
+    wild = Wild(tmp_path)
+    wild.item(0, BOX, BOX)
+    wild.settings("box")
+    cv2.imwrite(str(tmp_path / "000000.seg.png"), np.full((HEIGHT, WIDTH), 12, np.uint8))
+    assert all(i.mask is None for i in NddsSource(tmp_path, [BOX]).sample(0).instances)
+
+
+def test_ndds_needs_neither_torch_nor_the_renderer() -> None:
+    code = (
+        "import sys, dopepp.data.formats.ndds.source, dopepp.data.formats.ndds.writer; "
+        "sys.exit(bool({'torch', 'lightning'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

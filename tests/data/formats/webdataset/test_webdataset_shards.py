@@ -1,0 +1,445 @@
+from __future__ import annotations
+
+import http.server
+import io
+import json
+import pickle
+import subprocess
+import sys
+import tarfile
+import threading
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.images import decode_runs, encode_runs
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.writer import STAGING
+from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.webdataset.tar import FIELDS, index_shard, members
+from dopepp.data.formats.webdataset.writer import WebdatasetWriter
+from dopepp.data.sample import Sample
+from dopepp.data.sources.rendered import rendered_sample
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.part import Part
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
+
+NUM_IMAGES = 4
+K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def parts() -> list[Part]:
+    return [servoholder(), pivconnector()]
+
+
+@pytest.fixture(scope="module")
+def samples(parts: list[Part]) -> list[Sample]:
+    factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=4)
+    return [rendered_sample(factory.render(0, i), "virtual", str(i)) for i in range(NUM_IMAGES)]
+
+
+@pytest.fixture
+def written(parts: list[Part], samples: list[Sample], tmp_path: Path) -> Path:
+    """Write four images in two shards."""
+    root = tmp_path / "rendered"
+    writer = WebdatasetWriter(root, parts)
+    writer.prepare()
+    for index, sample in enumerate(samples):
+        writer.write(index + 998, sample)
+    writer.finalize(0, [998, 999])
+    writer.finalize(1, [1000, 1001])
+    return root
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def test_round_trip(written: Path, samples: list[Sample]) -> None:
+    source = WebdatasetSource(written, bop_parts(written), "train_pbr")
+    assert len(source) == NUM_IMAGES
+    source = pickle.loads(pickle.dumps(source))
+    for index in (2, 0, 3, 1):  # at random
+        sample, read = samples[index], source.sample(index, epoch=5)
+        np.testing.assert_array_equal(read.image, sample.image)
+        np.testing.assert_array_equal(read.K, sample.K)
+        assert read.depth is not None
+        assert sample.depth is not None
+        assert np.abs(read.depth - sample.depth).max() <= 0.5001e-4
+        for instance, expected in zip(read.instances, sample.instances, strict=True):
+            assert instance.label == expected.label
+            np.testing.assert_allclose(instance.T_cam_obj, expected.T_cam_obj, atol=1e-12)
+            np.testing.assert_allclose(instance.keypoints, expected.keypoints, atol=1e-4)
+            np.testing.assert_array_equal(instance.mask, expected.mask)
+            assert instance.visible_fraction == expected.visible_fraction
+    keys = [source.sample(index).key for index in range(4)]
+    assert keys == ["000000_000998", "000000_000999", "000001_000000", "000001_000001"]
+    assert source.contains("servoholder")
+    assert not source.contains("else")
+    (info,) = source.describe()
+    assert info.identity["visible_fractions"] == "gt_info.json"
+    parts = bop_parts(written, ["pivconnector"])
+    last = WebdatasetSource(written, parts, "train_pbr", part_of=(0.75, 1), read_depth=False)
+    sample = last.sample(0)
+    assert (len(last), sample.key, sample.depth) == (1, keys[3], None)
+    assert {instance.label for instance in sample.instances} <= {"pivconnector"}
+
+
+def test_the_library_and_tarfile_read_the_shards(written: Path, samples: list[Sample]) -> None:
+    import webdataset
+
+    url = str(written / "train_pbr" / "shard-{000000..000001}.tar")
+    stream = list(webdataset.WebDataset(url, shardshuffle=False))
+    assert [item["__key__"][-6:] for item in stream] == ["000998", "000999", "000000", "000001"]
+    for item, sample in zip(stream, samples, strict=True):
+        image = cv2.imdecode(np.frombuffer(item["rgb.png"], np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_array_equal(image[..., ::-1], sample.image)
+        truths = json.loads(item["gt.json"])
+        assert [t["obj_id"] for t in truths] == [
+            1 + (instance.label == "pivconnector") for instance in sample.instances
+        ]
+        masks = json.loads(item["mask_visib.json"])
+        first = masks["0"]
+        mask = sample.instances[0].mask
+        assert mask is not None
+        assert first["size"] == [120, 160]
+        assert sum(first["counts"][1::2]) == mask.sum()
+        assert set(masks) == set(json.loads(item["mask.json"]))
+    table = json.loads((written / "train_pbr" / "key_to_shard.json").read_text())
+    assert table == {item["__key__"]: int(item["__url__"][-10:-4]) for item in stream}
+    with tarfile.open(written / "train_pbr" / "shard-000001.tar") as archive:
+        for info, member in zip(
+            archive.getmembers(), members(written / "train_pbr" / "shard-000001.tar"), strict=True
+        ):
+            assert info.name == f"{member.key}.{member.extension}"
+            assert (info.offset_data, info.size) == (member.offset, member.size)
+            assert (info.mtime, info.uid, info.uname) == (0, 0, "dopepp")
+
+
+def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
+    written: Path, parts: list[Part], samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    root = written.parent / "other"
+    writer = WebdatasetWriter(root, parts)
+    writer.prepare()
+    for index in (1001, 999, 998):
+        writer.write(index, samples[index - 998])
+        writer.finalize(index // 1000, [index])
+        writer.finalize(index // 1000, [index])
+    assert not (root / "train_pbr" / STAGING).exists()
+    writer.write(1000, samples[2])
+    with monkeypatch.context() as patch:
+        patch.setattr(WebdatasetWriter, "_write_keys", die)
+        with pytest.raises(KeyboardInterrupt):
+            writer.finalize(1, [1000])
+    assert WebdatasetWriter(root, parts).written(1) == {1000, 1001}
+    assert len(list((root / "train_pbr" / STAGING).rglob("*.tar"))) == 1
+    WebdatasetWriter(root, parts).finalize(1, [1000, 1001])
+    assert writer.written(0) == {998, 999}
+    assert writer.written(2) == set()
+    assert contents(root) == contents(written)
+
+
+def test_staging_needs_no_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys, numpy as np\n"
+        "from dopepp.data.formats.webdataset.writer import WebdatasetWriter\n"
+        "from dopepp.data.formats.webdataset.source import WebdatasetSource\n"
+        "from dopepp.data.formats.bop.source import BopSource\n"
+        "from dopepp.data.formats.bop.writer import BopWriter\n"
+        "from dopepp.data.sample import Sample\n"
+        "from dopepp.parts.catalogue import servoholder\n"
+        f"writer = WebdatasetWriter({str(tmp_path)!r}, [servoholder()])\n"
+        "writer.prepare()\n"
+        "image, depth = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)\n"
+        "writer.write(0, Sample(image, np.eye(3), [], depth))\n"
+        "assert writer.written(0) == {0}\n"
+        "sys.exit(bool({'torch', 'lightning', 'webdataset'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
+def test_runs_round_trip(mask: np.ndarray) -> None:
+    record = encode_runs(mask)
+    assert sum(record["counts"]) == mask.size
+    np.testing.assert_array_equal(decode_runs(record, mask.shape, "x"), mask)
+
+
+def test_runs_go_down_the_columns_and_begin_with_zeros() -> None:
+    mask = np.array([[1, 0, 0], [1, 1, 0]], bool)
+    assert encode_runs(mask) == {"counts": [0, 2, 1, 1, 2], "size": [2, 3]}
+    assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), "x").sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        ({"counts": [6], "size": [3, 2]}, r"x: size \[3, 2\]; allowed: \[2, 3\]"),
+        ({"counts": [5], "size": [2, 3]}, r"counts \[5\]"),
+        ({"counts": [-1, 7], "size": [2, 3]}, "counts"),
+        ({"counts": [1.0, 5.0], "size": [2, 3]}, "counts"),
+        ({"counts": "abc", "size": [2, 3]}, "counts 'abc'"),
+        ({"counts": [10**20], "size": [2, 3]}, "counts"),
+        (None, "size None"),
+    ],
+)
+def test_damaged_runs(record: object, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        decode_runs(record, (2, 3), "x")
+
+
+class Shard:
+    """Writes a shard by hand with tarfile."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def write(self, files: list[tuple[Any, bytes]], **options: Any) -> Path:
+        with tarfile.open(self.path, "w", **options) as archive:
+            for name, content in files:
+                info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
+                info.size = len(content) if info.isreg() else 0
+                archive.addfile(info, io.BytesIO(content))
+        return self.path
+
+
+def block() -> Part:
+    half = np.array([0.02, 0.01, 0.005])
+    cuboid = cuboid_keypoints(-half, half)
+    return Part("obj_000002", cuboid, float(2 * np.linalg.norm(half)), cuboid[:8])
+
+
+def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
+    picture = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
+    truth = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [5, -10, 250], "obj_id": 2}
+    values: dict[str, object] = {
+        "camera.json": {"cam_K": K, "depth_scale": 1.0},
+        "gt.json": [truth | {"obj_id": 7}, truth, truth | {"cam_t_m2c": [0, 0, -1]}],
+        "gt_info.json": [{"visib_fract": 0.5}] * 3,
+    }
+    values |= {name.replace("_json", ".json"): value for name, value in changes.items()}
+    texts = [(f"{key}.{n}", json.dumps(v).encode()) for n, v in values.items() if v is not None]
+    return [*texts, (f"{key}.rgb.jpg", picture)]
+
+
+def test_a_shard_of_another_writer(tmp_path: Path) -> None:
+    files = [("./" + name, data) for name, data in image_files("000001_000005")]
+    files += image_files("000000_000007", gt_json=None, gt_info_json=None)
+    folder = tarfile.TarInfo("some")
+    folder.type = tarfile.DIRTYPE
+    long = image_files("some/" + "x" * 150)
+    shard = Shard(tmp_path / "shard-000000.tar")
+    for options in ({"format": tarfile.PAX_FORMAT}, {"format": tarfile.GNU_FORMAT}):
+        shard.write([(folder, b""), *files, ("__meta__", b"x"), *long], **options)
+        source = WebdatasetSource(tmp_path, [block()])
+        samples = [source.sample(index) for index in range(len(source))]
+        assert [s.key[:20] for s in samples] == [
+            "000001_000005",
+            "000000_000007",
+            "some/" + "x" * 15,
+        ]
+        assert [len(sample.instances) for sample in samples] == [1, 0, 1]
+        (instance,) = samples[0].instances
+        np.testing.assert_allclose(instance.T_cam_obj[:3, 3], [0.005, -0.01, 0.25])
+        np.testing.assert_allclose(instance.keypoints[8], [33.5, 19.46])
+        assert (instance.visible_fraction, instance.mask, samples[0].depth) == (0.5, None, None)
+
+
+def test_hostile_members_are_refused(tmp_path: Path) -> None:
+    good = image_files("000000_000000")
+
+    def refused(message: str, files: list[tuple[Any, bytes]]) -> None:
+        path = Shard(tmp_path / "s" / "shard-000000.tar").write(files)
+        with pytest.raises(UserError, match=message) as caught:
+            index_shard(path)
+        assert "shard-000000.tar" in str(caught.value)
+
+    for name in ("../000000_000001.rgb.png", "/etc/x.rgb.png", "a/../../b.rgb.png", "a\\b.rgb.png"):
+        refused("leads out of the archive", [*good, (name, b"x")])
+    for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE):
+        link = tarfile.TarInfo("000000_000001.rgb.png")
+        link.type, link.linkname = kind, "/etc/passwd"
+        refused("a link, a device", [*good, (link, b"")])
+    refused("'000000_000000.rgb.jpg' twice", [*good, good[-1]])
+    refused("two members for its image", [*good, ("000000_000000.rgb.png", b"x")])
+    refused("000000_000000 without rgb", good[:-1])
+    refused("000000_000000 without camera", good[1:])
+    refused("no KEY.EXTENSION", [*good, ("README", b"x")])
+
+
+def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) -> None:
+    files = image_files("000000_000000") + image_files("000000_000001")
+    path = Shard(tmp_path / "shard-000000.tar").write(files)
+    whole = path.read_bytes()
+    with tarfile.open(path) as archive:
+        infos = archive.getmembers()
+    ends = [info.offset for info in infos[1:]] + [infos[-1].offset_data + infos[-1].size]
+    for length in (0, 100, 512, *ends, infos[3].offset_data + 5, infos[-1].offset_data + 200):
+        path.write_bytes(whole[:length])
+        with pytest.raises(UserError, match=r"shard-000000\.tar"):
+            index_shard(path)
+    for start in (infos[0].offset, infos[3].offset, infos[-1].offset):
+        damaged = bytearray(whole)
+        damaged[start + 150] ^= 0x55  # within the header's checksum
+        path.write_bytes(bytes(damaged))
+        with pytest.raises(UserError, match="damaged"):
+            index_shard(path)
+    bomb = tarfile.TarInfo("000000_000002.rgb.png")
+    bomb.size = 1 << 40
+    path.write_bytes(whole[: ends[-1] + -ends[-1] % 512] + bomb.tobuf() + bytes(10_240))
+    with pytest.raises(UserError, match=r"000000_000002\.rgb\.png' of 1,099,512 MB"):
+        index_shard(path)
+    long_name = tarfile.TarInfo("././@LongLink")
+    long_name.type, long_name.size = tarfile.GNUTYPE_LONGNAME, 1 << 32
+    path.write_bytes(long_name.tobuf() + bytes(10_240))
+    with pytest.raises(UserError, match=r"a header of \d+ bytes"):
+        index_shard(path)
+    import gzip
+
+    path.write_bytes(gzip.compress(whole))
+    with pytest.raises(UserError, match="a compressed archive"):
+        index_shard(path)
+    path.write_bytes(whole)
+    index = index_shard(path)
+    path.write_bytes(whole[:3000])
+    with pytest.raises(UserError, match="cut short within the member at byte"):
+        index.read(1, "image")
+
+
+@settings(max_examples=40, deadline=None)
+@given(place=st.integers(0, 6000), noise=st.binary(min_size=1, max_size=12))
+def test_any_damage_is_a_user_error_or_harmless(
+    place: int, noise: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("noise") / "shard-000000.tar"
+    whole = bytearray(Shard(path).write(image_files("000000_000000")).read_bytes())
+    whole[place : place + len(noise)] = noise
+    path.write_bytes(bytes(whole))
+    try:
+        source = WebdatasetSource(path.parent, [block()])
+        source.sample(0)
+    except UserError:
+        return
+    assert len(source) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"camera_json": {"cam_K": K[:4]}}, r"camera\.json: cam_K"),
+        ({"camera_json": []}, r"camera\.json: cam_K"),
+        ({"gt_json": {"a": 1}}, r"lists of objects"),
+        ({"gt_info_json": [{"visib_fract": 1}]}, r"gt_info\.json with 1 objects; allowed: 3"),
+        ({"gt_info_json": [{"visib_fract": "1"}] * 3}, r"object 0: visib_fract"),
+        ({"mask_visib_json": {"0": {}}}, r"mask_visib\.json: 1: size None"),
+        ({"mask_visib_json": {"1": {"size": [48, 64], "counts": [1]}}}, r"counts \[1\]"),
+    ],
+)
+def test_damaged_annotation_is_named(
+    changes: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    Shard(tmp_path / "shard-000000.tar").write(image_files("000003_000004", **changes))
+    source = WebdatasetSource(tmp_path, [block()])
+    with pytest.raises(UserError, match=message) as caught:
+        source.sample(0)
+    assert "000003_000004" in str(caught.value)
+
+
+def test_a_key_in_two_shards_and_wrong_paths(tmp_path: Path) -> None:
+    for name in ("shard-000000.tar", "shard-000001.tar"):
+        Shard(tmp_path / "a" / name).write(image_files("000000_000000"))
+    with pytest.raises(UserError, match=r"shard-000001\.tar with 1 keys of .*shard-000000\.tar"):
+        WebdatasetSource(tmp_path, [block()], "a")
+    source = WebdatasetSource(tmp_path, [block()], "a/shard-000001.tar")
+    assert len(source) == 1
+    braces = WebdatasetSource(tmp_path, [block()], "a/shard-00000{1..1}.tar")
+    assert braces.describe()[0].identity == source.describe()[0].identity
+    for shards, message in {
+        "b": "no such file or folder",
+        "a/shard-{000001..000002}.tar": r"shard-000002\.tar, no such file",
+        "a/{1..999999999}.tar": "at most 100,000 shards",
+        "a/" + "{a,b}" * 40: "at most 100,000 shards",
+        "a/" + "x" * 5000: "at most 100,000 shards",
+        "a/{000000": "Unbalanced braces",
+        "https://host/shard-000000.tar": "which are not on this machine.*download_dir",
+        "pipe:touch hacked": "a command to run",
+        "PIPE:touch hacked": "a command to run",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            WebdatasetSource(tmp_path, [block()], shards)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"a folder without \*\.tar"):
+        WebdatasetSource(tmp_path, [block()], "empty")
+    with pytest.raises(UserError, match=r"shard-000000\.tar twice"):
+        WebdatasetSource(tmp_path, [block()], ["a/shard-000000.tar", "a/shard-000000.tar"])
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> Iterator[str]:
+    handler = partial(_Quiet, directory=str(tmp_path / "served"))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_shards_are_downloaded_once_and_within_bounds(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for n in (0, 1):
+        Shard(tmp_path / "served" / f"shard-{n:06d}.tar").write(image_files(f"00000{n}_000000"))
+    folder = tmp_path / "downloads"
+    url = address + "/shard-{000000..000001}.tar"
+    source = WebdatasetSource(tmp_path, [block()], url, download_dir=folder)
+    assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
+    assert contents(folder) == contents(tmp_path / "served")
+    monkeypatch.setattr("dopepp.data.formats.webdataset.shards.MAX_SHARD_BYTES", 1000)
+    again = WebdatasetSource(tmp_path, [block()], url, download_dir=folder)
+    assert again.describe() == [source.describe()[0]]
+    with pytest.raises(UserError, match="of over 0 GB"):
+        WebdatasetSource(tmp_path, [block()], url, download_dir=tmp_path / "small")
+    missing = address + "/shard-000009.tar"
+    with pytest.raises(UserError, match="which cannot be fetched"):
+        WebdatasetSource(tmp_path, [block()], missing, download_dir=folder)
+    with pytest.raises(UserError, match=r"URLs of .*https"):
+        WebdatasetSource(tmp_path, [block()], "nope://x/y.tar", download_dir=folder)
+    assert list((tmp_path / "small").iterdir()) == []
+
+
+def test_commands_run_only_when_allowed(tmp_path: Path) -> None:
+    path = Shard(tmp_path / "elsewhere" / "shard-000000.tar").write(image_files("000000_000000"))
+    command = f"pipe:cat {path}"
+    with pytest.raises(UserError, match="a command to run"):
+        WebdatasetSource(tmp_path, [block()], command, download_dir=tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+    source = WebdatasetSource(
+        tmp_path, [block()], command, download_dir=tmp_path / "d", allow_commands=True
+    )
+    assert source.sample(0).key == "000000_000000"
+    assert FIELDS[0] == "image"

@@ -1,0 +1,333 @@
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.sample import hull_areas
+from dopepp.geometry.camera import camera_matrix
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.parts.part import Part
+from dopepp.virtual.backgrounds import ProceduralBackgrounds
+
+
+def ycb_part_of(root: Path, name: str) -> Part:
+    points = np.loadtxt(root / "models" / name / "points.xyz")
+    cuboid = cuboid_keypoints(points.min(axis=0), points.max(axis=0))
+    return Part(name, cuboid, float(np.ptp(points, axis=0).max()), points)
+
+
+def source_of(tree: Any, box: Part, **options: Any) -> YcbVideoSource:
+    return YcbVideoSource(tree.root, [box], **({"frames": ["0000/000001"]} | options))
+
+
+# --- good input ------------------------------------------------------------------------------
+
+
+def test_reads_pose_camera_depth_and_mask(ycb_tree: Any, box: Part) -> None:
+    poses = ycb_tree.write("0000/000001", classes=(1, 2))
+    sample = source_of(ycb_tree, box).sample(0)
+    (instance,) = sample.instances
+    assert (instance.label, sample.source, sample.key) == (
+        "003_box",
+        "ycb_video/data",
+        "0000/000001",
+    )
+    np.testing.assert_array_equal(instance.T_cam_obj[:3], poses[..., 1])
+    expected, _ = cv2.projectPoints(box.cuboid, np.zeros(3), poses[:, 3, 1], ycb_tree.K, None)
+    np.testing.assert_allclose(instance.keypoints, expected[:, 0], atol=1e-9)
+    np.testing.assert_array_equal(sample.K, ycb_tree.K)
+    assert sample.depth is not None
+    np.testing.assert_allclose(sample.depth, 0.3, rtol=1e-6)
+    label = cv2.imread(str(ycb_tree.path("0000/000001", "label.png")), cv2.IMREAD_UNCHANGED)
+    assert instance.mask is not None
+    np.testing.assert_array_equal(instance.mask, label == 2)
+    bgr = cv2.imread(str(ycb_tree.path("0000/000001", "color.png")))
+    np.testing.assert_array_equal(sample.image, bgr[..., ::-1])
+
+
+def test_depth_can_be_left_out(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("0000/000001")
+    assert source_of(ycb_tree, box, read_depth=False).sample(0).depth is None
+
+
+@pytest.mark.parametrize(("scene", "fx"), [("0059", 1066.778), ("0060", 1077.836)])
+def test_camera_by_scene_where_meta_has_none(
+    ycb_tree: Any, box: Part, scene: str, fx: float
+) -> None:
+    frame = f"{scene}/000001"
+    ycb_tree.write(frame, intrinsic_matrix=None)
+    image = np.zeros((480, 640, 3), np.uint8)
+    for what, array in (("color", image), ("label", image[..., 0]), ("depth", image[..., 0])):
+        cv2.imwrite(str(ycb_tree.path(frame, f"{what}.png")), array)
+    assert source_of(ycb_tree, box, frames=[frame]).sample(0).K[0, 0] == fx
+
+
+def test_visible_fraction_of_a_half_hidden_object(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("0000/000001")
+    whole = source_of(ycb_tree, box).sample(0).instances[0]
+    assert whole.visible_fraction > 0.95
+    assert whole.mask is not None
+    label = np.where(whole.mask, 2, 0).astype(np.uint8)
+    columns = np.flatnonzero(whole.mask.any(axis=0))
+    label[:, columns[len(columns) // 2] :] = 0
+    cv2.imwrite(str(ycb_tree.path("0000/000001", "label.png")), label)
+    half = source_of(ycb_tree, box).sample(0).instances[0]
+    assert half.visible_fraction == pytest.approx(0.5 * whole.visible_fraction, abs=0.05)
+
+
+def test_unlabelled_real_object_counts_the_border_only(ycb_tree: Any, box: Part) -> None:
+    poses = ycb_tree.write("0000/000001", labelled=False)
+    poses[0, 3] = 0.47 * 0.3  # centred on the last column: half of it lies outside
+    ycb_tree.write("0000/000001", labelled=False, poses=poses)
+    instance = source_of(ycb_tree, box).sample(0).instances[0]
+    assert instance.mask is None
+    assert instance.visible_fraction == pytest.approx(0.5, abs=0.08)
+
+
+def test_synthetic_frames_are_composited_deterministically(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("data_syn/000000")
+    options = {"frames": ["000000"], "subset": "synthetic", "backgrounds": ProceduralBackgrounds()}
+    source = source_of(ycb_tree, box, **options)
+    first, again, later = source.sample(0, 0), source.sample(0, 0), source.sample(0, 1)
+    assert first.source == "ycb_video/data_syn"
+    np.testing.assert_array_equal(first.image, again.image)
+    mask = first.instances[0].mask
+    assert mask is not None
+    np.testing.assert_array_equal(first.image[mask], later.image[mask])
+    assert (first.image[~mask] != later.image[~mask]).mean() > 0.5
+    other_seed = source_of(ycb_tree, box, **options, seed=1).sample(0, 0)
+    assert (first.image != other_seed.image).any()
+
+
+def test_hidden_synthetic_object_has_fraction_zero(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("data_syn/000000", labelled=False)
+    source = source_of(
+        ycb_tree, box, frames=["000000"], subset="synthetic", backgrounds=ProceduralBackgrounds()
+    )
+    instance = source.sample(0).instances[0]
+    assert instance.visible_fraction == 0.0
+    assert instance.mask is not None
+    assert not instance.mask.any()
+
+
+def test_image_set_splits_into_subsets(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("0000/000001")
+    ycb_tree.write("data_syn/000003")
+    ycb_tree.write_list("train", ["0000/000001", "data_syn/000003"])
+    real = YcbVideoSource(ycb_tree.root, [box], "train")
+    synthetic = YcbVideoSource(
+        ycb_tree.root, [box], "train", "synthetic", backgrounds=ProceduralBackgrounds()
+    )
+    assert (real.frames, synthetic.frames) == (["0000/000001"], ["000003"])
+
+
+def test_absent_frames_are_counted_and_named_once(
+    ycb_tree: Any, box: Part, caplog: pytest.LogCaptureFixture
+) -> None:
+    ycb_tree.write("0000/000001")
+    ycb_tree.write_list("train", ["0000/000001", "0007/000001", "0007/000002"])
+    with caplog.at_level(logging.WARNING):
+        assert len(YcbVideoSource(ycb_tree.root, [box], "train")) == 1
+    (record,) = caplog.records
+    assert "2 of 3 frames listed in train.txt are absent; first: 0007/000001" in record.message
+
+
+def test_describe_and_contains(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("0000/000001", classes=(2,))
+    ycb_tree.write("0000/000002", classes=(1,))
+    mug = replace(box, name="004_mug")
+    frames = ["0000/000002", "0000/000001"]
+    source = YcbVideoSource(ycb_tree.root, [box, mug], frames=frames)
+    assert source.contains("003_box")
+    assert not source.contains("004_mug")
+    assert not source.contains("no_such")
+    (info,) = source.describe()
+    assert (info.num_images, info.num_instances) == (2, {"003_box": 1, "004_mug": 0})
+    (other,) = YcbVideoSource(ycb_tree.root, [box, mug], frames=frames[1:]).describe()
+    assert info.identity != other.identity
+
+
+def test_hull_areas_against_trimesh_and_shapes() -> None:
+    square = np.array([[-0.5, -0.5], [9.5, -0.5], [9.5, 9.5], [-0.5, 9.5], [4.0, 4.0]])
+    assert hull_areas(square, (100, 100)) == pytest.approx((100.0, 100.0))
+    assert hull_areas(square + np.array([95, 0]), (100, 100)) == pytest.approx((50.0, 100.0))
+    assert hull_areas(square + 500, (100, 100)) == pytest.approx((0.0, 100.0))
+    assert hull_areas(np.full((5, 2), np.nan), (100, 100)) == (0.0, 0.0)
+    cloud = np.random.default_rng(0).normal(50, 5, (200, 2))
+    prism = np.vstack([np.c_[cloud, np.zeros(200)], np.c_[cloud, np.ones(200)]])
+    volume = trimesh.convex.convex_hull(prism).volume
+    assert hull_areas(cloud, (100, 100))[1] == pytest.approx(volume, rel=1e-4)
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+
+def test_root_that_is_missing_or_wrong(tmp_path: Path, ycb_tree: Any, box: Part) -> None:
+    with pytest.raises(UserError, match=r"which is no folder.*set data\.root"):
+        YcbVideoSource(tmp_path / "nowhere", [box], "train")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"empty, which has no data/.*a YCB-Video folder"):
+        YcbVideoSource(tmp_path / "empty", [box], "train")
+    (ycb_tree.root / "image_sets" / "classes.txt").unlink()
+    with pytest.raises(UserError, match=r"no image_sets/classes\.txt"):
+        YcbVideoSource(ycb_tree.root, [box], "train")
+
+
+def test_unknown_object_lists_the_classes(ycb_tree: Any, box: Part) -> None:
+    with pytest.raises(UserError, match=r"'servoholder'.*002_can.*003_box.*004_mug"):
+        YcbVideoSource(ycb_tree.root, [replace(box, name="servoholder")], frames=["0000/000001"])
+
+
+def test_unknown_image_set_lists_the_others(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write_list("train", ["0000/000001"])
+    with pytest.raises(UserError, match=r"image set 'trian'; allowed: one of \['train'\]"):
+        YcbVideoSource(ycb_tree.root, [box], "trian")
+    ycb_tree.write_list("odd", ["colour.png"])
+    with pytest.raises(UserError, match=r"odd\.txt: line 'colour\.png'"):
+        YcbVideoSource(ycb_tree.root, [box], "odd")
+
+
+def test_no_frame_on_disk(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write_list("train", ["0007/000001", "0007/000002"])
+    with pytest.raises(UserError, match=r"no frame of train\.txt.*2 listed.*at least one"):
+        YcbVideoSource(ycb_tree.root, [box], "train")
+
+
+def test_wrong_combination_of_arguments(ycb_tree: Any, box: Part) -> None:
+    with pytest.raises(ValueError, match="either image_set or frames"):
+        YcbVideoSource(ycb_tree.root, [box])
+    with pytest.raises(ValueError, match="give backgrounds"):
+        YcbVideoSource(ycb_tree.root, [box], "train", "synthetic")
+
+
+def _rotated(change: Callable[[np.ndarray], object]) -> np.ndarray:
+    poses = np.zeros((3, 4, 1))
+    poses[:, :3, 0], poses[2, 3] = np.eye(3), 0.3
+    change(poses)
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"poses": None}, "poses"),
+        ({"cls_indexes": None}, "cls_indexes"),
+        ({"factor_depth": None}, "factor_depth"),
+        ({"factor_depth": 0}, "factor_depth 0"),
+        ({"cls_indexes": [[2], [3]]}, "1 poses for the classes"),
+        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), np.nan))}, "no rigid transform"),
+        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), -1.0))}, "no rigid transform"),
+        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), 2.0))}, "no rigid transform"),
+        ({"poses": _rotated(lambda p: p.__setitem__((2, 3), -0.3))}, "behind the camera"),
+        ({"intrinsic_matrix": camera_matrix(100.0, 100.0, 900.0, 35.5)}, "principal point"),
+        ({"intrinsic_matrix": np.full((3, 3), np.nan)}, "pinhole"),
+    ],
+)
+def test_impossible_meta(ycb_tree: Any, box: Part, changes: dict[str, Any], message: str) -> None:
+    ycb_tree.write("0000/000001", **changes)
+    with pytest.raises(UserError, match=message) as caught:
+        source_of(ycb_tree, box).sample(0)
+    assert "0000/000001" in str(caught.value)
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_meta_cut_short_anywhere(ycb_tree: Any, box: Part, compressed: bool) -> None:
+    ycb_tree.write("0000/000001")
+    path = ycb_tree.path("0000/000001", "meta.mat")
+    fields = {k: v for k, v in scipy.io.loadmat(path).items() if not k.startswith("__")}
+    scipy.io.savemat(path, fields, do_compression=compressed)
+    content, source = path.read_bytes(), source_of(ycb_tree, box)
+    for length in [0, 60, 128, 130, 200, *range(256, len(content), 4001), len(content) - 1]:
+        path.write_bytes(content[:length])
+        with pytest.raises(UserError, match=r"meta\.mat.*complete MAT-5 file"):
+            source.sample(0)
+    path.unlink()
+    with pytest.raises(UserError, match=r"meta\.mat.*No such file"):
+        source.sample(0)
+
+
+@pytest.mark.parametrize("what", ["color.png", "label.png", "depth.png"])
+def test_images_cut_or_of_another_size(ycb_tree: Any, box: Part, what: str) -> None:
+    ycb_tree.write("0000/000001")
+    path, source = ycb_tree.path("0000/000001", what), source_of(ycb_tree, box)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match=rf"{re.escape(what)}.*complete PNG or JPEG"):
+        source.sample(0)
+    path.write_bytes(content)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), image[:-2])
+    with pytest.raises(UserError, match=r"of 96×7[02] for a colour image of 96×7[02]"):
+        source.sample(0)
+
+
+def test_wrong_channels(ycb_tree: Any, box: Part) -> None:
+    ycb_tree.write("0000/000001")
+    path = ycb_tree.path("0000/000001", "color.png")
+    cv2.imwrite(str(path), np.zeros((72, 96), np.uint8))
+    with pytest.raises(UserError, match="8 bits and 3 channels"):
+        source_of(ycb_tree, box).sample(0)
+
+
+# --- the real frames -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frame", "name"),
+    [
+        ("0000/000001", "009_gelatin_box"),
+        ("0050/000003", "003_cracker_box"),
+        ("0050/000003", "006_mustard_bottle"),
+        ("0051/000001", "005_tomato_soup_can"),
+    ],
+)
+def test_projected_cuboid_covers_the_real_label(ycb_root: Path, frame: str, name: str) -> None:
+    source = YcbVideoSource(ycb_root, [ycb_part_of(ycb_root, name)], frames=[frame])
+    (instance,) = source.sample(0).instances
+    assert instance.mask is not None
+    hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
+    rows, columns = np.nonzero(instance.mask)
+    distances = [
+        cv2.pointPolygonTest(hull, (float(u), float(v)), True)
+        for u, v in zip(columns[::17], rows[::17], strict=True)
+    ]
+    assert min(distances) > -8  # the released poses sit 2–6 px off the image
+    assert 0.1 < instance.visible_fraction <= 1
+
+
+def test_real_depth_agrees_with_the_pose(ycb_root: Path) -> None:
+    part = ycb_part_of(ycb_root, "003_cracker_box")
+    sample = YcbVideoSource(ycb_root, [part], frames=["0050/000003"]).sample(0)
+    (instance,) = sample.instances
+    assert sample.depth is not None
+    assert instance.mask is not None
+    seen = sample.depth[instance.mask & (sample.depth > 0)]
+    assert abs(np.median(seen) - instance.T_cam_obj[2, 3]) < part.diameter / 2
+
+
+def test_real_synthetic_frame_and_lists(ycb_root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    parts = [ycb_part_of(ycb_root, name) for name in ("003_cracker_box", "005_tomato_soup_can")]
+    train = YcbVideoSource(ycb_root, parts, "train")
+    assert train.frames == ["0000/000001", "0050/000003"]
+    with caplog.at_level(logging.WARNING):
+        test = YcbVideoSource(ycb_root, parts, "keyframe")
+    assert "2,949 frames listed in keyframe.txt are absent; first: 0048/000001" in caplog.text
+    assert 1 <= len(test) <= 3
+    synthetic = YcbVideoSource(
+        ycb_root, parts, "train", "synthetic", backgrounds=ProceduralBackgrounds()
+    )
+    sample = synthetic.sample(0)
+    assert {instance.label for instance in sample.instances} <= {part.name for part in parts}
+    assert sample.image.std() > 5

@@ -1,0 +1,62 @@
+"""The sheet that a user looks at before rendering thousands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.data.jobs.job import make_job
+from dopepp.data.jobs.progress import preview_sheet, scene_tiles
+from dopepp.data.jobs.render_dataset import write_preview
+
+SMALL = ("width=96", "height=72")
+
+
+def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images() -> None:
+    factory = make_job(["servoholder", "pivconnector"], changes=SMALL).factory
+    sheet = preview_sheet(factory, num_scenes=2)
+    assert sheet.shape == (2 * (240 + 18) + 3 * 6, 4 * 320 + 5 * 6, 3)
+    image = factory.render(0, 1).image
+    shown = sheet[6 + 258 + 6 :][:240, 6 : 6 + 320]
+    small = cv2.resize(shown, (96, 72), interpolation=cv2.INTER_AREA).astype(int)
+    assert np.abs(small - image).mean() < 4
+
+
+def test_panels_say_what_they_show() -> None:
+    job = make_job(
+        ["servoholder"], preset="bin", changes=["targets_per_image=[5,5]"], size="160x120"
+    )
+    rendered = job.factory.render(0, 0)
+    image, posed, masks, depth = scene_tiles(rendered, "image 0")
+    assert image.caption.startswith("image 0: 160×120, ")
+    assert image.caption.endswith("on a plane")
+    number = len(rendered.scene.targets)
+    assert posed.caption == f"{number} servoholder"
+    assert masks.caption.startswith("visible: ")
+    assert depth.caption.startswith("depth: red 0.")
+    # Cuboids are drawn where the pixels of the parts are.
+    changed = (cv2.resize(posed.image, (160, 120)).astype(int) - image.image).any(axis=2)
+    assert changed[rendered.instances >= 0].mean() > 2 * changed[rendered.instances < 0].mean()
+
+
+def test_no_target_is_said_so() -> None:
+    job = make_job(["servoholder"], changes=["targets_per_image=[0,0]", *SMALL])
+    _, posed, masks, depth = scene_tiles(job.factory.render(0, 0), "image 0")
+    assert posed.caption == "no target"
+    assert masks.caption == "nothing to find; distractors: 0"
+    assert depth.caption == "no depth"
+
+
+def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(tmp_path: Path) -> None:
+    job = make_job(["servoholder"], preset="quickstart", size="32x24")
+    beside = write_preview(job, tmp_path / "data")
+    named = write_preview(job, tmp_path / "sheet.png")
+    assert beside == tmp_path / "data.preview.png"
+    assert beside.read_bytes() == named.read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"data.preview.png", "sheet.png"}
+    with pytest.raises(UserError, match=r"sheet .*sheet\.png.*a folder that can be written"):
+        write_preview(job, named / "x")

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Sample
+from dopepp.data.sources.cache import CachedSource
+from dopepp.data.transforms.resize import resize_sample
+
+
+def assert_same(first: Sample, second: Sample) -> None:
+    np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_array_equal(first.K, second.K)
+    assert (first.source, first.key) == (second.source, second.key)
+    for one, other in zip(first.instances, second.instances, strict=True):
+        assert (one.label, one.visible_fraction) == (other.label, other.visible_fraction)
+        np.testing.assert_array_equal(one.T_cam_obj, other.T_cam_obj)
+        np.testing.assert_array_equal(one.keypoints, other.keypoints)
+        assert (one.mask is None) == (other.mask is None)
+        if one.mask is not None and other.mask is not None:
+            np.testing.assert_array_equal(one.mask, other.mask)
+
+
+def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source: Any) -> None:
+    source = fake_source(num_items=3)
+    cached = CachedSource(source, (64, 64))
+    for epoch in (0, 5, 2):
+        for index in range(3):
+            assert_same(cached.sample(index, epoch), fake_source().sample(index, 0))
+    assert source.calls == [(0, 0), (0, 1), (0, 2)]
+
+
+def test_without_mask_and_without_instance(fake_source: Any) -> None:
+    source = fake_source(num_items=2)
+    bare = source.sample(1)
+    bare.instances[0].mask = None
+    empty = source.sample(0)
+    empty.instances = []
+    source.sample = lambda index, epoch=0: (empty, bare)[index]
+    cached = CachedSource(source, (64, 64))
+    for _ in range(2):
+        assert_same(cached.sample(0), empty)
+        assert_same(cached.sample(1), bare)
+
+
+def test_a_returned_sample_is_a_copy(fake_source: Any) -> None:
+    cached = CachedSource(fake_source(), (64, 64))
+    sample = cached.sample(0)
+    sample.image[:] = 0
+    sample.K[:] = 0
+    sample.instances[0].keypoints[:] = 0
+    assert_same(cached.sample(0), fake_source().sample(0))
+
+
+def test_images_are_kept_at_the_input_size(fake_source: Any) -> None:
+    cached = CachedSource(fake_source(size=(640, 480)), (64, 64))
+    expected = resize_sample(fake_source(size=(640, 480)).sample(1), (64, 64))
+    assert_same(cached.sample(1), expected)
+    assert cached.num_bytes < 12 * 64 * 64 * 6
+
+
+def test_forked_processes_fill_one_cache(fake_source: Any) -> None:
+    source = fake_source(num_items=8)
+    cached = CachedSource(source, (64, 64))
+    context = multiprocessing.get_context("fork")
+
+    def fill(indices: list[int]) -> None:
+        for index in indices:
+            cached.sample(index)
+
+    # Overlapping ranges: two processes write the same bytes into the same slots.
+    children = [
+        context.Process(target=fill, args=(part,)) for part in ([1, 2, 3, 4, 5], [5, 4, 3, 6, 7])
+    ]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+        assert child.exitcode == 0
+    for index in range(8):
+        assert_same(cached.sample(index), fake_source().sample(index))
+    assert source.calls == [(0, 0)]  # this process rendered the first item only
+
+
+def test_too_large_and_too_many_instances(fake_source: Any) -> None:
+    with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
+        CachedSource(fake_source(num_items=10**9), (64, 64))
+    with pytest.raises(ValueError, match="max_instances=0"):
+        CachedSource(fake_source(), (64, 64), max_instances=0)
+    with pytest.raises(ValueError, match="max_instances=256"):
+        CachedSource(fake_source(), (64, 64), max_instances=256)
+
+
+def test_what_does_not_fit_a_slot_is_refused(fake_source: Any) -> None:
+    with pytest.raises(ValueError, match="more than 64 characters"):
+        CachedSource(fake_source(label="x" * 65), (64, 64))
+    source = fake_source()
+    cached = CachedSource(source, (64, 64))
+    source.size = (48, 64)
+    with pytest.raises(ValueError, match="one size and one source"):
+        cached.sample(1)
+    source.size, source.name = (64, 48), "another"
+    with pytest.raises(ValueError, match="one size and one source"):
+        cached.sample(1)
+
+
+def test_a_file_lasts_and_is_told_apart(fake_source: Any, tmp_path: Path) -> None:
+    first = fake_source(num_items=4)
+    kept = CachedSource(first, (64, 64), tmp_path, identity="a")
+    for index in range(3):
+        kept.sample(index)
+    assert first.calls == [(0, 0), (0, 1), (0, 2)]
+
+    second = fake_source(num_items=4)
+    again = CachedSource(second, (64, 64), tmp_path, identity="a")
+    for index in range(4):
+        assert_same(again.sample(index), fake_source().sample(index))
+    assert second.calls == [(0, 0), (0, 3)]  # the first tells the slot's layout
+    assert again.folder == kept.folder
+
+    for other in (
+        CachedSource(fake_source(num_items=4), (64, 64), tmp_path, identity="b"),
+        CachedSource(fake_source(num_items=5), (64, 64), tmp_path, identity="a"),
+        CachedSource(fake_source(num_items=4), (32, 32), tmp_path, identity="a"),
+    ):
+        assert other.folder != kept.folder
+
+
+def test_a_torn_slot_is_filled_again(fake_source: Any, tmp_path: Path) -> None:
+    kept = CachedSource(fake_source(num_items=4), (64, 64), tmp_path)
+    kept.sample(2)
+    assert kept.folder is not None
+    path = kept.folder / "slots.bin"
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size * 2 // 4 + 100)
+        file.write(b"torn")
+    source = fake_source(num_items=4)
+    assert_same(CachedSource(source, (64, 64), tmp_path).sample(2), fake_source().sample(2))
+    assert (0, 2) in source.calls
+
+
+def test_native_size_keeps_depth(fake_source: Any, tmp_path: Path) -> None:
+    source = fake_source()
+    sample = source.sample(1)
+    sample.depth = np.linspace(0, 1, 48 * 64, dtype=np.float32).reshape(48, 64)
+    source.sample = lambda index, epoch=0: sample
+    kept = CachedSource(source, None, tmp_path).sample(1)
+    np.testing.assert_array_equal(kept.depth, sample.depth)
+    assert CachedSource(source, (64, 64)).sample(1).depth is None
+
+
+def test_no_room_is_one_line(
+    fake_source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(UserError, match=r"data\.cache=disk.*No space left.*data\.cache_dir"):
+        CachedSource(fake_source(), (64, 64), tmp_path)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_describes_itself_as_cached(fake_source: Any) -> None:
+    source = fake_source()
+    (info,), (plain,) = CachedSource(source, (64, 64)).describe(), source.describe()
+    assert info.identity == {**plain.identity, "cached": True}
+    assert CachedSource(source, (64, 64)).contains("box")

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Sample, SourceInfo
+from dopepp.data.sources.hybrid import REAL, SYNTHETIC, VIRTUAL, HybridSource
+
+
+class Named:
+    """A source whose samples carry (epoch, index) in their key."""
+
+    def __init__(self, name: str, num_items: int) -> None:
+        self.name, self._num_items = name, num_items
+
+    def __len__(self) -> int:
+        return self._num_items
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        assert 0 <= index < self._num_items
+        image = np.zeros((2, 2, 3), np.uint8)
+        return Sample(image, np.eye(3), source=self.name, key=f"{epoch}/{index}")
+
+    def contains(self, label: str) -> bool:
+        return label == self.name
+
+    def describe(self) -> list[SourceInfo]:
+        return [SourceInfo(self.name, self._num_items)]
+
+
+def items(source: HybridSource, epoch: int) -> list[tuple[str, str]]:
+    samples = [source.sample(i, epoch) for i in range(len(source))]
+    return [(sample.source, sample.key) for sample in samples]
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    real=st.integers(1, 12),
+    virtual=st.integers(1, 40),
+    synthetic=st.none() | st.integers(1, 9),
+    fraction=st.floats(0, 1),
+    synthetic_fraction=st.floats(0, 1),
+    length=st.integers(1, 40),
+    seed=st.integers(0, 1000),
+)
+def test_shares_are_exact_and_items_used_equally(
+    real: int,
+    virtual: int,
+    synthetic: int | None,
+    fraction: float,
+    synthetic_fraction: float,
+    length: int,
+    seed: int,
+) -> None:
+    mix = HybridSource(
+        Named("real", real),
+        Named("virtual", virtual),
+        fraction,
+        length,
+        seed,
+        None if synthetic is None else Named("synthetic", synthetic),
+        synthetic_fraction,
+    )
+    used: Counter[tuple[str, str]] = Counter()
+    for epoch in range(3):
+        epoch_items = items(mix, epoch)
+        counts = Counter(name for name, _ in epoch_items)
+        assert counts["real"] == round(fraction * length)
+        expected = 0 if synthetic is None else (1 - fraction) * synthetic_fraction * length
+        assert abs(counts["synthetic"] - expected) <= 0.5
+        assert (counts["real"], counts["virtual"], counts["synthetic"]) == mix.counts
+        used.update((name, key.partition("/")[2]) for name, key in epoch_items)
+        # An (epoch, index) of a source never comes twice, so no background or render repeats.
+        assert len(set(epoch_items)) == length
+    for name, size in (("real", real), ("virtual", virtual)):
+        uses = [used[name, str(i)] for i in range(size)]
+        assert max(uses) - min(uses) <= 1
+
+
+def test_pure_function_of_seed_epoch_and_index() -> None:
+    def build(seed: int) -> HybridSource:
+        return HybridSource(Named("real", 7), Named("virtual", 30), 0.5, 20, seed)
+
+    forward = [items(build(3), epoch) for epoch in range(4)]
+    fresh, backward = build(3), {}
+    for epoch in (3, 1, 2, 0):
+        for index in reversed(range(20)):
+            sample = fresh.sample(index, epoch)
+            backward[epoch, index] = (sample.source, sample.key)
+    assert all(backward[e, i] == forward[e][i] for e in range(4) for i in range(20))
+    assert forward[0] != forward[1]
+    assert items(build(4), 0) != forward[0]
+    # RenderRequest is mixed, not real frames first.
+    names = [name for name, _ in forward[0]]
+    assert names != sorted(names)
+
+
+def test_an_absent_source_gives_its_share_away(caplog: pytest.LogCaptureFixture) -> None:
+    assert HybridSource(None, Named("virtual", 5), 0.5, 10, 0).counts == (0, 10, 0)
+    synthetic = Named("synthetic", 5)
+    only_synthetic = HybridSource(Named("real", 5), None, 0.3, 10, 0, synthetic, 0.2)
+    assert only_synthetic.counts == (3, 0, 7)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        assert HybridSource(Named("real", 5), None, 0.3, 10, 0).counts == (10, 0, 0)
+    assert "the real share is 1" in caplog.text
+
+
+def test_contains_and_describe_know_only_used_sources() -> None:
+    mix = HybridSource(Named("real", 5), Named("virtual", 5), 0.0, 10, 0)
+    assert not mix.contains("real")
+    assert mix.contains("virtual")
+    (info,) = mix.describe()
+    assert info.name == "virtual"
+    assert info.identity["hybrid"] == {
+        "seed": 0,
+        "samples_per_epoch": 10,
+        "role": "virtual",
+        "count": 10,
+    }
+    roles = {mix.locate(i, 0)[0] for i in range(10)}
+    assert roles == {VIRTUAL}
+    assert (REAL, SYNTHETIC) == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"real_fraction": 1.2}, r"data\.real_fraction=1\.2; allowed: a share in \[0, 1\]"),
+        ({"synthetic_fraction": -0.1}, r"data\.synthetic_fraction=-0\.1"),
+        ({"samples_per_epoch": 0}, r"data\.samples_per_epoch=0; allowed: at least 1"),
+        ({"real": None, "virtual": None}, "without any source"),
+    ],
+)
+def test_wrong_options(changes: dict[str, Any], message: str) -> None:
+    options = {"real": Named("real", 2), "virtual": Named("virtual", 2)}
+    options |= {"real_fraction": 0.5, "samples_per_epoch": 4, "seed": 0} | changes
+    with pytest.raises(UserError, match=message):
+        HybridSource(**options)  # type: ignore[arg-type]

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.data.sources.rendered import FIRST_INDEX, MAX_ITEMS, RenderedSource
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
+
+
+@pytest.fixture(scope="module")
+def factory() -> Factory:
+    return Factory([servoholder()], PRESETS["quickstart"], seed=3)
+
+
+def test_sample_agrees_with_the_scene(factory: Factory) -> None:
+    sample = RenderedSource(factory, 4).sample(2, epoch=1)
+    rendered = factory.render(1, 2)
+    np.testing.assert_array_equal(sample.image, rendered.image)
+    (target,) = rendered.scene.targets
+    (instance,) = sample.instances
+    placed = rendered.scene.objects[target]
+    expected, _ = cv2.projectPoints(
+        servoholder().cuboid,
+        cv2.Rodrigues(placed.T_cam_obj[:3, :3])[0],
+        placed.T_cam_obj[:3, 3],
+        sample.K,
+        None,
+    )
+    np.testing.assert_allclose(instance.keypoints, expected[:, 0], atol=1e-6)
+    assert instance.mask is not None
+    assert instance.visible_fraction == rendered.visible_fractions[target]
+    # What is seen of the part lies inside the hull of its cuboid's corners.
+    hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
+    rows, columns = np.nonzero(instance.mask)
+    inside = [
+        cv2.pointPolygonTest(hull, (float(u), float(v)), True)
+        for u, v in zip(columns, rows, strict=True)
+    ]
+    assert min(inside) > -1.0
+    assert (sample.source, sample.key) == ("virtual", "train/1/2")
+
+
+def test_splits_are_disjoint_and_only_training_has_epochs(factory: Factory) -> None:
+    sources = {split: RenderedSource(factory, 3, split) for split in FIRST_INDEX}
+    images = {
+        (split, epoch): source.sample(0, epoch).image
+        for split, source in sources.items()
+        for epoch in (0, 1)
+    }
+    assert (images["train", 0] != images["train", 1]).any()
+    for split in ("val", "test"):
+        np.testing.assert_array_equal(images[split, 0], images[split, 1])
+        assert (images[split, 0] != images["train", 0]).any()
+    assert (images["val", 0] != images["test", 0]).any()
+    firsts = sorted(FIRST_INDEX.values())
+    assert min(np.diff(firsts)) >= MAX_ITEMS
+
+
+def test_bounds_description_and_objects(factory: Factory) -> None:
+    source = RenderedSource(factory, 3)
+    with pytest.raises(IndexError, match="item 3 of 3"):
+        source.sample(3)
+    with pytest.raises(ValueError, match="num_items"):
+        RenderedSource(factory, 0)
+    assert source.contains(servoholder().name)
+    assert not source.contains(pivconnector().name)
+    (info,) = source.describe()
+    assert info.identity["parts"] == {servoholder().name: servoholder().mesh_hash}
+    (other,) = RenderedSource(Factory(factory.parts, factory.preset, 4), 3).describe()
+    assert other.identity != info.identity
+
+
+def test_the_render_path_loads_neither_torch_nor_lightning() -> None:
+    code = (
+        "import sys, dopepp.data.sources.rendered, dopepp.data.formats.ycb_video.source; "
+        "import dopepp.data.sources.hybrid, dopepp.data.sources.cache, dopepp.data.transforms; "
+        "import dopepp.data.transforms.masking, dopepp.data.transforms.augment; "
+        "sys.exit(bool({'torch', 'lightning'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_another_scale_is_the_same_test_set_from_elsewhere(factory: Factory) -> None:
+    usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
+    one, other = usual.sample(1), near.sample(1)
+    assert one.key == other.key
+    np.testing.assert_allclose(other.instances[0].keypoints[8], one.instances[0].keypoints[8])
+    assert (one.image != other.image).any()
+    ((described,), (there,)) = usual.describe(), near.describe()
+    # Caches and checkpoints of the usual images stay valid.
+    assert there.identity == {**described.identity, "scale": 0.5}
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="scale"):
+            RenderedSource(factory, 2, scale=scale)

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.data.transforms.augment import Photometric
+
+OFF: dict[str, float] = {
+    "brightness": 0,
+    "contrast": 0,
+    "saturation": 0,
+    "hue": 0,
+    "colour_gain": 0,
+    "blur_probability": 0,
+    "noise_probability": 0,
+    "jpeg_probability": 0,
+}
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    noise = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    return cv2.GaussianBlur(noise, (5, 5), 2)
+
+
+def only(**options: Any) -> Photometric:
+    return Photometric(**(OFF | options))
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**31), epoch=st.integers(0, 100))
+def test_pure_function_of_the_generator(seed: int, epoch: int) -> None:
+    image = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)
+    before, augment = image.copy(), Photometric()
+    first = augment(image, np.random.default_rng([seed, epoch]))
+    second = augment(image, np.random.default_rng([seed, epoch]))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(image, before)
+    assert (first.dtype, first.shape) == (image.dtype, image.shape)
+
+
+def test_everything_off_changes_nothing(image: np.ndarray) -> None:
+    np.testing.assert_array_equal(only()(image, np.random.default_rng(0)), image)
+
+
+def test_brightness_and_contrast_stay_in_their_range() -> None:
+    grey = np.full((8, 8, 3), 128, np.uint8)
+    dark, light = np.full((8, 8, 3), 90, np.uint8), np.full((8, 8, 3), 160, np.uint8)
+    offsets, gains = [], []
+    for seed in range(200):
+        offsets.append(float(only(brightness=0.2)(grey, np.random.default_rng(seed)).mean()) - 128)
+        contrast = only(contrast=0.3)
+        low = contrast(dark, np.random.default_rng(seed)).mean()
+        gains.append((contrast(light, np.random.default_rng(seed)).mean() - low) / 70)
+    assert max(np.abs(offsets)) <= 0.2 * 255 + 0.5
+    assert min(offsets) < -40
+    assert max(offsets) > 40
+    assert 0.68 < min(gains) < 0.8
+    assert 1.2 < max(gains) < 1.32
+
+
+def test_hue_and_saturation_keep_the_luma(image: np.ndarray) -> None:
+    soft = (image // 2 + 64).astype(np.uint8)  # away from clipping
+    changed = only(hue=0.5, saturation=0.3)(soft, np.random.default_rng(2))
+    assert np.abs(changed.astype(int) - soft).max() > 3
+    luma = [cv2.cvtColor(array, cv2.COLOR_RGB2GRAY).astype(int) for array in (soft, changed)]
+    assert np.abs(luma[0] - luma[1]).max() <= 2
+    grey = np.full((4, 4, 3), 77, np.uint8)
+    np.testing.assert_allclose(only(hue=1.0, saturation=0.5)(grey, np.random.default_rng(0)), 77)
+
+
+def test_noise_has_the_asked_spread() -> None:
+    grey = np.full((200, 200, 3), 128, np.uint8)
+    augment = only(noise_probability=1, noise_sigma=(6.0, 6.0))
+    noise = augment(grey, np.random.default_rng(0)).astype(float) - 128
+    assert noise.std() == pytest.approx(6.0, rel=0.02)
+    assert abs(noise.mean()) < 0.1
+    for value in (0, 255):
+        flat = np.full((20, 20, 3), value, np.uint8)
+        assert np.abs(augment(flat, np.random.default_rng(0)).astype(int) - value).max() < 40
+
+
+def test_blur_and_jpeg_against_opencv(image: np.ndarray) -> None:
+    blurred = only(blur_probability=1, blur_sigma=(1.0, 1.0))(image, np.random.default_rng(0))
+    np.testing.assert_array_equal(blurred, cv2.GaussianBlur(image, (0, 0), 1.0))
+    mild = only(jpeg_probability=1, jpeg_quality=(95, 95))(image, np.random.default_rng(0))
+    harsh = only(jpeg_probability=1, jpeg_quality=(10, 10))(image, np.random.default_rng(0))
+    errors = [np.abs(array.astype(int) - image).mean() for array in (mild, harsh)]
+    assert 0 < errors[0] < errors[1]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"brightness": -0.1}, {"noise_sigma": (5, 1)}, {"blur_probability": 1.2}, {"hue": -1}],
+)
+def test_wrong_ranges_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Photometric(**options)

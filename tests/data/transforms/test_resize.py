@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.data.transforms.resize import letterbox_sample, nearest, pad_sample, resize_sample
+from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.cuboid import cuboid_keypoints
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    shape=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    target=st.tuples(st.integers(1, 70), st.integers(1, 70)),
+)
+def test_nearest_is_the_source_pixel_under_the_target_centre(
+    shape: tuple[int, int], target: tuple[int, int]
+) -> None:
+    image = np.arange(shape[0] * shape[1]).reshape(shape)
+    result = nearest(image, *target)
+    assert result.shape == target[::-1]
+    for row in range(0, target[1], 7):
+        for column in range(0, target[0], 7):
+            # Exact rationals: the centre of a target pixel, in source pixels, from the corner.
+            u = (2 * column + 1) * shape[1] // (2 * target[0])
+            v = (2 * row + 1) * shape[0] // (2 * target[1])
+            assert result[row, column] == image[v, u]
+
+
+def test_nearest_against_opencvs_exact_rule() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
+    for width, height in ((416, 312), (128, 96), (640, 480), (1280, 960), (37, 301)):
+        expected = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        # A centre on the border of two source pixels is equally near to both.
+        rows = (2 * np.arange(height) + 1) * 480 % (2 * height) != 0
+        columns = (2 * np.arange(width) + 1) * 640 % (2 * width) != 0
+        unique = np.ix_(rows, columns)
+        np.testing.assert_array_equal(nearest(image, width, height)[unique], expected[unique])
+
+
+def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:
+    """An image of a smooth bright dot, which is also the first keypoint."""
+    rows, columns = np.mgrid[: size[1], : size[0]]
+    sigma = max(size) / 40
+    value = 255 * np.exp(-((columns - dot[0]) ** 2 + (rows - dot[1]) ** 2) / (2 * sigma**2))
+    image = np.repeat(np.rint(value).astype(np.uint8)[..., None], 3, axis=2)
+    keypoints = np.tile(np.array(dot), (9, 1))
+    mask = value > 100
+    instance = Instance("dot", np.eye(4), keypoints, 1.0, mask)
+    depth = np.where(mask, 0.5, 0).astype(np.float32)
+    return Sample(image, np.eye(3), [instance], depth)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    x=st.floats(0.25, 0.75),
+    y=st.floats(0.25, 0.75),
+    size=st.sampled_from([(640, 480), (480, 640), (300, 200), (100, 100)]),
+    target=st.sampled_from([(416, 416), (128, 128), (256, 160), (416, 96)]),
+)
+def test_a_bright_dot_moves_with_its_keypoint(
+    x: float, y: float, size: tuple[int, int], target: tuple[int, int]
+) -> None:
+    sample = dot_sample(size, (x * size[0], y * size[1]))
+    result = letterbox_sample(sample, target)
+    assert result.size == target
+    weights = result.image[..., 0].astype(float)
+    rows, columns = np.mgrid[: target[1], : target[0]]
+    centre = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+    instance = result.instances[0]
+    np.testing.assert_allclose(instance.keypoints[0], centre, atol=0.1)
+    assert instance.mask is not None
+    assert result.depth is not None
+    np.testing.assert_array_equal(result.depth > 0, instance.mask)
+    mask_centre = np.argwhere(instance.mask).mean(axis=0)[::-1]
+    scale = min(target[0] / size[0], target[1] / size[1])
+    np.testing.assert_allclose(mask_centre, centre, atol=0.6 * max(1, scale))
+
+
+@settings(deadline=None, max_examples=30)
+@given(width=st.integers(50, 700), height=st.integers(50, 700), side=st.sampled_from([128, 416]))
+def test_keypoints_and_camera_follow_one_rule(width: int, height: int, side: int) -> None:
+    K = np.array([[1.1 * width, 0, 0.4 * width], [0, 1.2 * width, 0.6 * height], [0, 0, 1]])
+    T = np.eye(4)
+    T[:3, 3] = (0.01, -0.02, 0.4)
+    cuboid = cuboid_keypoints(np.full(3, -0.04), np.full(3, 0.05))
+    instance = Instance("box", T, project_keypoints(cuboid, T, K))
+    sample = Sample(np.zeros((height, width, 3), np.uint8), K, [instance])
+    result = letterbox_sample(sample, (side, side))
+    expected = project_keypoints(cuboid, T, result.K)
+    np.testing.assert_allclose(result.instances[0].keypoints, expected, atol=1e-9)
+
+
+def test_padding_is_zero_on_the_right_and_at_the_bottom(fake_source: Any) -> None:
+    sample = fake_source(size=(64, 48)).sample(0)
+    result = letterbox_sample(sample, (64, 64))
+    np.testing.assert_array_equal(result.image[:48], sample.image)
+    assert not result.image[48:].any()
+    np.testing.assert_array_equal(result.K, sample.K)
+    assert resize_sample(result, (64, 64)) is result
+    with pytest.raises(ValueError, match="does not fit"):
+        pad_sample(sample, (32, 64))
+    bare = replace(sample, instances=[replace(sample.instances[0], mask=None)])
+    assert letterbox_sample(bare, (32, 32)).instances[0].mask is None

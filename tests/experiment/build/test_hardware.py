@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from dopepp.experiment.build import hardware
+from dopepp.experiment.build.hardware import choose_precision, estimate_training_s
+from dopepp.experiment.build.objects import build_parts
+from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.system import build_system
+
+Composer = Callable[..., dict[str, Any]]
+
+
+@pytest.mark.parametrize("accelerator", ["cpu", "cuda", "mps"])
+def test_what_is_asked_for_is_taken(accelerator: str) -> None:
+    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [({"sse2", "avx512_bf16"}, "bf16-mixed"), ({"sse2", "avx2"}, "32-true"), (set(), "32-true")],
+)
+def test_a_cpu_takes_bf16_only_where_it_computes_in_it(
+    flags: set[str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hardware, "_cpu_flags", lambda: flags)
+    precision, reason = choose_precision("auto", "cpu")
+    assert precision == expected
+    assert "bf16" in reason
+
+
+@pytest.mark.parametrize(("fast", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_a_gpu_is_asked(fast: bool, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: fast)
+    assert choose_precision("auto", "cuda")[0] == expected
+
+
+def test_other_accelerators_are_not_guessed_at() -> None:
+    assert choose_precision("auto", "mps")[0] == "32-true"
+
+
+def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Composer) -> None:
+    config = tiny("model.backbone.batch_norm=true")
+    parts = build_parts(config["data"])
+    module, system = build_datamodule(config["data"], parts, 0), build_system(config, parts, "")
+    before = {name: value.clone() for name, value in system.network.state_dict().items()}
+    trainer = {**config["trainer"], "max_epochs": 1000, "max_steps": -1}
+    long = estimate_training_s(system.network, module, trainer, "32-true")
+    short = estimate_training_s(system.network, module, {**trainer, "max_steps": 2}, "32-true")
+    assert 0 < short < long
+    assert system.network.training
+    for name, value in system.network.state_dict().items():
+        assert torch.equal(value, before[name]), f"{name} has changed"
+    assert all(parameter.grad is None for parameter in system.network.parameters())

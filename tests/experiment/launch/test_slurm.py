@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dopepp.experiment.launch import slurm
+
+
+@pytest.fixture(autouse=True)
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SLURM_JOB_ID", "12")
+
+
+def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slurm.remember_run(["seed=1"], tmp_path / "a")
+    slurm.remember_run(["seed=2"], tmp_path / "b")
+    assert slurm.begun_run(["seed=1"]) is None  # the first time: no restart
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert slurm.begun_run(["seed=1"]) == tmp_path / "a"
+    assert slurm.begun_run(["seed=2"]) == tmp_path / "b"
+    assert slurm.begun_run(["seed=3"]) is None
+    monkeypatch.setenv("SLURM_JOB_ID", "13")
+    assert slurm.begun_run(["seed=1"]) is None
+
+
+def test_an_array_job_is_named_as_scontrol_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "10")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
+    assert slurm.job_id() == "10_3"
+
+
+@pytest.mark.parametrize("text", ["", "1; rm", "--help"])
+def test_what_is_no_job_id_is_none(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_JOB_ID", text)
+    assert slurm.job_id() is None
+
+
+def test_a_refused_or_missing_scontrol_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert slurm.requeue().startswith("SLURM did not requeue job 12: ")
+    script = tmp_path / "scontrol"
+    script.write_text("#!/bin/sh\necho Access denied >&2\nexit 1\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.defpath}")
+    assert slurm.requeue() == "SLURM did not requeue job 12: Access denied"

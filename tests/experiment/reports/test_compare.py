@@ -1,0 +1,399 @@
+"""Comparisons: reading run folders, seeds of one method together, the table, its words."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from omegaconf import OmegaConf
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.cost import COST_FILE
+from dopepp.experiment.reports.compare.compare import (
+    compare_paths,
+    compare_reports,
+    compare_runs,
+    write_comparison,
+)
+from dopepp.experiment.reports.compare.entries import Entry, differences, group, ordered
+from dopepp.experiment.reports.compare.pictures import logged
+from dopepp.experiment.reports.compare.runs import find_runs, read_run
+from dopepp.experiment.reports.compare.table import full, headline, lines
+from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.runs import record
+from dopepp.experiment.runs.sweep import CompareJobs
+from dopepp.metrics.pose import MEAN
+from dopepp.metrics.row import PoseRow, mean_row, summarise
+
+DIAMETER = 0.1
+
+
+def report(
+    name: str, add: Sequence[float], *, test_set: str = "images", num_objects: int = 1
+) -> Report:
+    """Make a result whose every object has these errors; 1 mm are 10°."""
+    errors, rows = np.array(add, np.float64), {}
+    angles = errors * 10_000
+    for number in range(num_objects):
+        part = f"part{number}"
+        e, a = torch.from_numpy(errors), torch.from_numpy(angles)
+        rows[part] = summarise(part, name, DIAMETER, e, e, e, a, a, 1)
+        rows[part].miss_rate = float(np.isinf(errors).mean())
+    parts = list(rows)
+    rows[MEAN] = mean_row(list(rows.values()), name)
+    constant = PoseRow("part0", "best constant pose", 4, 0.2)
+    return Report(
+        name, rows, {"best constant pose": {"part0": constant, MEAN: constant}},
+        dict.fromkeys(parts, errors), Cost(1234567, 1.5, 7.25), len(errors),
+        rotation_deg=dict.fromkeys(parts, angles), diameters=dict.fromkeys(parts, DIAMETER),
+        test_set=test_set,
+    )  # fmt: skip
+
+
+GOOD, BAD = [0.005] * 30 + [np.inf] * 2, [0.004] * 10 + [0.02] * 20 + [np.inf] * 2
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def entry(name: str, *reports: Report, seeds: Sequence[int | None] | None = None) -> Entry:
+    return Entry(name, list(reports), list(seeds or range(len(reports))))
+
+
+def write_run(
+    folder: Path, overrides: Sequence[str] = (), result: Report | str | None = None,
+    seed: int = 0, **config: Any,
+) -> Path:  # fmt: skip
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
+    if isinstance(result, Report):
+        record.write_json(folder / record.METRICS_FILE, result.to_record())
+        model = {"name": result.name, "width": 0.25}
+        record.write_config(folder, {"model": model, "seed": seed, **config})
+    elif result is not None:
+        record.write_json(folder / record.FAILURE_FILE, {"reason": result})
+    return folder
+
+
+# The table
+
+
+def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path: Path) -> None:
+    results = [entry("dopepp", report("dopepp", GOOD)), entry("dope", report("dope", BAD))]
+    text = write_comparison(ordered(results), tmp_path)
+    rows = read_csv(tmp_path / "compare.csv")
+    assert [row["method"] for row in rows] == ["dope", "dopepp", "best constant pose"]
+    assert rows[0]["Δ ADD-0.1d %"] == ""
+    assert rows[1]["Δ ADD-0.1d %"] == "+62.5"  # 30 of 32 against 10
+    assert rows[1]["Δ ADD-0.1d % verdict"] == "beyond noise"
+    assert float(rows[1]["Δ ADD-0.1d % low"]) < 62.5 < float(rows[1]["Δ ADD-0.1d % high"])
+    assert rows[1]["Δ ADD<10cm %"] == "+0.0"
+    assert rows[1]["Δ ADD<10cm % verdict"] == "within noise"
+    assert rows[1]["Δ rotation °"] == "-150.0"
+    assert (rows[0]["parameters"], rows[0]["GMACs"], rows[0]["ms/frame"]) == (
+        "1,234,567", "1.500", "7.2",
+    )  # fmt: skip
+    assert "Δ is against dope" in text
+    assert "the noise of training" in text
+    assert "Within noise, dopepp: ADD<5cm %, ADD<10cm %" in text
+    header = text.splitlines()[0]
+    assert "seeds" not in header
+    assert {line.count("|") for line in text.splitlines()[:5]} == {header.count("|")}
+    with (tmp_path / "compare_auc.csv").open() as stream:
+        assert stream.readline().strip() == "threshold_m,dope,dopepp"
+
+
+def test_differences_are_those_of_the_rows() -> None:
+    rng = np.random.default_rng(0)
+    one, other = (report(name, rng.gamma(1, 0.02, 60)) for name in "ab")
+    found = differences(entry("a", one), entry("b", other), "part0")
+    for field, difference in found.items():
+        assert difference is not None
+        expected = getattr(one.rows["part0"], field) - getattr(other.rows["part0"], field)
+        assert difference.value == pytest.approx(expected, abs=1e-12)
+
+
+def test_seeds_become_mean_and_deviation() -> None:
+    mine = entry("dopepp", report("dopepp", GOOD), report("dopepp", BAD), seeds=[2, 1])
+    row = full(lines([mine]))[0]
+    assert (row["seeds"], row["ADD-0.1d %"]) == ("1, 2", "62.5")
+    assert row["± ADD-0.1d %"] == f"{100 * np.std([30 / 32, 10 / 32], ddof=1):.1f}"
+    assert headline(lines([mine]))[0]["ADD-0.1d %"] == "62.5 ± 44.2"
+
+
+def test_seeds_are_paired_by_number_not_by_order() -> None:
+    """Row by row one seed is better than the baseline's and the other as much worse."""
+    shift = np.linspace(0, 0.001, 32)
+    a, b = 0.02 + shift, 0.03 + shift
+    base = entry("dope", report("x", a), report("x", b), seeds=[1, 2])
+    same = entry("y", report("y", b - 0.0005), report("y", a - 0.0005), seeds=[2, 1])
+    difference = differences(same, base, "part0")["auc_10cm"]
+    assert difference is not None
+    assert (difference.value, difference.within_noise) == (pytest.approx(0.005), False)
+    other = entry("y", report("y", b - 0.0005), report("y", a - 0.0005), seeds=[2, 3])
+    loose = differences(other, base, "part0")["auc_10cm"]
+    assert loose is not None
+    assert loose.within_noise
+
+
+def test_other_seeds_than_the_baselines_are_named(tmp_path: Path) -> None:
+    base = entry("dope", report("dope", BAD), report("dope", BAD), seeds=[1, 2])
+    mine = entry("dopepp", report("dopepp", GOOD), seeds=[1])
+    text = write_comparison([base, mine], tmp_path)
+    assert "not paired over them: dopepp" in text
+    assert "Of dopepp there is one training" in text
+    both = entry("dopepp", report("dopepp", GOOD), report("dopepp", GOOD), seeds=[1, 2])
+    text = write_comparison([base, both], tmp_path)
+    assert "and over the seeds of the trainings" in text
+    assert "Not of the same seeds" not in text
+
+
+def test_an_interval_of_shares_ends_at_one() -> None:
+    low, high = report("x", [0.2] * 40), report("x", [0.001] * 40)
+    base = entry("dope", low, low)
+    difference = differences(entry("y", low, high), base, "part0")["add_01d"]
+    assert difference is not None
+    assert (difference.low, difference.high) == (-1, 1)
+
+
+@pytest.mark.parametrize("known", ["images", ""])
+def test_other_images_are_not_set_off(known: str, tmp_path: Path) -> None:
+    base = entry("dope", report("dope", BAD, test_set=known))
+    text = write_comparison([base, entry("x", report("x", GOOD, test_set="others"))], tmp_path)
+    assert read_csv(tmp_path / "compare.csv")[1]["Δ ADD-0.1d %"] == ""
+    what = "not measured on the same images as dope: x" if known else "does not say which images"
+    assert what in text
+
+
+def test_a_mean_over_other_objects_is_not_set_off() -> None:
+    base = entry("dope", report("dope", BAD, num_objects=2))
+    mine = report("x", GOOD, num_objects=3)
+    table = lines([base, entry("x", mine)])
+    by_object = {line.object: line.differences for line in table if line.method == "x"}
+    assert by_object["part0"]
+    assert not by_object["part2"]
+    assert not by_object[MEAN]
+    assert {line.object for line in table if line.method == "dope"} == {"part0", "part1", MEAN}
+
+
+def test_an_object_without_instances_has_no_difference() -> None:
+    empty = report("dope", BAD)
+    empty.errors["part0"] = np.zeros(0)
+    assert differences(entry("x", empty), entry("dope", empty), "part0") == {}
+
+
+def test_all_missed_is_no_angle() -> None:
+    base, mine = report("dope", BAD), report("x", [np.inf] * 32)
+    row = full(lines([entry("dope", base), entry("x", mine)]))[1]
+    assert (row["rotation °"], row["Δ rotation °"]) == ("n/a", "n/a")
+    assert row["Δ ADD-0.1d % verdict"] == "beyond noise"
+    seeds = entry("x", mine, report("x", GOOD))
+    assert seeds.row("part0").median_rotation_deg is None  # one seed's alone would flatter
+
+
+def test_a_baseline_that_is_asked_for_stands_before_dope(tmp_path: Path) -> None:
+    compare_reports([report("dopepp", GOOD), report("dope", BAD)], tmp_path, "dopepp")
+    assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dopepp", "dope"]
+
+
+@pytest.mark.parametrize("others", [[], [entry("dope", report("dope", BAD))]])
+def test_a_failed_job_is_a_row(
+    others: list[Entry], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reason = "got data.input_size=[30, 30] | x; allowed: [width, height] [/nothing]; fix: [bold]"
+    text = write_comparison([*others, Entry("dopepp", failure=reason)], tmp_path)
+    rows = read_csv(tmp_path / "compare.csv")
+    assert rows[len(others)]["method"] == "dopepp"
+    assert rows[len(others)]["object"] == f"failed: {reason}"
+    assert r"[30, 30] \| x" in text
+    assert (tmp_path / "compare_auc.png").exists() == bool(others)
+    # In the terminal it is folded, not read as markup.
+    shown = "".join(capsys.readouterr().out.split())
+    assert "[width," in shown
+    assert "[/noth" in shown
+
+
+# Run folders
+
+
+def test_runs_that_differ_in_the_seed_are_one_method(tmp_path: Path) -> None:
+    number = 0
+    for model in ("dope", "dopepp"):
+        for seed in (1, 2):
+            write_run(
+                tmp_path / str(number), [f"model={model}", f"seed={seed}"],
+                report(model, GOOD), seed, output_dir=f"somewhere{seed}",
+            )  # fmt: skip
+            number += 1
+    write_run(tmp_path / "4", ["model=dope", "seed=3"], "out of memory")
+    entries = group(find_runs([tmp_path]))
+    assert [one.name for one in entries] == ["dope", "dopepp", "dope seed=3"]
+    assert [one.seeds for one in entries] == [[1, 2], [1, 2], []]
+    assert entries[2].failure == "out of memory"
+
+
+def test_whatever_else_differs_keeps_runs_apart(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", ["seed=1"], report("dopepp", GOOD), 1)
+    write_run(tmp_path / "1", ["seed=2", "lr=3"], report("dopepp", GOOD), 2, lr=3)
+    write_run(tmp_path / "2", ["seed=3"], report("dopepp", GOOD, test_set="others"), 3)
+    write_run(tmp_path / "3", ["seed=1"], report("dopepp", GOOD), 1)  # the same once more
+    names = [one.name for one in group(find_runs([tmp_path]))]
+    place = tmp_path.name
+    assert names == [
+        f"dopepp seed=1 {place}/0", "dopepp seed=2 lr=3", "dopepp seed=3",
+        f"dopepp seed=1 {place}/3",
+    ]  # fmt: skip
+
+
+def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
+    common = ["data=virtual", "seed=1", "output_dir=x", "hydra.verbose=true"]
+    write_run(tmp_path / "0", [*common, "model=dope", "+optimizer=adam"])
+    write_run(tmp_path / "1", [*common, "model=dopepp", "optimizer=sgd"])
+    write_run(tmp_path / "10", [*common, "model=dopepp", "x=" + 60 * "y"])
+    names = [one.name for one in group(find_runs([tmp_path]))]
+    assert names == ["dope optimizer=adam", "dopepp optimizer=sgd", f"dopepp {tmp_path.name}/10"]
+
+
+def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        run = write_run(
+            tmp_path / f"run{seed}", ["lr=2", f"seed={seed}"], report("dopepp", BAD), seed, lr=2
+        )
+        folder = tmp_path / f"evaluation{seed}"
+        write_run(folder, [f"ckpt_path={run}", "data.num_test=9"])
+        record.write_json(folder / record.METRICS_FILE, report("dopepp", GOOD).to_record())
+        checkpoint = run / "checkpoints" / "best.ckpt"
+        record.write_config(folder, {"ckpt_path": str(checkpoint), "data": {"num_test": 9}})
+    evaluations = [tmp_path / "evaluation1", tmp_path / "evaluation2"]
+    first = read_run(evaluations[0])
+    assert (first.seed, first.model) == (1, "dopepp")
+    assert first.checkpoint == tmp_path / "run1" / "checkpoints" / "best.ckpt"
+    (one,) = group(find_runs(evaluations))
+    assert one.seeds == [1, 2]
+    # Beside the trainings themselves it is something else: measured with other options.
+    assert len(group(find_runs([*evaluations, tmp_path / "run1"]))) == 2
+
+
+def test_a_folder_given_twice_counts_once(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", [], report("dopepp", GOOD))
+    assert len(find_runs([tmp_path, tmp_path / "0", tmp_path / "." / "0"])) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [("{", "unreadable"), ("{}", "not of this version"), ('{"name": 1, "objects": []}', "version")],
+)
+def test_a_damaged_result_is_a_row_with_the_reason(
+    content: str, reason: str, tmp_path: Path
+) -> None:
+    run = write_run(tmp_path / "0")
+    (run / record.METRICS_FILE).write_text(content)
+    (run / record.CONFIG_FILE).write_text("a: [")
+    (one,) = group(find_runs([tmp_path]))
+    assert reason in one.failure
+    assert "\n" not in one.failure
+
+
+def test_a_job_that_measures_costs_has_nothing_else(tmp_path: Path) -> None:
+    stored = {"parameters": 1234, "gmacs": 2.5, "ms_per_frame": 12.0, "name": "dopepp"}
+    record.write_json(write_run(tmp_path / "0") / COST_FILE, stored)
+    (one,) = group(find_runs([tmp_path]))
+    assert one.failure == ""
+    for table in (headline(lines([one])), full(lines([one]))):
+        (row,) = table
+        assert (row["object"], row["parameters"], row["ms/frame"]) == ("cost only", "1,234", "12.0")
+    write_comparison([entry("dope", report("dope", BAD)), one], tmp_path)
+    assert read_csv(tmp_path / "compare.csv")[1]["GMACs"] == "2.500"
+    record.write_json(tmp_path / "0" / COST_FILE, {})
+    assert "cost.json is not of this version" in read_run(tmp_path / "0").failure
+
+
+def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "0")
+    assert read_run(run).failure == "unfinished: it left no metrics.json"
+    (run / "checkpoints").mkdir()
+    (run / "checkpoints" / "last.ckpt").write_bytes(b"")
+    assert read_run(run).failure.endswith(f"go on with resume={run}")
+
+
+def test_a_folder_without_runs_is_a_users_mistake(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(UserError, match="holds no run"):
+            find_runs([path])
+
+
+def test_a_log_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    assert logged(path, "train/loss") == {}
+    path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
+    assert logged(path, "train/loss") == {0: 1.5, 3: 0.5}
+    assert logged(path, "val/loss") == {}
+
+
+# The whole
+
+
+def test_curves_of_unfinished_runs_are_drawn_and_checkpoints_that_are_none_told(
+    tmp_path: Path,
+) -> None:
+    write_run(tmp_path / "0", ["model=dope"], report("dope", BAD))
+    unfinished = write_run(tmp_path / "1", ["model=dopepp"])
+    for folder in (tmp_path / "0", unfinished):
+        rows = "\n".join(f"{step},{5 / (step + 1)}" for step in range(120))
+        (folder / "metrics.csv").write_text(f"step,train/loss\n{rows}\n")
+    (unfinished / "checkpoints").mkdir()
+    (unfinished / "checkpoints" / "best.ckpt").write_bytes(b"junk")
+    out = compare_paths([tmp_path / "0", unfinished], tmp_path / "out")
+    assert {path.name for path in out.iterdir()} == {
+        "compare.csv", "compare.md", "compare.png", "compare_loss.png",
+        "compare_auc.csv", "compare_auc.png",
+    }  # fmt: skip
+    text = (out / "compare.md").read_text()
+    assert "dope: no file" in text
+    assert "best.ckpt" in text
+    assert "model.width=0.25" in text
+    assert cv2.imread(str(out / "compare.png")).shape[2] == 3
+
+
+def test_a_comparison_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = write_run(tmp_path / "run", [], report("dopepp", GOOD))
+    monkeypatch.chdir(tmp_path)
+    first, second = compare_paths([run]), compare_paths([run])
+    assert first.parent == second.parent == Path("outputs", "compare")
+    assert first != second
+    with pytest.raises(UserError, match=r"holds compare\.csv"):
+        compare_paths([run], out=first)
+    with pytest.raises(UserError, match="baseline 'x'; allowed: dopepp"):
+        compare_runs([read_run(run)], tmp_path / "new", baseline="x")
+
+
+def end_sweep(folder: Path) -> None:
+    CompareJobs().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}}))
+
+
+def test_the_sweep_ends_with_a_table_and_fails_after_it(tmp_path: Path) -> None:
+    end_sweep(tmp_path)  # of no jobs: nothing to say
+    write_run(tmp_path / "0", ["model=dopepp"], report("dopepp", GOOD))
+    write_run(tmp_path / "1", ["model=dope"], report("dope", BAD))
+    end_sweep(tmp_path)
+    assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dope", "dopepp"]
+    assert "model.width=0.25" in (tmp_path / "compare.md").read_text()
+
+    write_run(tmp_path / "2", ["model=dopepp"], "out of memory")
+    write_run(tmp_path / "10", ["model=dopepp"])
+    with pytest.raises(SystemExit) as end:
+        end_sweep(tmp_path)
+    assert end.value.code == 1
+    cells = [row["object"] for row in read_csv(tmp_path / "compare.csv")]
+    assert cells[2] == "failed: out of memory"
+    assert cells[3].startswith("failed: unfinished")

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.report import FULL_SIZE_COST, Report
+from dopepp.experiment.runs import record
+from dopepp.metrics.row import PoseRow
+
+
+def make_report(name: str, add_01d: float | None = 0.5, num_objects: int = 1) -> Report:
+    objects = [f"part{number}" for number in range(num_objects)]
+
+    def rows(method: str, share: float | None) -> dict[str, PoseRow]:
+        return {
+            label: PoseRow(label, method, 4, share, 1.0, 1.0, share, 1.0, 0.9, 12.0, 0.003)
+            for label in [*objects, "mean"]
+        }
+
+    errors = {label: np.array([0.001, 0.02, np.inf, 0.3]) for label in objects}
+    references = {"best constant pose": rows("best constant pose", 0.2)}
+    return Report(name, rows(name, add_01d), references, errors, Cost(1234567, 1.5, 7.25), 4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    errors=st.lists(st.floats(0, 10) | st.just(np.inf), max_size=5),
+    share=st.none() | st.floats(0, 1),
+    ms=st.none() | st.floats(0, 1e6),
+)
+def test_a_report_survives_json(errors: list[float], share: float | None, ms: float | None) -> None:
+    report = make_report("dopepp", share, num_objects=2)
+    report.errors["part0"] = np.array(errors, np.float64)
+    report.rotation_deg = {"part0": np.array(errors, np.float64) * 10}
+    report.diameters, report.test_set = {"part0": 0.1}, "abc"
+    report.cost = Cost(1, 2.0, ms)
+    report.details = {"checkpoint": "best.ckpt", FULL_SIZE_COST: vars(Cost(9, 8.0, 7.0))}
+    text = json.dumps(report.to_record(), allow_nan=False)
+    back = Report.from_record(json.loads(text))
+    np.testing.assert_array_equal(back.errors["part0"], report.errors["part0"])
+    np.testing.assert_array_equal(back.rotation_deg["part0"], report.rotation_deg["part0"])
+    assert (back.diameters, back.test_set) == ({"part0": 0.1}, "abc")
+    assert back.rows == report.rows
+    assert back.references == report.references
+    assert (back.name, back.cost, back.num_images) == ("dopepp", report.cost, 4)
+    assert back.details == report.details
+
+
+def test_a_report_of_an_earlier_version_is_read() -> None:
+    stored = make_report("dopepp").to_record()
+    for key in ("rotation_deg", "diameters", "test_set"):
+        del stored[key]
+    back = Report.from_record(stored)
+    assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
+
+
+def test_a_run_records_what_it_ran_with(tmp_path: Path) -> None:
+    environment: dict[str, Any] = record.environment(7, "abc")
+    record.write_json(tmp_path / record.VERSIONS_FILE, environment)
+    assert record.read_json(tmp_path / record.VERSIONS_FILE) == environment
+    assert (environment["seed"], environment["data_fingerprint"]) == (7, "abc")
+    assert environment["packages"]["torch"] == version("torch")
+    assert set(environment) >= {"dopepp", "python", "platform", "git", "hardware", "command"}
+
+
+def test_the_config_is_written_as_it_was(tmp_path: Path) -> None:
+    config = {"b": {"x": [1, 2.5, None]}, "a": "größer"}
+    record.write_config(tmp_path, config)
+    path = tmp_path / record.CONFIG_FILE
+    assert yaml.safe_load(path.read_text()) == config
+    assert list(yaml.safe_load(path.read_text())) == ["b", "a"]
+
+
+def test_json_that_nobody_else_could_read_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    record.write_json(path, {"a": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        record.write_json(path, {"a": float("nan")})
+    assert record.read_json(path) == {"a": 1}
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", None])
+def test_a_damaged_record_is_a_users_error(content: str | None, tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match=r"metrics\.json"):
+        record.read_json(path)

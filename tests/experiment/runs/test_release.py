@@ -1,0 +1,73 @@
+"""A released checkpoint and its card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.runs import record
+from dopepp.experiment.runs import release as module
+from dopepp.experiment.runs.release import release
+from dopepp.metrics.row import PoseRow
+from dopepp.models.checkpoint.schema import Checkpoint, read, write_atomic
+from dopepp.models.spec import build_network
+from dopepp.parts import load_part
+
+SPEC: dict[str, Any] = {
+    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
+    "attention": {"_target_": "dopepp.models.attention.Identity"},
+    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625},
+    "activation": "exp",
+    "num_objects": 1,
+}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run's folder: checkpoint and result."""
+    config = {"virtual": {"preset": "wide"}, "masking": {"probability": 0.3}, "cache_dir": "/x/y"}
+    checkpoint = Checkpoint(
+        SPEC, build_network(SPEC).state_dict(), [load_part("pivconnector")], (64, 64), 8, 1.0,
+        data={"name": "dopepp", "config": config},
+    )  # fmt: skip
+    write_atomic(checkpoint.to_file(), tmp_path / "best.ckpt")
+    rows = {name: PoseRow(name, "dopepp", 300, 0.843) for name in ("pivconnector", "mean")}
+    chance = {name: PoseRow(name, "chance", 300, 0.125) for name in rows}
+    report = Report("dopepp", rows, {"chance": chance}, {}, Cost(), 300)
+    record.write_json(tmp_path / "metrics.json", report.to_record())
+    return tmp_path
+
+
+def test_the_card_says_what_it_can_do(run: Path) -> None:
+    weights, card = release(run / "best.ckpt", run / "metrics.json", "bracket", run / "out")
+    assert (weights.name, card.name) == ("bracket.safetensors", "bracket.md")
+    assert read(weights).data["config"]["cache_dir"] is None
+    text = card.read_text()
+    assert "ckpt_path=pretrained/bracket" in text
+    assert "- pivconnector: 108 mm across" in text
+    assert "preset `wide`" in text
+    assert "random masks on 30 %" in text
+    assert "| pivconnector | dopepp | 300 | 84.3 |" in text
+    assert "| pivconnector | chance | 300 | 12.5 |" in text
+    assert "| mean |" not in text
+
+
+def test_what_cannot_be_released(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = run / "out"
+    with pytest.raises(UserError, match=r"name '\.\./x'; allowed: letters"):
+        release(run / "best.ckpt", run / "metrics.json", "../x", out)
+    with pytest.raises(UserError, match=r"other\.json"):
+        release(run / "best.ckpt", run / "other.json", "x", out)
+    torch.save({"a": 1}, run / "other.ckpt")
+    with pytest.raises(UserError, match=r"other\.ckpt"):
+        release(run / "other.ckpt", run / "metrics.json", "x", out)
+    monkeypatch.setattr(module, "MAX_BYTES", 100)
+    with pytest.raises(UserError, match=r"of weights in half precision; allowed: at most 100"):
+        release(run / "best.ckpt", run / "metrics.json", "x", out)
+    assert not out.exists()

@@ -1,0 +1,77 @@
+"""The fingerprint of a test set changes with what is measured, and with nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.runs.images import Fingerprint
+from dopepp.parts.catalogue import pivconnector, servoholder
+
+
+def sample(key: str = "0/1") -> Sample:
+    T = np.eye(4)
+    T[:3, 3] = 0.01, -0.02, 0.4
+    one = Instance("pivconnector", T, np.zeros((9, 2)), 0.8)
+    return Sample(
+        np.zeros((4, 6, 3), np.uint8), np.diag([600.0, 600.0, 1.0]), [one], None, "s", key
+    )
+
+
+def word(*samples: Sample) -> str:
+    fingerprint = Fingerprint([pivconnector()])
+    for one in samples:
+        fingerprint.add(one)
+    return fingerprint.word()
+
+
+def test_the_same_images_have_one_word() -> None:
+    again = sample()
+    again.image += 1  # pixels may differ in a bit from machine to machine
+    again.instances[0].T_cam_obj = again.instances[0].T_cam_obj + 1e-10
+    again.instances[0].T_cam_obj[0, 1] = -0.0
+    again.instances[0].visible_fraction = 0.81
+    assert word(sample()) == word(again)
+
+
+def moved(one: Sample) -> Sample:
+    one.instances[0].T_cam_obj = one.instances[0].T_cam_obj + 1e-4
+    return one
+
+
+def changed(**fields: object) -> Callable[[Sample], Sample]:
+    def change(one: Sample) -> Sample:
+        one.instances = [replace(one.instances[0], **fields)]  # type: ignore[arg-type]
+        return one
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        moved,
+        changed(label="servoholder"),
+        changed(visible_fraction=0.05),
+        changed(masked_fraction=0.4),
+        lambda one: replace(one, key="0/2"),
+        lambda one: replace(one, source="photoreal"),
+        lambda one: replace(one, K=one.K * 1.01),
+        lambda one: replace(one, image=np.zeros((6, 4, 3), np.uint8)),
+        lambda one: replace(one, instances=[]),
+    ],
+)
+def test_other_images_have_another(change: Callable[[Sample], Sample]) -> None:
+    assert word(sample()) != word(change(sample()))
+
+
+def test_number_order_and_objects_count() -> None:
+    a, b = sample("a"), sample("b")
+    assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
+    fingerprint = Fingerprint([pivconnector(), servoholder()])
+    fingerprint.add(a)
+    assert fingerprint.word() != word(a)

@@ -1,0 +1,180 @@
+"""A search as a user runs it, with trainings that take no time."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("optuna")
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+Called = tuple[int, str, str]
+Call = Callable[..., Called]
+SEARCH = ("search=optuna", "search.study=s", "search.space=[]")
+LR = "optimizer.lr=tag(log, interval(1e-6, 1.0))"
+FAST = (*SEARCH, LR, "search.prune=false")
+
+
+def trials(folder: Path) -> list[FrozenTrial]:
+    storage = f"sqlite:///{folder}/search/s/study.db"
+    return optuna.load_study(study_name="s", storage=storage).trials
+
+
+def started(folder: Path) -> list[list[str]]:
+    lines = (folder / "search" / "s" / "started.txt").read_text().splitlines()
+    return [line.split() for line in lines]
+
+
+def test_the_best_trial_is_found_and_named(call_fast: Call, tmp_path: Path) -> None:
+    code, out, err = call_fast(*FAST, "search.num_trials=4")
+    assert code == 0, err
+    found = trials(tmp_path)
+    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 4
+    for trial, (number, lr) in zip(found, started(tmp_path), strict=True):
+        assert (tmp_path / "search" / "s" / number / "metrics.json").is_file()
+        assert trial.number == int(number)
+        assert trial.params["optimizer.lr"] == pytest.approx(float(lr), rel=1e-3)
+    best = max(found, key=lambda trial: trial.value or 0)
+    assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in out
+    assert "study s: 4 complete" in out
+
+
+def test_the_same_command_goes_on_with_what_is_missing(call_fast: Call, tmp_path: Path) -> None:
+    assert call_fast(*FAST, "search.num_trials=2")[0] == 0
+    assert call_fast(*FAST, "search.num_trials=4")[0] == 0
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 2, 3]
+    assert call_fast(*FAST, "search.num_trials=4")[0] == 0
+    assert len(started(tmp_path)) == 4
+    drawn = {trial.params["optimizer.lr"] for trial in trials(tmp_path)}
+    assert len(drawn) == 4  # the second command did not draw the first one's again
+
+
+def test_interrupted_trials_run_again_under_their_numbers(
+    call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (0, 1):
+        monkeypatch.setenv(f"END_{number}", "interrupt")
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 130
+    assert trials(tmp_path)[0].state == TrialState.RUNNING
+    drawn = trials(tmp_path)[0].params
+    code, out, _ = call_fast(*FAST, "search.num_trials=3")
+    assert code == 130
+    assert "goes on with trials 0" in out
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 0
+    found = trials(tmp_path)
+    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 3
+    assert found[0].params == drawn
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
+
+
+def test_a_result_that_was_not_told_is_not_computed_again(call_fast: Call, tmp_path: Path) -> None:
+    """The command died after a job's end: here, one of two that run at a time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("END_1", "interrupt")
+        assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 130
+    assert [trial.state for trial in trials(tmp_path)] == [TrialState.RUNNING] * 2
+    assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 0
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 1]
+    assert [trial.state for trial in trials(tmp_path)] == [TrialState.COMPLETE] * 2
+
+
+def test_a_failing_trial_does_not_stop_the_study(
+    call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("END_0", "raise")
+    code, out, _ = call_fast(*FAST, "search.num_trials=2")
+    assert code == 0
+    assert "1 complete, 1 fail" in out
+    assert trials(tmp_path)[0].state == TrialState.FAIL
+    failed = json.loads((tmp_path / "search" / "s" / "0" / "failed.json").read_text())
+    assert failed["reason"] == "as the test asked"
+
+
+def test_trials_below_the_median_are_pruned(call_fast: Call, tmp_path: Path) -> None:
+    rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=6")
+    assert call_fast(*SEARCH, LR, *rule)[0] == 0
+    found = trials(tmp_path)
+    pruned = [trial for trial in found if trial.state == TrialState.PRUNED]
+    assert pruned
+    assert all(trial.number >= 2 for trial in pruned)
+    for trial in found:
+        # Only finished trials count, and those of before: one ran after the other.
+        before = [one for one in found[: trial.number] if one.state == TrialState.COMPLETE]
+        reported = trial.intermediate_values
+        for epoch in (1, 2):
+            if epoch not in reported or trial.number < 2:
+                continue
+            median = statistics.median(one.intermediate_values[epoch] for one in before)
+            best = max(value for step, value in reported.items() if step <= epoch)
+            is_last = epoch == max(reported)
+            assert (best < median) == (is_last and trial.state == TrialState.PRUNED)
+        record = tmp_path / "search" / "s" / str(trial.number) / "pruned.json"
+        assert record.is_file() == (trial.state == TrialState.PRUNED)
+    record = tmp_path / "search" / "s" / str(pruned[0].number) / "pruned.json"
+    assert "worse than the other trials' median" in json.loads(record.read_text())["reason"]
+
+
+def test_a_study_is_not_mixed_with_another_configuration(call_fast: Call) -> None:
+    assert call_fast(*FAST, "search.num_trials=1")[0] == 0
+    code, _, err = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7")
+    assert code == 2
+    assert "data.batch_size=7, while the study s was begun with data.batch_size=32" in err
+    code, _, err = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
+    assert code == 2
+    assert "choose another search.study=NAME" in err
+
+
+def test_folders_of_another_study_are_not_gone_on_with(call_fast: Call, tmp_path: Path) -> None:
+    (tmp_path / "search" / "s" / "0").mkdir(parents=True)
+    code, _, err = call_fast(*FAST)
+    assert code == 2
+    assert "with the jobs 0 of another study" in err
+
+
+def test_two_commands_do_not_search_one_study(call_fast: Call, tmp_path: Path) -> None:
+    (tmp_path / "search" / "s").mkdir(parents=True)
+    with (tmp_path / "search" / "s" / ".search.lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        code, _, err = call_fast(*FAST)
+    assert code == 2
+    assert "search.study=s, which another command is searching" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["search.num_trials=0"], "search.num_trials=0"),
+        (["search.num_parallel=x"], "search.num_parallel='x'"),
+        (["experiment=table6_dope_vs_dopepp"], "sweeps over model, data.parts itself"),
+        (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
+        (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
+        (["search.space=['optimizer.lr=1']"], "which is one value"),
+        (["search.space=[]", "optimizer.lr=1"], "nothing to vary"),
+        (["model/attention=choice(cbam,cbbm)"], "cbbm"),
+        (["search.storage=/dev/null/study.db"], "search.storage=/dev/null/study.db"),
+        (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    arguments: list[str], message: str, call_fast: Call, tmp_path: Path
+) -> None:
+    code, _, err = call_fast("search=optuna", "search.study=s", *arguments)
+    assert code == 2, err
+    assert message in err.splitlines()[-1]
+    assert "Traceback" not in err
+    assert not (tmp_path / "search" / "s" / "started.txt").exists()
+
+
+def test_without_optuna_it_says_what_to_install(
+    call_fast: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
+    code, _, err = call_fast(*FAST)
+    assert code == 2
+    assert "pip install 'dopepp[search]'" in err

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.models.checkpoint import storage
+from dopepp.models.checkpoint.schema import Checkpoint, load_network, read, write_atomic
+from dopepp.models.spec import build_network
+from dopepp.parts.part import Mesh, Part, make_part
+
+
+@pytest.fixture
+def part() -> Part:
+    vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.05, 0], [0, 0, 0.02]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    return make_part("bracket", Mesh(vertices, faces))
+
+
+@pytest.fixture
+def checkpoint(small_spec: dict[str, Any], part: Part) -> Checkpoint:
+    return Checkpoint(
+        spec=small_spec,
+        state_dict=build_network(small_spec).state_dict(),
+        parts=[part],
+        input_size=(128, 96),
+        stride=8,
+        sigma=1.0,
+        recovery={"threshold": 0.3, "max_instances": 4},
+        data={"preset": "paper", "K": [[1.0, 0, 0]], "seed": 3},
+        data_fingerprint="abc",
+        metrics={"val/add_01d": 0.4},
+    )
+
+
+@pytest.fixture
+def saved(checkpoint: Checkpoint, tmp_path: Path) -> Path:
+    write_atomic(checkpoint.to_file(), tmp_path / "best.ckpt")
+    return tmp_path / "best.ckpt"
+
+
+def edited(path: Path, edit: Any) -> Path:
+    content = torch.load(path, weights_only=True)
+    edit(content)
+    torch.save(content, path)
+    return path
+
+
+def test_round_trip(checkpoint, saved, part):
+    network, loaded = load_network(saved)
+    for name in ("spec", "input_size", "stride", "sigma", "recovery", "data", "metrics"):
+        assert getattr(loaded, name) == getattr(checkpoint, name)
+    assert loaded.data_fingerprint == "abc"
+    assert isinstance(loaded.recovery["max_instances"], int)
+    assert loaded.parts[0].name == "bracket"
+    assert loaded.parts[0].mesh_hash == part.mesh_hash
+    np.testing.assert_array_equal(loaded.parts[0].cuboid, part.cuboid)
+    np.testing.assert_array_equal(loaded.parts[0].points, part.points)
+    assert not network.training
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, checkpoint.state_dict[name])
+
+
+def test_a_training_checkpoint_is_read_by_its_two_keys(checkpoint, tmp_path):
+    """What Lightning and a LightningModule add beside the network is left alone."""
+    content = checkpoint.to_file()
+    content["state_dict"]["loss.weight"] = torch.zeros(3)
+    content.update(epoch=3, optimizer_states=[{"state": {0: {"step": torch.tensor(4.0)}}}])
+    write_atomic(content, tmp_path / "last.ckpt")
+    assert read(tmp_path / "last.ckpt").state_dict.keys() == checkpoint.state_dict.keys()
+
+
+def test_numpy_scalars_become_plain_values(checkpoint, tmp_path):
+    checkpoint.metrics = {"a": np.float64(0.5), "b": np.float32(0.25), "c": np.int64(3)}
+    checkpoint.data = {"K": np.eye(3), "sizes": (1, 2), "none": None, "flag": np.bool_(True)}
+    write_atomic(checkpoint.to_file(), tmp_path / "a.ckpt")
+    loaded = read(tmp_path / "a.ckpt")
+    assert loaded.metrics == {"a": 0.5, "b": 0.25, "c": 3}
+    assert loaded.data == {"K": np.eye(3).tolist(), "sizes": [1, 2], "none": None, "flag": True}
+
+
+def test_what_is_not_plain_is_refused_before_writing(checkpoint):
+    checkpoint.data = {"path": Path("here")}
+    with pytest.raises(TypeError, match="holds plain values"):
+        checkpoint.to_payload()
+
+
+def test_pretrained_weights_path_is_neither_written_nor_read(make_spec, part, tmp_path):
+    spec = make_spec("VGG19", "Identity", backbone_width=0.125, head_width=0.125)
+    network = build_network(spec)
+    spec["backbone"]["weights_path"] = str(tmp_path / "not_there.pth")
+    checkpoint = Checkpoint(spec, network.state_dict(), [part], (64, 64), 8, 1.0)
+    content = checkpoint.to_file()
+    assert "weights_path" not in content["dopepp"]["spec"]["backbone"]
+    # A file that names one all the same must not make its reader open it.
+    content["dopepp"]["spec"]["backbone"]["weights_path"] = "/etc/passwd"
+    write_atomic(content, tmp_path / "a.ckpt")
+    loaded, _ = load_network(tmp_path / "a.ckpt")
+    assert loaded.backbone.out_channels == 16
+
+
+def test_a_missing_file(tmp_path):
+    for path in (tmp_path / "none.ckpt", tmp_path):
+        with pytest.raises(UserError, match=r"which is no file; allowed: a checkpoint \(\.ckpt\)"):
+            read(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", bytes(range(256)) * 40])
+def test_a_file_that_is_no_torch_file(tmp_path, content):
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match="not a torch file or was cut short"):
+        read(path)
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.5, 0.99])
+def test_a_truncated_file(saved, keep):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(len(content) * keep)])
+    with pytest.raises(UserError, match="not a torch file or was cut short"):
+        read(saved)
+
+
+def test_a_damaged_pickle_inside_an_intact_archive(saved, tmp_path):
+    target = tmp_path / "damaged.ckpt"
+    with zipfile.ZipFile(saved) as source, zipfile.ZipFile(target, "w") as archive:
+        for member in source.infolist():
+            content = source.read(member)
+            if member.filename.endswith("data.pkl"):
+                content = content[: len(content) // 2]
+            archive.writestr(member, content)
+    with pytest.raises(UserError, match=r"torch refuses to load"):
+        read(target)
+
+
+def test_a_zip_that_is_not_torchs(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
+        archive.writestr("a.txt", "hello")
+    with pytest.raises(UserError, match="torch refuses to load"):
+        read(tmp_path / "a.ckpt")
+
+
+class Malicious:
+    """Unpickling it creates the file that its argument names."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return os.mkdir, (str(self.path),)
+
+
+def test_pickled_code_does_not_run(checkpoint, tmp_path):
+    trap = tmp_path / "executed"
+    content = checkpoint.to_file()
+    content["dopepp"]["data"] = {"x": Malicious(trap)}
+    torch.save(content, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="torch refuses to load"):
+        read(tmp_path / "a.ckpt")
+    (tmp_path / "b.ckpt").write_bytes(pickle.dumps(Malicious(trap)))
+    with pytest.raises(UserError, match="not a torch file"):
+        read(tmp_path / "b.ckpt")
+    assert not trap.exists()
+
+
+def test_a_decompression_bomb_is_not_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "bomb.ckpt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(10_000_000))
+    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("was loaded"))
+    with pytest.raises(UserError, match="which unpacks to 10000000 bytes"):
+        read(path)
+
+
+def test_a_file_over_the_limit(saved, monkeypatch):
+    monkeypatch.setattr(storage, "MAX_BYTES", 1000)
+    with pytest.raises(UserError, match="at most 1000 bytes"):
+        read(saved)
+
+
+def set_payload(key: str, value: object) -> Any:
+    return lambda content: content["dopepp"].update({key: value})
+
+
+def set_spec(part: str, **arguments: object) -> Any:
+    return lambda content: content["dopepp"]["spec"][part].update(arguments)
+
+
+def first_weight(content: dict[str, Any]) -> str:
+    return next(name for name in content["state_dict"] if name.endswith("weight"))
+
+
+def set_weight(value: Any) -> Any:
+    return lambda content: content["state_dict"].update({first_weight(content): value})
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda c: c.pop("dopepp"), "without 'dopepp' entry"),
+        (lambda c: c.update(dopepp=[1]), "a list under 'dopepp'"),
+        (set_payload("format_version", 2), "format_version 2, .*allowed: 1 to 1; fix: update"),
+        (set_payload("format_version", 0), "format_version 0"),
+        (set_payload("format_version", "1"), "format_version '1'"),
+        (set_payload("format_version", True), "format_version True"),
+        (lambda c: c["dopepp"].pop("spec"), "spec None"),
+        (set_payload("spec", "DSC"), "spec 'DSC'"),
+        (set_payload("spec", {}), "a model spec with"),
+        (set_spec("backbone", _target_="os.system"), "backbone _target_ 'os.system'"),
+        (set_spec("head", _target_="torch.load"), "head _target_ 'torch.load'"),
+        (set_spec("head", stages=10**6), "stages=1000000"),
+        (set_spec("backbone", width=4), "weights that do not fit the spec's network"),
+        (set_payload("input_size", [128]), r"input_size \[128\]"),
+        (set_payload("input_size", [0, 128]), r"input_size \[0, 128\]"),
+        (set_payload("input_size", (128, 128)), "input_size"),
+        (set_payload("stride", 4), "stride 4 and 1 parts"),
+        (set_payload("stride", 8.0), "stride 8.0"),
+        (set_payload("sigma", 0.0), "sigma 0.0"),
+        (set_payload("sigma", float("nan")), "sigma nan"),
+        (set_payload("sigma", torch.tensor(1.0)), "sigma with a Tensor"),
+        (set_payload("parts", []), "0 parts.*allowed: stride 8 and 1 parts"),
+        (set_payload("parts", None), "parts None"),
+        (set_payload("parts", [{"name": "x"}]), "checkpoint .*best.ckpt"),
+        (set_payload("parts", ["x"]), "checkpoint .*best.ckpt"),
+        (set_payload("recovery", {"threshold": "high"}), "recovery with 'threshold': 'high'"),
+        (set_payload("recovery", {3: 0.1}), "recovery with 3"),
+        (set_payload("metrics", [0.1]), r"metrics \[0.1\]"),
+        (set_payload("data", "paper"), "data 'paper'"),
+        (set_payload("data_fingerprint", 3), "data_fingerprint 3"),
+        (lambda c: c.pop("state_dict"), "state_dict as NoneType"),
+        (lambda c: c.update(state_dict={}), "weights that do not fit"),
+        (lambda c: c["state_dict"].pop(first_weight(c)), "do not fit .*first backbone"),
+        (lambda c: c["state_dict"].update({"network.extra": torch.ones(1)}), "first extra"),
+        (set_weight(3), "weights that do not fit"),
+        (set_weight(torch.ones(2, 2)), "weights that do not fit"),
+        (set_weight(torch.ones(8, 3, 3, 3).to_sparse()), "_rebuild_sparse_tensor"),
+        (set_weight(torch.ones(8, 3, 3, 3, device="meta")), "_rebuild_meta_tensor_no_storage"),
+        (set_weight(torch.ones(8, 3, 3, 3, dtype=torch.complex64)), "weights that do not fit"),
+        (set_weight(torch.ones(8, 3, 3, 3, dtype=torch.int64)), "weights that do not fit"),
+    ],
+)
+def test_an_inconsistent_file_is_refused_in_one_line(saved, edit, message):
+    with pytest.raises(UserError, match=message) as caught:
+        load_network(edited(saved, edit))
+    assert "\n" not in str(caught.value)
+    assert "best.ckpt" in str(caught.value)
+
+
+def test_views_that_repeat_stored_numbers_are_refused(make_spec, part, tmp_path):
+    """A file of kilobytes must not fill gigabytes: its tensors must hold what they span."""
+    spec = make_spec(backbone_width=4.0, head_width=4.0, head_stages=12)
+    with torch.device("meta"):
+        shapes = build_network(spec).state_dict()
+    state = {name: torch.zeros(()).expand(value.shape) for name, value in shapes.items()}
+    write_atomic(Checkpoint(spec, state, [part], (64, 64), 8, 1.0).to_file(), tmp_path / "a.ckpt")
+    assert (tmp_path / "a.ckpt").stat().st_size < 1_000_000
+    with pytest.raises(UserError, match="first their size"):
+        read(tmp_path / "a.ckpt")
+
+
+@pytest.mark.parametrize("failing", ["replace", "fsync"])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    checkpoint, saved, monkeypatch, failing
+):
+    before = saved.read_bytes()
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(storage.os, failing, fail)
+    checkpoint.sigma = 2.0
+    with pytest.raises(OSError, match="no space left"):
+        write_atomic(checkpoint.to_file(), saved)
+    monkeypatch.undo()
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
+    assert read(saved).sigma == 1.0
+
+
+def test_an_interrupted_write_cleans_up(checkpoint, saved, monkeypatch):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(storage.torch, "save", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(checkpoint.to_file(), saved)
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_writing_makes_the_folder_and_replaces_the_old_file(checkpoint, tmp_path):
+    path = tmp_path / "run" / "checkpoints" / "best.ckpt"
+    for sigma in (1.0, 2.0):
+        checkpoint.sigma = sigma
+        write_atomic(checkpoint.to_file(), path)
+        assert read(path).sigma == sigma
+    assert list(path.parent.iterdir()) == [path]

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from trimesh.exchange.stl import export_stl
+
+from dopepp.core.errors import UserError
+from dopepp.parts import Mesh, load_part, make_part, part, servoholder
+from dopepp.parts.mesh.decimate import MAX_FACES, decimate
+
+
+def subdivided(mesh: Mesh, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest)
+    fine = trimesh.Trimesh(vertices, faces, process=False)
+    fine.merge_vertices(digits_vertex=9)
+    return np.asarray(fine.vertices), np.asarray(fine.faces)
+
+
+def distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Distance to a dense sample of a surface, an upper bound of that to the surface."""
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    return cKDTree(trimesh.sample.sample_surface(solid, 400_000, seed=0)[0]).query(points)[0]
+
+
+def test_a_part_keeps_its_shape() -> None:
+    mesh = servoholder().mesh
+    assert mesh is not None
+    vertices, faces = subdivided(mesh, 0.0015)
+    assert len(faces) > 100_000
+    fewer, kept, uv, moved = decimate(vertices, faces, None, 20_000)
+    assert uv is None
+    assert 0.8 * 20_000 < len(kept) <= 20_000
+    assert kept.max() < len(fewer)
+    assert set(np.unique(kept)) == set(range(len(fewer)))
+    assert 0 < moved < 0.003
+    # Sides are flat and edges straight, so the surface moves far less than its vertices do.
+    away = distance(fewer, vertices, faces)
+    assert np.quantile(away, 0.99) < 4e-4
+    assert away.max() <= moved + 4e-4
+    back = distance(vertices[::7], fewer, kept)
+    assert np.quantile(back, 0.95) < 4e-4
+    assert back.max() <= moved + 4e-4
+    np.testing.assert_allclose(np.ptp(fewer, axis=0), np.ptp(vertices, axis=0), rtol=1e-3)
+
+
+def test_a_ball_stays_a_ball_that_faces_outwards() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.05)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    fewer, kept, _, moved = decimate(vertices, faces, None, 5000)
+    radii = np.linalg.norm(fewer, axis=1)
+    assert np.abs(radii / 0.05 - 1).max() < 0.01
+    solid = trimesh.Trimesh(fewer, kept, process=False)
+    assert solid.volume == pytest.approx(ball.volume, rel=0.01)
+    outward = np.einsum("fi,fi->f", solid.face_normals, solid.triangles_center)
+    assert (outward > 0).mean() > 0.995
+    cells = np.linalg.norm(vertices[cKDTree(vertices).query(fewer)[1]] - fewer, axis=1)
+    assert cells.max() <= moved
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_faces=st.integers(30, 400),
+    size=st.sampled_from([0.02, 0.5, 3.0]),
+    flat=st.booleans(),
+)
+def test_any_triangles_are_taken(seed: int, num_faces: int, size: float, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.random((num_faces, 1, 3)) + size * rng.random((num_faces, 3, 3))
+    if flat:
+        corners[..., 2] = 0
+    vertices, faces = corners.reshape(-1, 3), np.arange(3 * num_faces).reshape(-1, 3)
+    try:
+        fewer, kept, _, moved = decimate(vertices, faces, None, 20)
+    except ValueError:  # too small and apart, which a test of its own looks at
+        return
+    assert 0 < len(kept) <= 20
+    assert kept.max() < len(fewer)
+    assert np.isfinite(fewer).all()
+    assert (fewer >= vertices.min(axis=0) - 1e-12).all()
+    assert (fewer <= vertices.max(axis=0) + 1e-12).all()
+    assert moved <= np.linalg.norm(np.ptp(vertices, axis=0))
+
+
+def test_texture_coordinates_stay_on_their_side_of_a_seam() -> None:
+    # A tube unrolled: at the seam one position has u = 0 and u = 1.
+    count, rings = 240, 200
+    angle, height = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, rings + 1))
+    uv = np.stack([angle.ravel(), height.ravel()], axis=1)
+    turn = 2 * np.pi * (angle.ravel() % 1)
+    vertices = np.stack([np.cos(turn), np.sin(turn), 3 * height.ravel()], axis=1)
+    corner = (np.arange(rings)[:, None] * (count + 1) + np.arange(count)).ravel()
+    up, right = count + 1, 1
+    faces = np.concatenate([
+        np.stack([corner, corner + right, corner + up], axis=1),
+        np.stack([corner + right, corner + up + right, corner + up], axis=1),
+    ])  # fmt: skip
+    fewer, kept, coordinates, _ = decimate(vertices, faces, uv, 6000)
+    assert coordinates is not None
+    span = np.ptp(coordinates[kept][..., 0], axis=1)
+    assert span.max() < 0.1  # no triangle runs across the whole texture
+    around = np.arctan2(fewer[:, 1], fewer[:, 0]) / (2 * np.pi) % 1
+    off = np.abs(coordinates[:, 0] - around)
+    assert np.minimum(off, 1 - off).max() < 0.02
+    np.testing.assert_allclose(coordinates[:, 1], fewer[:, 2] / 3, atol=0.02)
+
+
+def test_the_part_is_measured_before_it_is_decimated(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    mesh = servoholder().mesh
+    assert mesh is not None
+    whole = make_part("a", mesh)
+    assert whole.mesh is mesh
+    monkeypatch.setattr(part, "MAX_FACES", 500)
+    monkeypatch.setattr(part, "decimate", lambda v, f, uv: decimate(v, f, uv, 500))
+    with caplog.at_level(logging.WARNING):
+        fewer = make_part("a", mesh)
+    assert len(caplog.records) == 1
+    assert caplog.text.count("\n") == 1
+    message = rf"part 'a': {len(mesh.faces)} triangles decimated to \d+ to render; no point moved"
+    assert re.match(message + r" by more than [\d.]+ mm$", caplog.records[0].message)
+    assert fewer.mesh is not None
+    assert len(fewer.mesh.faces) <= 500
+    assert fewer.mesh.faces.dtype == np.int32
+    assert fewer.mesh_hash == whole.mesh_hash
+    assert fewer.diameter == whole.diameter
+    np.testing.assert_array_equal(fewer.cuboid, whole.cuboid)
+    np.testing.assert_array_equal(fewer.points, whole.points)
+
+
+def test_specks_that_no_triangle_can_stand_for_are_refused() -> None:
+    # Far more separate specks than the limit, each inside of a cell of any grid that is tried.
+    grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 1, 3) + 0.45
+    specks = grid + 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    with pytest.raises(ValueError, match="no 4 triangles can stand for its 216"):
+        decimate(specks.reshape(-1, 3), np.arange(648).reshape(-1, 3), None, 4)
+
+
+def test_many_faces_of_a_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=7, radius=40)
+    assert len(ball.faces) == 327_680
+    (tmp_path / "ball.stl").write_bytes(export_stl(ball))
+    loaded = load_part(tmp_path / "ball.stl", "mm")
+    assert loaded.mesh is not None
+    assert 0.5 * MAX_FACES < len(loaded.mesh.faces) <= MAX_FACES
+    assert loaded.diameter == pytest.approx(0.08, rel=1e-6)
+    assert "327680 triangles decimated" in caplog.text
+    with pytest.raises(UserError, match="diameter"):
+        load_part(tmp_path / "ball.stl", "m")

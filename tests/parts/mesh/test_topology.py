@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trimesh.exchange.stl import export_stl
+
+from dopepp.parts import read_mesh, servoholder
+from dopepp.parts.mesh.topology import find_topology, opposed_faces, turn_over
+
+
+def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+
+
+def repaired(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    topology = find_topology(vertices, faces)
+    return turn_over(faces, opposed_faces(vertices, faces, topology))
+
+
+def cyclic(faces: np.ndarray) -> set[tuple[int, ...]]:
+    """Triangles by their corners and direction, wherever they start."""
+    return {tuple(np.roll(face, -int(face.argmin())).tolist()) for face in faces}
+
+
+def test_edges_agree_with_trimesh() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = arrays(mesh)
+    assert find_topology(vertices, faces).is_closed
+    cut = faces[np.random.default_rng(0).random(len(faces)) < 0.9]
+    topology = find_topology(vertices, cut)
+    open_edges = trimesh.Trimesh(vertices, cut, process=False)
+    unique = trimesh.grouping.group_rows(open_edges.edges_sorted, require_count=1)
+    assert topology.num_open == len(unique) > 0
+    assert topology.num_crowded == 0
+    tip = np.vstack([vertices, [[9.0, 9.0, 9.0]]])
+    fin = np.vstack([faces, [[faces[0, 0], faces[0, 1], len(vertices)]]])
+    assert find_topology(tip, fin).num_crowded == 1
+    assert find_topology(tip, fin).num_open == 2
+
+
+def test_corners_at_one_position_are_one() -> None:
+    mesh = trimesh.creation.box((1, 2, 3))
+    soup = mesh.triangles.reshape(-1, 3)
+    assert find_topology(soup, np.arange(36).reshape(12, 3)).is_closed
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1), whole=st.booleans())
+def test_any_closed_solid_ends_up_facing_outwards(seed: int, share: float, whole: bool) -> None:
+    rng = np.random.default_rng(seed)
+    mesh = trimesh.creation.annulus(0.3, 1.0, 0.5, sections=16)
+    vertices, faces = arrays(mesh)
+    turned = turn_over(faces, rng.random(len(faces)) < share)
+    result = repaired(vertices, turned if whole else turned[rng.permutation(len(faces))])
+    assert cyclic(result) == cyclic(faces)
+
+
+def test_an_open_surface_follows_its_majority() -> None:
+    vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))
+    bowl = faces[vertices[faces].mean(axis=1)[:, 2] < 0.3]
+    wrong = np.arange(len(bowl)) % 5 == 0
+    assert cyclic(repaired(vertices, turn_over(bowl, wrong))) == cyclic(bowl)
+    inwards = turn_over(bowl, ~wrong)  # nothing tells the inside of a bowl from its outside
+    assert cyclic(repaired(vertices, inwards)) == cyclic(bowl[:, ::-1])
+
+
+def test_every_body_is_repaired_by_itself_and_a_cavity_stays() -> None:
+    outer, inner = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 0.5)
+    inner.invert()
+    hollow = trimesh.util.concatenate([outer, inner])
+    vertices, faces = arrays(hollow)
+    np.testing.assert_array_equal(repaired(vertices, faces), faces)
+    mixed = turn_over(faces, np.arange(len(faces)) % 7 == 0)
+    assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
+
+
+def test_one_body_of_several_that_faces_inwards_is_turned() -> None:
+    ball = trimesh.creation.icosphere(2, 1.0)
+    beside = trimesh.creation.box((0.5, 0.5, 0.5))
+    beside.apply_translation((2, 0, 0))
+    vertices, faces = arrays(trimesh.util.concatenate([ball, beside]))
+    wrong = turn_over(faces, np.arange(len(faces)) >= len(ball.faces))
+    assert cyclic(repaired(vertices, wrong)) == cyclic(faces)
+    assert cyclic(repaired(vertices, faces)) == cyclic(faces)
+
+
+def test_a_moebius_strip_is_left_alone() -> None:
+    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rims = []
+    for side in (-0.2, 0.2):
+        radius = 1 + side * np.cos(around / 2)
+        height = side * np.sin(around / 2)
+        rims.append(np.stack([radius * np.cos(around), radius * np.sin(around), height], axis=1))
+    vertices = np.concatenate(rims)
+    faces = []
+    for i in range(24):
+        a, b = i, i + 24
+        c, d = ((i + 1) % 24, (i + 1) % 24 + 24) if i < 23 else (24, 0)
+        faces += [[a, b, c], [b, d, c]]
+    strip = np.array(faces)
+    assert find_topology(vertices, strip).opposed.any()
+    np.testing.assert_array_equal(repaired(vertices, strip), strip)
+
+
+@pytest.mark.parametrize(
+    ("share", "message"), [(0.1, "turned over [0-9]+ triangles"), (1.0, "turned over 320 tri")]
+)
+def test_a_file_that_faces_the_wrong_way_is_repaired_and_said(
+    tmp_path: Path, share: float, message: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
+    ball.faces = turn_over(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
+    (tmp_path / "a.stl").write_bytes(export_stl(ball))
+    with caplog.at_level(logging.INFO):
+        loaded = read_mesh(tmp_path / "a.stl", "mm")
+    assert [r.levelname for r in caplog.records] == ["INFO"]
+    assert caplog.records[0].message.startswith(f"{tmp_path / 'a.stl'}: turned over")
+    solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
+    assert solid.is_volume
+    assert solid.volume > 0
+
+
+def test_holes_are_counted_in_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
+    ball.update_faces(np.arange(len(ball.faces)) >= 1)
+    (tmp_path / "a.stl").write_bytes(export_stl(ball))
+    with caplog.at_level(logging.INFO):
+        loaded = read_mesh(tmp_path / "a.stl", "mm")
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / 'a.stl'} is not watertight")
+    assert "3 open edges" in message
+    assert len(loaded.faces) == 319
+
+
+def test_bodies_that_pass_through_each_other_are_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    boxes = [trimesh.creation.box((20, 20, 20)), trimesh.creation.box((10, 10, 40))]
+    (tmp_path / "a.stl").write_bytes(export_stl(trimesh.util.concatenate(boxes)))
+    with caplog.at_level(logging.INFO):
+        loaded = read_mesh(tmp_path / "a.stl", "mm")
+    assert not caplog.records
+    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.02, 0.02, 0.04])
+
+
+def test_a_good_part_is_not_touched() -> None:
+    mesh = servoholder().mesh
+    assert mesh is not None
+    np.testing.assert_array_equal(repaired(mesh.vertices, mesh.faces), mesh.faces)

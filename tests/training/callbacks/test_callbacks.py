@@ -1,0 +1,181 @@
+"""The callbacks on one fit whose validation maps are the true ones, most of them displaced."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import Logger
+
+from dopepp.data.batch import Batch
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.metrics.pose import PoseMetrics
+from dopepp.recovery.detection import Detection
+from dopepp.training.callbacks.pictures import AUCCurves, Overlays
+from dopepp.training.callbacks.pose_metrics import LOGGED, PoseMetricsCallback, batch_instances
+from dopepp.training.callbacks.throughput import Throughput
+from dopepp.training.loggers import GuardedLogger, MetricsTable
+from dopepp.training.system import PoseSystem, ValidationOutput
+
+SystemMaker = Callable[..., PoseSystem]
+
+
+class Displaced(PoseSystem):
+    """Its maps are the targets; the first of every batch is two cells to the side."""
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:  # type: ignore[override]
+        belief, field = self.targets(batch)
+        belief[::2] = belief[::2].roll(2, dims=-1)
+        field[::2] = field[::2].roll(2, dims=-1)
+        return ValidationOutput(belief.new_zeros(()), belief, field)
+
+
+class Recorder(Callback):
+    def __init__(self) -> None:
+        self.detections: list[list[Detection]] = []
+        self.logged: dict[str, float] = {}
+
+    def on_validation_batch_end(  # type: ignore[override]
+        self,
+        trainer: Trainer,
+        pl_module: PoseSystem,
+        outputs: ValidationOutput,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        self.detections += pl_module.recover(outputs, batch)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+class Offline(Logger):
+    """A logger whose service does not answer."""
+
+    name = None
+    version = None
+
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        raise ConnectionError("no network")
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:  # type: ignore[override]
+        raise ConnectionError("no network")
+
+
+class Run:
+    def __init__(self, folder: Path, system: PoseSystem, data: PoseDataModule) -> None:
+        self.folder, self.system, self.data = folder, system, data
+        self.recorder, self.metrics = Recorder(), PoseMetricsCallback()
+        self.overlays = Overlays(num_images=2)
+        trainer = Trainer(
+            accelerator="cpu",
+            max_epochs=1,
+            default_root_dir=folder,
+            logger=[MetricsTable(folder / "metrics.csv"), GuardedLogger(Offline)],
+            callbacks=[self.metrics, AUCCurves(), self.overlays, Throughput(), self.recorder],
+            use_distributed_sampler=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            log_every_n_steps=1,
+        )
+        trainer.fit(system, datamodule=data)
+
+
+@pytest.fixture
+def run(
+    make_system: SystemMaker,
+    make_datamodule: Callable[[], PoseDataModule],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> Run:
+    caplog.set_level(logging.INFO)
+    return Run(tmp_path, make_system(system_class=Displaced), make_datamodule())
+
+
+def test_figures_pictures_and_throughput(
+    run: Run, read_png: Callable[[Path], np.ndarray], caplog: pytest.LogCaptureFixture
+) -> None:
+    # The logged figures are PoseMetrics' on the same poses and the samples' own ground truth.
+    metrics = PoseMetrics(run.system.parts)
+    for index, detections in enumerate(run.recorder.detections):
+        item = run.data.val_item(0, index)
+        metrics.update(detections, item.instances, item.K, item.size[0])
+    assert len(run.recorder.detections) == 3
+    mean = metrics.compute()["mean"]
+    assert mean.num_instances == 3
+    assert mean.median_rotation_deg is not None
+    for name in LOGGED:
+        assert run.recorder.logged[f"val/{name}"] == pytest.approx(getattr(mean, name), rel=1e-4)
+    # Neither all nor nothing, or the comparison would say little.
+    assert 0 < run.recorder.logged["val/auc_10cm"] < 1
+
+    # Curves and sheet are whole pictures, the curve's table agrees with the figures.
+    assert read_png(run.folder / "val_auc.png").std() > 0
+    with (run.folder / "val_auc.csv").open(newline="") as stream:
+        curve = list(csv.DictReader(stream))
+    assert curve[0]["threshold_m"] == "0"
+    assert float(curve[-1]["pivconnector"]) == pytest.approx(mean.pass_10cm)
+    # Green for the truth and yellow for the prediction are on the sheet (BGR here).
+    sheet = read_png(run.folder / "val_overlay.png").astype(int)
+    blue, green, red = sheet[..., 0], sheet[..., 1], sheet[..., 2]
+    assert ((green > 150) & (red < 100) & (blue < 100)).any()
+    assert ((green > 180) & (red > 180) & (blue < 80)).any()
+
+    # Throughput is in the table.
+    with (run.folder / "metrics.csv").open(newline="") as stream:
+        last = list(csv.DictReader(stream))[-1]
+    assert float(last["throughput/images_per_s"]) > 0
+    assert 0 <= float(last["throughput/loader_wait"]) <= 1
+    assert float(last["val/auc_10cm"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+    assert float(last["val/selection"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
+    assert 0 < float(last["val/ar_mspd"]) < 1
+
+    # … and said in a line per epoch.
+    said = [r.getMessage() for r in caplog.get_records("setup") if "images/s" in r.getMessage()]
+    assert len(said) == len({line.partition(":")[0] for line in said}) > 0
+    assert "% of the time waiting for the loader" in said[0]
+
+    # A logger without its service did not end the run, and said so once.
+    complaints = [r for r in caplog.get_records("setup") if "a logger failed" in r.getMessage()]
+    assert len(complaints) == 1
+    assert complaints[0].levelno == logging.WARNING
+
+
+def test_batches_give_back_the_samples_instances(
+    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule]
+) -> None:
+    data, system = make_datamodule(), make_system()
+    batch: Batch = next(iter(data.val_dataloader()))
+    batch = replace(batch, object_index=torch.tensor([[0], [-1]]))
+    first, second = batch_instances(batch, system.parts)
+    assert second == []
+    truth = data.val_item(0, 0).instances[0]
+    assert first[0].label == truth.label
+    np.testing.assert_allclose(first[0].T_cam_obj, truth.T_cam_obj, atol=1e-6)
+    np.testing.assert_allclose(first[0].keypoints, truth.keypoints, atol=1e-4)
+    assert first[0].visible_fraction == pytest.approx(truth.visible_fraction)
+
+
+def test_no_counted_instance_still_gives_a_number_to_select_by(
+    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule], tmp_path: Path
+) -> None:
+    class Blind(Displaced):
+        def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
+            batch.object_index[:] = -1
+            return super().validation_step(batch, batch_idx)
+
+    run = Run(tmp_path, make_system(system_class=Blind), make_datamodule())
+    assert np.isnan(run.recorder.logged["val/auc_10cm"])
+    assert np.isnan(run.recorder.logged["val/selection"])
+    assert "val/median_rotation_deg" not in run.recorder.logged

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import errno
+import os
+import random
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.core.files import partial_path
+from dopepp.training.checkpointing.files import AtomicCheckpointIO, SavingFailedError, sweep
+from dopepp.training.checkpointing.resume_point import capture, restore
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"a": torch.arange(3), "b": [1, "x"]}, path)
+    loaded = AtomicCheckpointIO().load_checkpoint(path)
+    assert torch.equal(loaded["a"], torch.arange(3))
+    assert loaded["b"] == [1, "x"]
+
+
+class Unwritable:
+    def __reduce__(self) -> str:
+        raise RuntimeError("cannot be saved")
+
+
+@pytest.mark.parametrize("when", ["while writing", "at the rename"])
+def test_a_failing_write_keeps_the_old_file(
+    when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "last.ckpt"
+    io = AtomicCheckpointIO()
+    io.save_checkpoint({"epoch": 1}, path)
+    content: dict[str, Any] = {"epoch": 2}
+    if when == "while writing":
+        content["bad"] = Unwritable()
+    else:
+
+        def refuse(*_: object) -> None:
+            raise RuntimeError("cannot be renamed")
+
+        monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(RuntimeError, match="cannot be"):
+        io.save_checkpoint(content, path)
+    assert io.load_checkpoint(path) == {"epoch": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("weights_only", [None, False, True])
+def test_loading_runs_no_code_whoever_asks(weights_only: bool | None, tmp_path: Path) -> None:
+    path, trace = tmp_path / "hostile.ckpt", tmp_path / "trace"
+
+    class Hostile:
+        def __reduce__(self) -> tuple[Any, tuple[str]]:
+            return os.mkdir, (str(trace),)
+
+    torch.save({"state_dict": Hostile()}, path)
+    with pytest.raises(Exception, match=r"[Ww]eights"):
+        AtomicCheckpointIO().load_checkpoint(path, weights_only=weights_only)
+    assert not trace.exists()
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_what_cannot_be_written_is_written_later_in_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    refuse = [True]
+    io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
+    weights = torch.zeros(2)
+    io.save_checkpoint({"step": 1, "weights": weights}, tmp_path / "best.ckpt")
+    weights += 1  # training goes on
+    io.save_checkpoint({"step": 1}, tmp_path / "last.ckpt")
+    io.save_checkpoint({"step": 2}, tmp_path / "last.ckpt")
+    assert io.waiting == [tmp_path / "best.ckpt", tmp_path / "last.ckpt"]
+    assert f"cannot save best.ckpt in {tmp_path}: No space left on device" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SavingFailedError, match=r"cannot save best.ckpt in .*: No space left"):
+        io.finish()
+    refuse[0] = False
+    io.finish()
+    assert io.waiting == []
+    best = io.load_checkpoint(tmp_path / "best.ckpt")
+    assert best["step"] == 1
+    assert best["weights"].tolist() == [0.0, 0.0]
+    assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
+
+
+def test_nothing_outside_of_the_run_is_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run, other = tmp_path / "run", tmp_path / "other.ckpt"
+    io = AtomicCheckpointIO(folder=run)
+    io.save_checkpoint({"step": 1}, run / "checkpoints" / "old.ckpt")
+    other.write_bytes(b"mine")
+    (run / "link").symlink_to(tmp_path)
+    for path in (run / "checkpoints" / ".." / ".." / "other.ckpt", other, run / "link/other.ckpt"):
+        io.remove_checkpoint(path)
+    assert other.read_bytes() == b"mine"
+    assert caplog.text.count("is not of this run and stays") == 3
+    io.remove_checkpoint(run / "checkpoints")  # a folder is no checkpoint
+    io.remove_checkpoint(run / "checkpoints" / "old.ckpt")
+    assert list((run / "checkpoints").iterdir()) == []
+
+
+def test_a_moved_run_finds_its_own_files(tmp_path: Path) -> None:
+    old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
+    best = {
+        "dirpath": str(old), "monitor": "val/x", "best_model_path": str(old / "best.ckpt"),
+        "kth_best_model_path": "", "last_model_path": "/etc/passwd",
+        "best_k_models": {str(old / "best.ckpt"): torch.tensor(0.5)},
+    }  # fmt: skip
+    state = {"callbacks": {"ModelCheckpoint": best, "other": {"a": 1}}, "epoch": 3}
+    AtomicCheckpointIO().save_checkpoint(state, old / "last.ckpt")
+    old.parent.rename(new.parent)
+    loaded = AtomicCheckpointIO(folder=new.parent).load_checkpoint(new / "last.ckpt")
+    moved = loaded["callbacks"]["ModelCheckpoint"]
+    assert moved["dirpath"] == str(new)
+    assert moved["best_model_path"] == str(new / "best.ckpt")
+    assert (moved["kth_best_model_path"], moved["last_model_path"]) == ("", str(new / "passwd"))
+    assert list(moved["best_k_models"]) == [str(new / "best.ckpt")]
+    assert (moved["monitor"], loaded["callbacks"]["other"], loaded["epoch"]) == (
+        "val/x",
+        {"a": 1},
+        3,
+    )
+
+
+def test_the_previous_file_is_kept(tmp_path: Path) -> None:
+    io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
+    for step in range(3):
+        io.save_checkpoint({"step": step}, tmp_path / "last.ckpt", storage_options=options)
+    assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
+    assert io.load_checkpoint(tmp_path / "previous.ckpt") == {"step": 1}
+
+
+def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path: Path) -> None:
+    with subprocess.Popen(["true"]) as process:
+        process.wait()
+    (tmp_path / "checkpoints").mkdir()
+    mine = partial_path(tmp_path / "checkpoints" / "last.ckpt")
+    gone = mine.with_name(mine.name.replace(str(os.getpid()), str(process.pid)))
+    mine.touch()
+    gone.touch()
+    sweep(tmp_path)
+    assert list((tmp_path / "checkpoints").iterdir()) == [mine]
+
+
+def test_random_states_come_back_through_a_file(tmp_path: Path) -> None:
+    def draw() -> list[float]:
+        return [random.gauss(0, 1), np.random.randn(), float(torch.randn(()))]  # noqa: NPY002
+
+    draw()
+    AtomicCheckpointIO().save_checkpoint({"random": capture()}, tmp_path / "a.ckpt")
+    expected = [draw() for _ in range(3)]
+    restore(torch.load(tmp_path / "a.ckpt", weights_only=True)["random"])
+    assert [draw() for _ in range(3)] == expected

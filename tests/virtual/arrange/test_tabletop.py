@@ -1,0 +1,270 @@
+"""Objects on tables and in heaps: contact, no piercing, views, and a background that fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import manifold3d
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import invert_transform, transform
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.mesh.read import read_mesh, ycb_part
+from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.virtual import Factory, Scene, SceneObject
+from dopepp.virtual.arrange.tabletop import HeightMap
+from dopepp.virtual.presets.preset import PRESETS, Distractors, Preset, Table, customised_preset
+from dopepp.virtual.surface import make_surface
+
+NUM_SCENES = 25
+CONTACT = 1e-4
+
+
+class Constant:
+    """Backgrounds of one grey level after another."""
+
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+        return np.full((height, width, 3), rng.integers(1, 255), np.uint8)
+
+
+class Ramp:
+    """A picture whose red is its column and whose green is its row, over 256 px."""
+
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+        ramp = np.zeros((height, width, 3), np.uint8)
+        ramp[..., 0], ramp[..., 1] = np.arange(width), np.arange(height)[:, None]
+        return ramp
+
+
+def small(name: str, **changes: object) -> Preset:
+    return customised_preset(name, changes).resized(160, 120)
+
+
+def heights(scene: Scene, item: SceneObject) -> np.ndarray:
+    """Heights of an object's vertices above the plane, metres."""
+    assert scene.plane is not None
+    points = transform(item.T_cam_obj, item.surface.vertices)
+    return np.asarray(points @ np.array(scene.plane.normal) - scene.plane.offset)
+
+
+@pytest.fixture(scope="module")
+def parts() -> list[Part]:
+    return [servoholder(), pivconnector()]
+
+
+@pytest.fixture(scope="module")
+def tables(parts: list[Part]) -> list[Scene]:
+    factory = Factory(parts, small("table"), 1, Constant())
+    return [factory.scene(0, index) for index in range(NUM_SCENES)]
+
+
+@pytest.fixture(scope="module")
+def heaps(parts: list[Part]) -> list[Scene]:
+    factory = Factory(parts, small("bin"), 1, Constant())
+    return [factory.scene(0, index) for index in range(NUM_SCENES)]
+
+
+def test_everything_on_a_table_touches_it_and_nothing_is_below(tables: list[Scene]) -> None:
+    for scene in tables:
+        for item in scene.objects:
+            assert -1e-9 <= heights(scene, item).min() <= CONTACT
+    assert {len(scene.targets) for scene in tables} == {1, 2, 3}
+    assert {len(scene.objects) - len(scene.targets) for scene in tables} >= {1, 4, 7}
+
+
+def test_what_does_not_lean_rests_on_a_face(parts: list[Part]) -> None:
+    factory = Factory(parts, small("table", table={"tilted_share": 0.0}), 1, Constant())
+    leaning = Factory(parts, small("table", table={"tilted_share": 1.0}), 1, Constant())
+    for index in range(8):
+        scene, other = factory.scene(0, index), leaning.scene(0, index)
+        for item in scene.objects:
+            assert (heights(scene, item) < 1e-5).sum() >= 3
+        low = [heights(other, other.objects[i]) for i in other.targets]
+        # A leaning plate touches along an edge or at a corner, not with its face.
+        assert all((values < 1e-5).sum() < len(values) / 10 for values in low)
+        assert all(-1e-9 <= values.min() <= CONTACT for values in low)
+
+
+def test_heaps_stand_on_the_plane(heaps: list[Scene]) -> None:
+    for scene in heaps:
+        lowest = [heights(scene, item).min() for item in scene.objects]
+        assert min(lowest) >= -1e-9
+        assert min(lowest) <= CONTACT
+    assert any(max(heights(s, i).min() for i in s.objects) > 0.005 for s in heaps)
+    counts = [len(scene.targets) for scene in heaps]
+    assert min(counts) >= 2
+    assert max(counts) >= 8
+
+
+def solid(item: SceneObject) -> manifold3d.Manifold:
+    vertices = transform(item.T_cam_obj, item.surface.vertices)
+    merged, index = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
+    mesh = manifold3d.Mesh64(merged, index.reshape(-1)[item.surface.faces].astype(np.uint64))
+    return manifold3d.Manifold(mesh)
+
+
+@pytest.mark.parametrize(("name", "most"), [("table", 1e-4), ("bin", 0.02)])
+def test_objects_do_not_pierce_each_other(
+    name: str, most: float, tables: list[Scene], heaps: list[Scene]
+) -> None:
+    shares = []
+    for scene in (tables if name == "table" else heaps)[:12]:
+        solids = [solid(item) for item in scene.objects]
+        assert all(body.volume() > 0 for body in solids)
+        for number, body in enumerate(solids):
+            for other in solids[:number]:
+                shared = (body ^ other).volume()
+                shares.append(shared / min(body.volume(), other.volume()))
+    assert len(shares) > 20
+    assert max(shares) < most
+
+
+def test_heaps_hide_but_not_too_much(parts: list[Part]) -> None:
+    preset = small("bin")
+    factory = Factory(parts, preset, 2, Constant())
+    fractions = np.concatenate(
+        [(r := factory.render(0, i)).visible_fractions[list(r.scene.targets)] for i in range(12)]
+    )
+    assert fractions.min() >= preset.min_visible_fraction
+    assert np.mean(fractions < 0.8) > 0.2
+
+
+def test_the_cameras_place_keeps_to_its_ranges(tables: list[Scene]) -> None:
+    distances, elevations = [], []
+    for scene in tables:
+        assert scene.plane is not None
+        normal = np.array(scene.plane.normal)
+        assert np.linalg.norm(normal) == pytest.approx(1.0)
+        assert scene.plane.offset < 0
+        distances.append(scene.plane.offset / normal[2])
+        elevations.append(np.degrees(np.arcsin(-normal[2])))
+        for light in scene.lights:
+            assert normal @ np.array(light.position) > scene.plane.offset
+    assert 0.25 <= min(distances) < 0.32
+    assert 0.52 < max(distances) <= 0.60
+    assert 30 - 1e-9 <= min(elevations) < 45
+    assert 70 < max(elevations) <= 85 + 1e-9
+
+
+def test_the_background_is_a_picture_that_lies_on_the_plane(parts: list[Part]) -> None:
+    wide = {"picture_width": (8.0, 8.0), "elevation_deg": (45.0, 85.0)}
+    preset = replace(customised_preset("table", {"table": wide}), width=256, height=256)
+    factory = Factory(parts, preset, 4, Ramp())
+    for index in range(4):
+        scene = factory.scene(0, index)
+        assert scene.plane is not None
+        normal = np.array(scene.plane.normal)
+        v, u = np.mgrid[10:250:7, 10:250:7].reshape(2, -1)
+        rays = np.stack([u, v, np.ones(u.shape)], axis=1) @ np.linalg.inv(scene.K).T
+        points = rays * (scene.plane.offset / (rays @ normal))[:, None]
+        # Any two axes in the plane: the map from it to the picture must be one similarity.
+        first = np.cross(normal, [0.3, 0.5, 0.7])
+        first /= np.linalg.norm(first)
+        plane_xy = np.stack([points @ first, points @ np.cross(normal, first), np.ones(u.shape)], 1)
+        levels = scene.background[v, u, :2].astype(float)
+        fit, *_ = np.linalg.lstsq(plane_xy, levels, rcond=None)
+        assert np.abs(plane_xy @ fit - levels).max() < 1.2  # grey levels, which are whole
+        similarity = fit[:2].T @ fit[:2]
+        np.testing.assert_allclose(similarity, similarity[0, 0] * np.eye(2), rtol=0.05,
+                                   atol=0.05 * similarity[0, 0])  # fmt: skip
+
+
+def test_beyond_the_horizon_is_another_picture(parts: list[Part]) -> None:
+    preset = small("table", table={"elevation_deg": (12.0, 12.0), "roll_deg": 0.0})
+    background = Factory(parts, preset, 4, Constant()).scene(0, 0).background
+    assert len(np.unique(background)) == 2
+    # At 12° the horizon lies f·tan 12° above the middle; the table ends a little below it.
+    focal, horizon = preset.K[1, 1], preset.K[1, 2] - preset.K[1, 1] * np.tan(np.radians(12))
+    edge = int(np.flatnonzero(background[:, 80, 0] != background[0, 80, 0])[0])
+    assert horizon < edge < horizon + focal * 0.05
+
+
+def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None:
+    for name in ("table", "bin", "paper", "quickstart", "ycb"):
+        preset = replace(
+            PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
+        )
+        rendered = [Factory(parts, preset, 0).render(0, index) for index in range(2)]
+        assert all(r.scene.targets == () for r in rendered)
+        assert sum(len(r.scene.objects) for r in rendered) >= 4
+        empty = replace(preset, distractors=Distractors((0, 0)))
+        assert Factory(parts, empty, 0).render(0, 1).scene.objects == ()
+
+
+def test_parts_no_table_can_show_are_an_error(box_part: Part) -> None:
+    assert box_part.mesh is not None
+    for scale, name in ((40, "huge"), (0.06, "tiny")):
+        mesh = replace(box_part.mesh, vertices=box_part.mesh.vertices * scale)
+        part = make_part(name, mesh)
+        for preset in (PRESETS["table"], PRESETS["bin"]):
+            far = replace(preset, table=Table(distance=(20.0, 20.0))) if scale < 1 else preset
+            with pytest.raises(UserError, match=f"part {name} of diameter"):
+                Factory([part], far, 0, Constant()).scene(0, 0)
+
+
+@pytest.mark.parametrize("name", ["table", "bin"])
+def test_somebody_elses_parts_lie_well(name: str, request: pytest.FixtureRequest) -> None:
+    shared = request.getfixturevalue("shared_data")
+    path = sorted((shared / "parts" / "so_arm100").glob("*.stl"))[0]
+    theirs = [
+        make_part("printed", read_mesh(path, "mm")),
+        ycb_part(shared / "ycb_video_mini", "006_mustard_bottle"),
+    ]
+    factory = Factory(theirs, small(name), 0, Constant())
+    for index in range(4):
+        scene = factory.scene(0, index)
+        assert scene.targets
+        lowest = [heights(scene, item).min() for item in scene.objects]
+        assert min(lowest) >= -1e-9
+        assert name == "bin" or max(lowest) <= CONTACT
+
+
+def test_a_dropped_box_lands_on_what_is_there() -> None:
+    box = trimesh.creation.box((0.04, 0.02, 0.03))
+    surface = make_surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+    table = HeightMap(0.001, 0.1)
+    footprint = table.footprint(surface, np.eye(3), -0.015)
+    assert footprint is not None
+    assert table.height(footprint, (0, 0)) == 0.0
+    table.put(footprint, (0, 0), 0.0)
+    assert table.height(footprint, (10, 5)) == pytest.approx(0.03, abs=1e-6)
+    assert not table.is_free(footprint, (10, 5))
+    assert not table.is_free(footprint, (40, 0))  # side by side, within a cell
+    assert table.is_free(footprint, (43, 0))
+    assert table.height(footprint, (43, 0)) == 0.0
+    assert table.height(footprint, (95, 0)) is None  # off the map
+    turned = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    lying = table.footprint(surface, turned, -0.01)
+    assert lying is not None
+    table.put(footprint, (10, 5), 0.03)
+    assert table.height(lying, (0, 0)) == pytest.approx(0.06, abs=1e-6)
+
+
+def test_a_slope_is_met_where_it_is_highest() -> None:
+    profile, ends = ((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05)), (-0.05, 0.05)
+    wedge = trimesh.convex.convex_hull(np.array([[x, y, z] for x, z in profile for y in ends]))
+    box = trimesh.creation.box((0.01, 0.01, 0.01))
+    shapes = [
+        make_surface(Mesh(np.asarray(m.vertices), np.asarray(m.faces, np.int32)))
+        for m in (wedge, box)
+    ]
+    table = HeightMap(0.001, 0.1)
+    slope = table.footprint(shapes[0], np.eye(3), 0.0)
+    block = table.footprint(shapes[1], np.eye(3), -0.005)
+    assert slope is not None
+    assert block is not None
+    table.put(slope, (0, 0), 0.0)
+    # Height z = (x + 5 cm)/2; the block's right edge is 5 mm beside its middle.
+    for x in (-20, 0, 30):
+        assert table.height(block, (x, 0)) == pytest.approx(
+            (0.001 * x + 0.005 + 0.05) / 2, abs=8e-4
+        )
+
+
+def test_the_tables_frame_is_rigid() -> None:
+    view = Table(roll_deg=180.0).draw_view(np.random.default_rng(0))
+    np.testing.assert_allclose(view @ invert_transform(view), np.eye(4), atol=1e-12)
+    assert np.linalg.det(view[:3, :3]) == pytest.approx(1.0)
