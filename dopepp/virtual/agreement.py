@@ -22,7 +22,8 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import Part
-from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, project_object, rasterise
+from dopepp.virtual.renderers.raster.projection import project_object
+from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, rasterise
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 

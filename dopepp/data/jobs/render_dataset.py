@@ -19,7 +19,8 @@ from rich.console import Console
 
 from dopepp.core.errors import UserError
 from dopepp.core.interrupts import stopped
-from dopepp.data.jobs.job import Job, begin, is_begun
+from dopepp.data.jobs.folder import begin, is_begun
+from dopepp.data.jobs.job import Job
 from dopepp.data.jobs.processes import ProcessPool, available_cores, check_workers
 from dopepp.data.jobs.progress import ProgressDisplay
 from dopepp.data.jobs.work import Chunk, Outcome, Shard, Task, Work, check_count, plan

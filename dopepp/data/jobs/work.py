@@ -21,7 +21,7 @@ import cv2
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import Writer
-from dopepp.data.jobs.job import RECORD_FILE, is_begun
+from dopepp.data.jobs.folder import RECORD_FILE, is_begun
 from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
 from dopepp.parts.part import Part
 from dopepp.virtual.factory import Factory

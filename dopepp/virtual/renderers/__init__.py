@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from dopepp.core.errors import UserError
-from dopepp.virtual.scene import Rendered, Scene
 
-Renderer = Callable[[Scene], Rendered]
+if TYPE_CHECKING:
+    from dopepp.virtual.scene import Rendered, Scene
+
+Renderer: TypeAlias = "Callable[[Scene], Rendered]"
 """Draws a scene as an ideal camera sees it; the factory applies the scene's sensor."""
 
 RENDERERS: Final = {

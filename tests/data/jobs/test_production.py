@@ -22,7 +22,8 @@ from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.jobs.job import RECORD_FILE, Job, make_job, named_part
+from dopepp.data.jobs.folder import RECORD_FILE
+from dopepp.data.jobs.job import Job, make_job, named_part
 from dopepp.data.jobs.progress import ProgressDisplay
 from dopepp.data.jobs.render_dataset import RenderReport, render_dataset
 from dopepp.data.jobs.work import WRITERS, Outcome, Shard, Task, Worker, plan

@@ -11,7 +11,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.jobs.cluster import ClusterPool, connect
-from dopepp.data.jobs.job import Job, begin, make_job
+from dopepp.data.jobs.folder import begin
+from dopepp.data.jobs.job import Job, make_job
 from dopepp.data.jobs.processes import ProcessPool
 from dopepp.data.jobs.render_dataset import OpenPool, render_dataset
 from dopepp.data.jobs.work import Shard, Task, Work

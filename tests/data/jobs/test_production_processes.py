@@ -15,7 +15,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.core.interrupts import StoppedError
-from dopepp.data.jobs.job import Job, begin, make_job
+from dopepp.data.jobs.folder import begin
+from dopepp.data.jobs.job import Job, make_job
 from dopepp.data.jobs.processes import ProcessPool, available_cores, check_workers
 from dopepp.data.jobs.render_dataset import render_dataset
 from dopepp.data.jobs.work import Task, Work, Worker

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import NDArray
 
-from dopepp.data.formats.bop.check import Model, Models
+from dopepp.data.formats.bop.check_models import Model, Models
 from dopepp.data.formats.problems import CheckReport, entries, mapping, numbers
 from dopepp.data.formats.tolerances import (
     Box,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.check import Models, load_models
 from dopepp.data.formats.bop.check_image import ImageRecords, Silhouettes, check_image_records
+from dopepp.data.formats.bop.check_models import Models, load_models
 from dopepp.data.formats.bop.images import decode_runs
 from dopepp.data.formats.bop.writer import STAGING
 from dopepp.data.formats.problems import (

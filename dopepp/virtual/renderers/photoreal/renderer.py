@@ -39,8 +39,8 @@ from dopepp.virtual.renderers.photoreal.table import (
 from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads, require
 from dopepp.virtual.renderers.raster.light import CODE_STEPS, TONE_CURVE
 from dopepp.virtual.renderers.raster.plane import inverse_depth_of, plane_depth
+from dopepp.virtual.renderers.raster.projection import project_object
 from dopepp.virtual.renderers.raster.rasteriser import visible_fractions
-from dopepp.virtual.renderers.raster.visibility import project_object
 from dopepp.virtual.scene import NEAR, Rendered, Scene
 
 _CPU_DEVICE: Final = 1

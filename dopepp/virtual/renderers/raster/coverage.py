@@ -12,14 +12,8 @@ from jaxtyping import Bool, Float, Int16
 
 from dopepp.core.compiled import Array
 from dopepp.geometry.camera import resize_camera
-from dopepp.virtual.renderers.raster.visibility import (
-    CENTRE_SAMPLE,
-    Box,
-    Projected,
-    bounds,
-    project_object,
-    rasterise,
-)
+from dopepp.virtual.renderers.raster.projection import Box, Projected, project_object
+from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, bounds, rasterise
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 
 _MOST_PX: Final = 1_000_000

@@ -17,8 +17,9 @@ from jaxtyping import Float, Float32
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.virtual.renderers.raster.light import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.renderers.raster.projection import Box
 from dopepp.virtual.renderers.raster.shadow import ShadowMap, hidden_sky
-from dopepp.virtual.renderers.raster.visibility import NUM_COLOUR_SAMPLES, Box, scratch
+from dopepp.virtual.renderers.raster.visibility import NUM_COLOUR_SAMPLES, scratch
 from dopepp.virtual.scene import NEAR, Plane, Scene
 
 _LAMP_ANGLE: Final = 0.04

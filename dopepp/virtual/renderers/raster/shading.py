@@ -35,10 +35,11 @@ from dopepp.virtual.renderers.raster.light import (
     reflect_light,
 )
 from dopepp.virtual.renderers.raster.occlusion import look_up_sky
-from dopepp.virtual.renderers.raster.rasteriser import add_colour
+from dopepp.virtual.renderers.raster.picture import add_colour
+from dopepp.virtual.renderers.raster.projection import Projected
 from dopepp.virtual.renderers.raster.shadow import ShadowMap
 from dopepp.virtual.renderers.raster.texture import sample_texture
-from dopepp.virtual.renderers.raster.visibility import Projected, scratch
+from dopepp.virtual.renderers.raster.visibility import scratch
 from dopepp.virtual.scene import Scene, SceneObject
 
 _SIDE: Final = 32

@@ -19,12 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.visibility import (
-    CENTRE_SAMPLE,
-    Projected,
-    project_vertices,
-    rasterise,
-)
+from dopepp.virtual.renderers.raster.projection import Projected
+from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, project_vertices, rasterise
 from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
 
 _CELLS: Final = 80
