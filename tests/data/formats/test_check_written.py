@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dopepp.data.check import check_dataset
 from dopepp.data.formats import Writer
 from dopepp.data.formats.bop.writer import BopWriter
-from dopepp.data.formats.ndds.source import NddsSource
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 from dopepp.data.sample import Sample
@@ -45,20 +43,3 @@ def test_written_sets_are_clean(
     assert [str(defect) for defect in report.defects] == []
     assert report.num_images == NUM_IMAGES
     assert report.notes == []
-
-
-@pytest.mark.render
-def test_rendered_ndds_reads_back_exactly(tmp_path: Path, samples: list[Sample]) -> None:
-    writer = NddsWriter(tmp_path, PARTS)
-    writer.prepare()
-    for index, sample in enumerate(samples):
-        writer.write(index, sample)
-    source = NddsSource(tmp_path, PARTS)
-    for index, sample in enumerate(samples):
-        back = source.sample(index)
-        np.testing.assert_array_equal(back.image, sample.image)
-        for one, other in zip(back.instances, sample.instances, strict=True):
-            np.testing.assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-12)
-            np.testing.assert_allclose(one.keypoints, other.keypoints, atol=1e-9)
-            np.testing.assert_array_equal(one.mask, other.mask)
-            assert one.visible_fraction == other.visible_fraction

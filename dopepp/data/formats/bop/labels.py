@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt16
 
 from dopepp.data.formats.bop.images import depth_units
 from dopepp.data.formats.bop.records import MM
+from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.parts.part import Part
 from dopepp.virtual.renderers.raster.rasteriser import Silhouette, silhouette
@@ -115,47 +116,37 @@ def _info(
     whole: Silhouette,
     depth: UInt16[np.ndarray, "height width"],
 ) -> Record:
-    is_seen = bool(visible.any())
-    inside = int(np.count_nonzero(whole.mask))
+    seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
     return {
-        "bbox_obj": _box(_whole_bounds(whole)) if is_seen else NO_BOX,
-        "bbox_visib": _box(_bounds(visible)) if is_seen else NO_BOX,
+        "bbox_obj": NO_BOX if seen is None else _bop_box(_beyond_the_border(inside, whole)),
+        "bbox_visib": _bop_box(seen),
         # A silhouette around the camera has no finite size: its pixels within the image stand.
-        "px_count_all": int(whole.num_px) if math.isfinite(whole.num_px) else inside,
+        "px_count_all": int(whole.num_px if math.isfinite(whole.num_px) else whole.mask.sum()),
         "px_count_valid": int(np.count_nonzero(depth[whole.mask])),
         "px_count_visib": int(np.count_nonzero(visible)),
         "visib_fract": float(instance.visible_fraction),
     }
 
 
-def _box(bounds: tuple[int, int, int, int] | None) -> list[int]:
-    """Turn (left, top, right, bottom), all included, into BOP's (x, y, width, height)."""
-    if bounds is None:
+def _bop_box(box: Box | None) -> list[int]:
+    """Return BOP's (x, y, width, height)."""
+    if box is None:
         return NO_BOX
-    left, top, right, bottom = bounds
-    return [left, top, right - left, bottom - top]
+    return [int(n) for n in (box.left, box.top, box.right - box.left, box.bottom - box.top)]
 
 
-def _bounds(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int] | None:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
-
-
-def _whole_bounds(whole: Silhouette) -> tuple[int, int, int, int] | None:
+def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
     """Return the outermost pixels of a silhouette, those beyond the image included.
 
     Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
     """
-    inside = _bounds(whole.mask)
     if inside is None or whole.box is None:
         return inside
     height, width = whole.mask.shape
     left, top, right, bottom = whole.box[0], whole.box[1], whole.box[2] - 1, whole.box[3] - 1
-    return (
-        left if left < 0 else inside[0],
-        top if top < 0 else inside[1],
-        right if right >= width else inside[2],
-        bottom if bottom >= height else inside[3],
+    return Box(
+        left if left < 0 else inside.left,
+        top if top < 0 else inside.top,
+        right if right >= width else inside.right,
+        bottom if bottom >= height else inside.bottom,
     )

@@ -39,41 +39,6 @@ SCENE_FILES: Final = {
 finalized, so it is written last."""
 
 
-class PartSurfaces:
-    """The parts a writer numbers 1, 2, …, with the surfaces that give their silhouettes."""
-
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self.parts = tuple(parts)
-
-    @cached_property
-    def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        return {
-            part.name: (part, make_surface(part.mesh))
-            for part in self.parts
-            if part.mesh is not None
-        }
-
-    def labels(self, sample: Sample) -> Labels:
-        """Annotate a sample, see :func:`~dopepp.data.formats.bop.labels.make_labels`."""
-        ids = {part.name: number for number, part in enumerate(self.parts, start=1)}
-        return make_labels(sample, ids, self._surfaces)
-
-
-def prepare_models(root: Path, split: str, parts: Sequence[Part]) -> None:
-    """Write the models, unless the split holds images that were made without them.
-
-    Raises:
-        UserError: The folder holds something else.
-    """
-    if (root / split).exists() and not (root / MODEL_FOLDERS[0] / INFO_FILE).exists():
-        raise UserError(
-            f"{root}, which has {split}/ and no {MODEL_FOLDERS[0]}/{INFO_FILE}",
-            "an empty folder, or one that this layout was begun in",
-            "choose another folder",
-        )
-    write_models(root, parts)
-
-
 class BopFolder:
     """What the writers of BOP's layouts share: a folder with models beside a split of images.
 
@@ -86,16 +51,32 @@ class BopFolder:
     chunk_size = IMAGES_A_SCENE
 
     def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
-        self.root, self.split = Path(root), split
-        self._parts = PartSurfaces(parts)
+        self.root, self.split, self._parts = Path(root), split, tuple(parts)
 
     def prepare(self) -> None:
-        """Write the models.
+        """Write the models, unless the split holds images that were made without them.
 
         Raises:
             UserError: The folder holds something else, or a part has no mesh.
         """
-        prepare_models(self.root, self.split, self._parts.parts)
+        info = self.root / MODEL_FOLDERS[0] / INFO_FILE
+        if (self.root / self.split).exists() and not info.exists():
+            raise UserError(
+                f"{self.root}, which has {self.split}/ and no {MODEL_FOLDERS[0]}/{INFO_FILE}",
+                "an empty folder, or one that this layout was begun in",
+                "choose another folder",
+            )
+        write_models(self.root, self._parts)
+
+    @cached_property
+    def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
+        meshes = {part.name: (part, part.mesh) for part in self._parts}
+        return {n: (part, make_surface(mesh)) for n, (part, mesh) in meshes.items() if mesh}
+
+    def labels(self, sample: Sample) -> Labels:
+        """Annotate a sample, see :func:`~dopepp.data.formats.bop.labels.make_labels`."""
+        ids = {part.name: number for number, part in enumerate(self._parts, start=1)}
+        return make_labels(sample, ids, self._surfaces)
 
 
 class BopWriter(BopFolder):
@@ -105,7 +86,7 @@ class BopWriter(BopFolder):
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an image's files, its records last."""
-        labels = self._parts.labels(sample)
+        labels = self.labels(sample)
         chunk, image = divmod(index, self.chunk_size)
         scene = self._scene(chunk)
         write_whole(scene / "rgb" / f"{image:06d}.png", encode_png(sample.image))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.data.sample import hull_areas
-from dopepp.geometry.camera import camera_matrix
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
@@ -210,45 +208,6 @@ def test_wrong_combination_of_arguments(ycb_tree: Any, box: Part) -> None:
         YcbVideoSource(ycb_tree.root, [box])
     with pytest.raises(ValueError, match="give backgrounds"):
         YcbVideoSource(ycb_tree.root, [box], "train", "synthetic")
-
-
-def _rotated(change: Callable[[np.ndarray], object]) -> np.ndarray:
-    poses = np.zeros((3, 4, 1))
-    poses[:, :3, 0], poses[2, 3] = np.eye(3), 0.3
-    change(poses)
-    return poses
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"poses": None}, "poses"),
-        ({"cls_indexes": None}, "cls_indexes"),
-        ({"factor_depth": None}, "factor_depth"),
-        ({"factor_depth": 0}, "factor_depth: 0"),
-        ({"cls_indexes": [[2], [3]]}, r"poses: shape \(3, 4, 1\) for 2 classes"),
-        (
-            {"poses": _rotated(lambda p: p.__setitem__((0, 0), np.nan))},
-            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
-        ),
-        (
-            {"poses": _rotated(lambda p: p.__setitem__((0, 0), -1.0))},
-            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
-        ),
-        (
-            {"poses": _rotated(lambda p: p.__setitem__((0, 0), 2.0))},
-            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
-        ),
-        ({"poses": _rotated(lambda p: p.__setitem__((2, 3), -0.3))}, "behind the camera"),
-        ({"intrinsic_matrix": camera_matrix(100.0, 100.0, 900.0, 35.5)}, "principal point"),
-        ({"intrinsic_matrix": np.full((3, 3), np.nan)}, "intrinsic_matrix: not finite"),
-    ],
-)
-def test_impossible_meta(ycb_tree: Any, box: Part, changes: dict[str, Any], message: str) -> None:
-    ycb_tree.write("0000/000001", **changes)
-    with pytest.raises(UserError, match=message) as caught:
-        source_of(ycb_tree, box).sample(0)
-    assert "0000/000001" in str(caught.value)
 
 
 @pytest.mark.parametrize("compressed", [True, False])
