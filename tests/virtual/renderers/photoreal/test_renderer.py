@@ -31,13 +31,14 @@ from dopepp.virtual import (
     make_surface,
     render,
 )
-from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.renderers import Renderer, find_renderer
 
 pytestmark = pytest.mark.render
+MakeScene = Callable[..., Scene]
 
 
 @pytest.fixture(scope="module")
-def photoreal() -> Callable[[Scene], Rendered]:
+def photoreal() -> Renderer:
     pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
     pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
     return find_renderer("photoreal")
@@ -63,9 +64,7 @@ def assert_same_labels(found: Rendered, expected: Rendered) -> None:
 
 
 @pytest.mark.parametrize(("preset", "seed"), [("paper", 1), ("paper", 2), ("table", 3), ("bin", 5)])
-def test_labels_agree_with_the_rasteriser(
-    photoreal: Callable[[Scene], Rendered], preset: str, seed: int
-) -> None:
+def test_labels_agree_with_the_rasteriser(photoreal: Renderer, preset: str, seed: int) -> None:
     parts = [make() for make in BUILTIN.values()]
     scene = Factory(parts, PRESETS[preset].resized(160, 120), seed).scene(0, seed)
     expected, found = render(scene), photoreal(scene)
@@ -89,10 +88,7 @@ def test_labels_agree_with_the_rasteriser(
     ],
 )
 def test_every_material_renders(
-    photoreal: Callable[[Scene], Rendered],
-    material: Material,
-    box_part: Part,
-    scene_of: Callable[..., Scene],
+    photoreal: Renderer, material: Material, box_part: Part, scene_of: MakeScene
 ) -> None:
     scene = scene_of(lying(box_part, 0.1, material=material))
     found = photoreal(scene)
@@ -105,7 +101,7 @@ def test_every_material_renders(
 
 
 def test_a_textured_model_shows_its_texture(
-    photoreal: Callable[[Scene], Rendered], ycb_root: Path, scene_of: Callable[..., Scene]
+    photoreal: Renderer, ycb_root: Path, scene_of: MakeScene
 ) -> None:
     mesh = read_mesh(ycb_root / "models" / "003_cracker_box" / "textured.obj", "m")
     T = np.eye(4)
@@ -120,7 +116,7 @@ def test_a_textured_model_shows_its_texture(
 
 
 def test_no_light_at_all_is_black_and_finite(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     dark = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
     scene = on_table(scene_of(lying(box_part, 0.01), lights=(), ambient=dark))
@@ -132,7 +128,7 @@ def test_no_light_at_all_is_black_and_finite(
 
 
 def test_the_table_is_darker_near_the_contact(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     scene = on_table(scene_of(lying(box_part, 0.01), lights=()))
     found = photoreal(scene)
@@ -145,7 +141,7 @@ def test_the_table_is_darker_near_the_contact(
 
 
 def test_a_shadow_falls_away_from_its_lamp(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     dim = Ambient(above=(0.02, 0.02, 0.02), below=(0.02, 0.02, 0.02))
     lamp = Light((-0.4, 0.0, 0.2))
@@ -159,7 +155,7 @@ def test_a_shadow_falls_away_from_its_lamp(
 
 
 def test_a_red_neighbour_is_seen_in_a_mirror(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     mirror = Material(metallic=1.0, roughness=0.05, colour=(0.9, 0.9, 0.9))
     red = Material(colour=(0.9, 0.02, 0.02))
@@ -181,7 +177,7 @@ def test_a_red_neighbour_is_seen_in_a_mirror(
 
 
 def test_pixels_that_are_not_square(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     scene = scene_of(lying(box_part, 0.1))
     K = scene.K.copy()
@@ -199,18 +195,15 @@ def test_pixels_that_are_not_square(
 
 
 def test_a_scene_gives_the_same_bytes(
-    photoreal: Callable[[Scene], Rendered], box_part: Part, scene_of: Callable[..., Scene]
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
 ) -> None:
     scene = on_table(scene_of(lying(box_part, 0.02)))
     first, second = photoreal(scene), photoreal(pickle.loads(pickle.dumps(scene)))
-    np.testing.assert_array_equal(first.image, second.image)
-    np.testing.assert_array_equal(first.depth, second.depth)
-    np.testing.assert_array_equal(first.instances, second.instances)
+    for field in ("image", "depth", "instances"):
+        np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
 
 
-def test_an_empty_scene_is_its_background(
-    photoreal: Callable[[Scene], Rendered], scene_of: Callable[..., Scene]
-) -> None:
+def test_an_empty_scene_is_its_background(photoreal: Renderer, scene_of: MakeScene) -> None:
     scene = scene_of()
     for found in (photoreal(scene), photoreal(on_table(scene))):
         np.testing.assert_array_equal(found.image, scene.background)

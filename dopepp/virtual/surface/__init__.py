@@ -10,14 +10,9 @@ from jaxtyping import Float, Int, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Mesh
-from dopepp.virtual.renderers.raster.normals import (
-    corner_normals,
-    is_closed,
-    merge_vertices,
-    smooth_patches,
-)
-from dopepp.virtual.renderers.raster.occlusion import OpenSky, bake_open_sky, spread_directions
-from dopepp.virtual.renderers.raster.texture import Texture, make_texture
+from dopepp.virtual.surface.normals import corner_normals, is_closed, merge_vertices, smooth_patches
+from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
+from dopepp.virtual.surface.texture import Texture, make_texture
 
 CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""

@@ -1,7 +1,4 @@
-"""A body: what can be put into a scene, and how it can lie there.
-
-How a body can lie on a plane: the stable faces of its convex hull.
-"""
+"""A body: what can be put into a scene, and on which faces of its convex hull it can lie there."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Part
+from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
 
 _COPLANAR_DEG: Final = 0.05
@@ -22,6 +20,54 @@ _COPLANAR_DEG: Final = 0.05
 
 _LEAST_SHARE: Final = 0.002
 """Faces under which a body comes to rest more rarely than this are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface that can be posed.
+
+    Attributes:
+        surface: Its geometry.
+        part: The part it is; None for what no network is to find.
+        source: The body it was stretched from.
+        stretch: By how much, along x, y and z.
+    """
+
+    surface: Surface
+    part: Part | None = None
+    source: Body | None = None
+    stretch: Triple = (1.0, 1.0, 1.0)
+
+    @cached_property
+    def hull(self) -> Hull:
+        """Its convex hull; that of a stretched body is stretched, not computed again."""
+        if self.source is not None:
+            return self.source.hull.scaled(np.array(self.stretch))
+        return make_hull(self.surface)
+
+    def stretched(self, scale: Float[np.ndarray, "3"]) -> Body:
+        """Return a body of no part, stretched along its axes by positive factors."""
+        stretch = triple(scale)
+        return Body(self.surface.scaled(np.array(stretch)), source=self, stretch=stretch)
+
+
+def make_body(part: Part, *, is_target: bool) -> Body:
+    """Prepare a part's mesh.
+
+    Args:
+        part: With its mesh.
+        is_target: Whether the network is to find it.
+
+    Raises:
+        UserError: The part has no mesh, or one that cannot be rendered.
+    """
+    if part.mesh is None:
+        raise UserError(
+            f"part {part.name} without a mesh",
+            "parts that were read from a mesh file or built in",
+            "give the part's mesh file; a checkpoint's objects table holds no mesh",
+        )
+    return Body(make_surface(part.mesh), part if is_target else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +118,20 @@ class Hull:
         if not len(chosen):
             # A ball of thousands of faces rests on any of them, each rarely.
             chosen = np.flatnonzero(stable)
-        return normals[largest[chosen]], shares[chosen] / shares[chosen].sum()
+        shares = shares[chosen]
+        if not shares.any():
+            shares = np.ones(len(chosen))  # a flat sheet, whose centre lies in both of its faces
+        return normals[largest[chosen]], shares / shares.sum()
 
 
 def make_hull(surface: Surface) -> Hull:
     """Compute a surface's hull and centre of mass (milliseconds; do it once per part)."""
     used = surface.vertices[np.unique(surface.faces)]
-    hull = _convex_hull(used)
+    try:
+        hull = ConvexHull(used)
+    except QhullError:
+        # A flat or straight mesh has no volume; joggled by a rounding error, it has.
+        hull = ConvexHull(used, qhull_options="QJ")
     triangles = _outward(hull)
     closed = surface.vertices[surface.faces] if surface.closed else hull.points[triangles]
     kept, index = np.unique(triangles, return_inverse=True)
@@ -88,14 +141,6 @@ def make_hull(surface: Surface) -> Hull:
         facets=_facets(hull),
         centre=_centre_of_mass(closed),
     )
-
-
-def _convex_hull(points: Float[np.ndarray, "points 3"]) -> ConvexHull:
-    try:
-        return ConvexHull(points)
-    except QhullError:
-        # A flat or straight mesh has no volume; joggled by a rounding error, it has.
-        return ConvexHull(points, qhull_options="QJ")
 
 
 def _outward(hull: ConvexHull) -> Int[np.ndarray, "triangles 3"]:
@@ -154,51 +199,3 @@ def _solid_angles(corners: Float[np.ndarray, "triangles 3 3"]) -> Float[np.ndarr
     return np.asarray(
         2 * np.arctan2(volume, la * lb * lc + dot[0] * lc + dot[1] * la + dot[2] * lb)
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A surface that can be posed.
-
-    Attributes:
-        surface: Its geometry.
-        part: The part it is; None for what no network is to find.
-        source: The body it was stretched from.
-        stretch: By how much, along x, y and z.
-    """
-
-    surface: Surface
-    part: Part | None = None
-    source: Body | None = None
-    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-    @cached_property
-    def hull(self) -> Hull:
-        """Its convex hull; that of a stretched body is stretched, not computed again."""
-        if self.source is not None:
-            return self.source.hull.scaled(np.array(self.stretch))
-        return make_hull(self.surface)
-
-    def stretched(self, scale: Float[np.ndarray, "3"]) -> Body:
-        """Return a body of no part, stretched along its axes by positive factors."""
-        x, y, z = (float(factor) for factor in scale)
-        return Body(self.surface.scaled(np.array((x, y, z))), source=self, stretch=(x, y, z))
-
-
-def make_body(part: Part, *, is_target: bool) -> Body:
-    """Prepare a part's mesh.
-
-    Args:
-        part: With its mesh.
-        is_target: Whether the network is to find it.
-
-    Raises:
-        UserError: The part has no mesh, or one that cannot be rendered.
-    """
-    if part.mesh is None:
-        raise UserError(
-            f"part {part.name} without a mesh",
-            "parts that were read from a mesh file or built in",
-            "give the part's mesh file; a checkpoint's objects table holds no mesh",
-        )
-    return Body(make_surface(part.mesh), part if is_target else None)

@@ -9,12 +9,20 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.parts.part import Mesh, Part
-from dopepp.virtual.presets.distractors import Distractors
-from dopepp.virtual.presets.lighting import Lighting, black_body_rgb
-from dopepp.virtual.presets.materials import Materials
-from dopepp.virtual.presets.table import Table
-from dopepp.virtual.surface import Surface, make_surface
+from dopepp.parts.part import Mesh
+from dopepp.virtual import (
+    DistancePlacement,
+    Distractors,
+    FacingTurning,
+    FillPlacement,
+    Lighting,
+    Materials,
+    OffsetPlacement,
+    Surface,
+    Table,
+    make_surface,
+)
+from dopepp.virtual.presets.lighting import black_body_rgb
 
 
 def planck_rgb(temperature: float) -> np.ndarray:
@@ -72,18 +80,10 @@ def test_lights_stand_above_their_plane() -> None:
     assert counts == {1, 2, 3}
 
 
-@pytest.fixture(scope="module")
-def plain(box_part: Part) -> Surface:
-    assert box_part.mesh is not None
-    return make_surface(box_part.mesh)
-
-
-def test_materials_keep_to_their_ranges_and_shares(plain: Surface) -> None:
-    ranges, rng = (
-        Materials(metal_share=0.3, brushed_share=0.5, print_share=0.6),
-        np.random.default_rng(0),
-    )
-    drawn = [ranges.draw(rng, plain) for _ in range(3000)]
+def test_materials_keep_to_their_ranges_and_shares(box_surface: Surface) -> None:
+    ranges = Materials(metal_share=0.3, brushed_share=0.5, print_share=0.6)
+    rng = np.random.default_rng(0)
+    drawn = [ranges.draw(rng, box_surface) for _ in range(3000)]
     metals = [m for m in drawn if m.metallic]
     plastics = [m for m in drawn if not m.metallic]
     assert len(metals) / 3000 == pytest.approx(0.3, abs=0.03)
@@ -105,11 +105,9 @@ def test_materials_keep_to_their_ranges_and_shares(plain: Surface) -> None:
     assert np.mean([axis == (0, 0, 1) for axis in axes]) == pytest.approx(7 / 9, abs=0.05)
 
 
-def test_textured_surfaces_keep_their_colours() -> None:
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], float)
-    texture = np.full((4, 4, 3), 99, np.uint8)
-    mesh = Mesh(corners, np.array([[0, 1, 2]], np.int32), corners[:, :2] * 10, texture)
-    surface, rng = make_surface(mesh), np.random.default_rng(0)
+def test_textured_surfaces_keep_their_colours(sheet: Callable[..., Mesh]) -> None:
+    surface = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
+    rng = np.random.default_rng(0)
     for _ in range(100):
         material = Materials(metal_share=1.0).draw(rng, surface)
         assert material.colour[0] == material.colour[1] == material.colour[2]
@@ -142,8 +140,17 @@ def test_textured_surfaces_keep_their_colours() -> None:
         lambda: Table(elevation_deg=(0.0, 90.0)),
         lambda: Table(heaped=1),  # type: ignore[arg-type]
         lambda: replace(Table(), tilt_deg=(10**400, 1)),
+        lambda: FillPlacement(0.9, 0.6),
+        lambda: FillPlacement(0.0, 0.6),
+        lambda: FillPlacement(smallest=True),
+        lambda: DistancePlacement(1.0, 0.5),
+        lambda: DistancePlacement(margin=0.6),
+        lambda: DistancePlacement(nearest=float("nan")),
+        lambda: OffsetPlacement(distance=0.1, axial=0.1),
+        lambda: OffsetPlacement(distance=float("inf")),
+        lambda: FacingTurning(tilt_deg=-1),
     ],
 )
-def test_wrong_looks_are_refused(make: Callable[[], object]) -> None:
-    with pytest.raises(UserError, match=r"allowed: .*fix: change"):
+def test_wrong_ranges_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(UserError, match=r"allowed: .*fix: (change|move)"):
         make()

@@ -49,6 +49,10 @@ def box_at(x: float, y: float, height: float, extents: tuple[float, float, float
     return SceneObject(surface, make_transform(rotation, on_plane(x, y, height + extents[2] / 2)))
 
 
+def drawn(scene: Scene) -> Rendered:
+    return render(replace(scene, plane=PLANE))
+
+
 def brightness(rendered: Rendered, point: np.ndarray) -> float:
     u, v = np.round(project(point, rendered.scene.K)).astype(int)
     assert rendered.instances[v, u] == -1
@@ -73,8 +77,8 @@ def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of: MakeScene) 
 
 def test_depth_is_right_around_objects(scene_of: MakeScene) -> None:
     item = box_at(0, 0, 0.0, (0.1, 0.1, 0.05))
-    bare = render(replace(scene_of(**IMAGE), plane=PLANE))
-    rendered = render(replace(scene_of(item, **IMAGE), plane=PLANE))
+    bare = drawn(scene_of(**IMAGE))
+    rendered = drawn(scene_of(item, **IMAGE))
     empty = rendered.instances < 0
     np.testing.assert_array_equal(rendered.depth[empty], bare.depth[empty])
     assert (rendered.depth[~empty] < bare.depth[~empty]).all()
@@ -107,7 +111,7 @@ def test_a_shadow_lies_where_the_light_is_blocked(scene_of: MakeScene, which: in
     weak = Light((0.0, 0.0, 0.0), (1e-4, 1e-4, 1e-4))
     lights = [Light(tuple(lamp), (1, 1, 1), 0.6), weak]
     scene = scene_of(item, lights=tuple(lights[:: 1 - 2 * which]), ambient=DARK, **IMAGE)
-    rendered = render(replace(scene, plane=PLANE))
+    rendered = drawn(scene)
     # Similar triangles: the ray through the box's centre goes on by 0.105/(0.5 − 0.105).
     stretch = 0.105 / (0.5 - 0.105)
     middle = on_plane(0.4 * stretch, -0.1 * stretch, 0)
@@ -125,9 +129,7 @@ def test_a_lamp_adds_to_what_is_left(scene_of: MakeScene) -> None:
     item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
     lamps = [Light(tuple(on_plane(x, 0, 0.4)), (0.5, 0.5, 0.5), 0.5) for x in (-0.4, 0.4)]
     shift = 0.4 * 0.105 / (0.4 - 0.105)
-    rendered = render(
-        replace(scene_of(item, lights=tuple(lamps), ambient=DARK, **IMAGE), plane=PLANE)
-    )
+    rendered = drawn(scene_of(item, lights=tuple(lamps), ambient=DARK, **IMAGE))
     near, far = 0.4 - shift, 0.4 + shift
     share = (near**2 + 0.16) ** -1.5 / ((near**2 + 0.16) ** -1.5 + (far**2 + 0.16) ** -1.5)
     linear = ((90 / 255 + 0.055) / 1.055) ** 2.4 * share
@@ -141,7 +143,7 @@ def test_contact_darkens_the_sky_more_the_nearer(scene_of: MakeScene) -> None:
     item = box_at(0, 0.05, 0, (0.3, 0.02, 0.05))
     sky = Ambient(tuple(NORMAL), (0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
     scene = scene_of(item, lights=(), ambient=sky, size=(640, 480), focal=640.0)
-    rendered = render(replace(scene, plane=PLANE))
+    rendered = drawn(scene)
     light = []
     for d in (0.012, 0.025, 0.05):
         code = brightness(rendered, on_plane(0, 0.04 - d, 0)) / 90
@@ -153,7 +155,7 @@ def test_contact_darkens_the_sky_more_the_nearer(scene_of: MakeScene) -> None:
 def test_far_from_objects_the_picture_is_untouched(scene_of: MakeScene) -> None:
     item = box_at(0, 0, 0, (0.02, 0.02, 0.02))
     scene = scene_of(item, lights=(Light(tuple(on_plane(0, 0, 1.0))),), **IMAGE)
-    rendered = render(replace(scene, plane=PLANE))
+    rendered = drawn(scene)
     assert (rendered.image[:60] == 90).all()
     assert (rendered.image[-60:] == 90).all()
     assert rendered.image.min() < 85
@@ -166,9 +168,9 @@ def test_odd_lights_and_places_do_no_harm(scene_of: MakeScene) -> None:
         (0.0, 0.0, 0.0), (0.0, 0.0, -1.0),
     ):  # fmt: skip
         scene = scene_of(tall, lights=(Light(tuple(position)),), **IMAGE)
-        rendered = render(replace(scene, plane=PLANE))
+        rendered = drawn(scene)
         assert np.isfinite(rendered.depth).all()
         assert rendered.image.max() <= 255
     turned = rotation_vector_to_matrix(np.array([0.0, 0.0, 1.0]))
     under = SceneObject(tall.surface, make_transform(turned, np.array([0, 0, -0.3])))
-    assert render(replace(scene_of(under, **IMAGE), plane=PLANE)).visible_fractions[0] == 0
+    assert drawn(scene_of(under, **IMAGE)).visible_fractions[0] == 0

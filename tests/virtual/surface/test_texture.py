@@ -16,7 +16,7 @@ from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Ambient, Material, Scene, SceneObject, Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
-from dopepp.virtual.renderers.raster.texture import Texture, make_texture
+from dopepp.virtual.surface.texture import make_texture
 
 MakeScene = Callable[..., Scene]
 SIDE = 0.3
@@ -31,12 +31,6 @@ def linear(codes: np.ndarray) -> np.ndarray:
 def encoded(light: np.ndarray) -> np.ndarray:
     curve = 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055
     return 255 * np.where(light <= 0.0031308, 12.92 * light, curve)
-
-
-def sheet(texture: np.ndarray) -> Mesh:
-    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], float)
-    uv = (corners[:, :2] + 1) / 2
-    return Mesh(corners * SIDE / 2, np.array([(0, 1, 2), (0, 2, 3)], np.int32), uv, texture)
 
 
 def supersampled(texture: np.ndarray, pose: np.ndarray, scene: Scene, n: int = 12) -> np.ndarray:
@@ -63,14 +57,14 @@ def unfiltered(surface: Surface) -> Surface:
 
 @pytest.mark.parametrize(("angle", "distance"), [(0, 0.8), (55, 0.6), (75, 0.5), (82, 0.8)])
 def test_a_fine_checker_matches_supersampling(
-    scene_of: MakeScene, angle: float, distance: float
+    scene_of: MakeScene, sheet: Callable[..., Mesh], angle: float, distance: float
 ) -> None:
     tiles = np.indices((80, 80)).sum(axis=0) % 2
     texture = (np.kron(tiles, np.ones((3, 3)))[..., None].repeat(3, -1) * 200 + 30).astype(np.uint8)
     tilt = rotation_vector_to_matrix(np.array([np.radians(angle), 0, 0]))
     turn = rotation_vector_to_matrix(np.array([0, 0, 0.3]))
     pose = make_transform(tilt @ turn @ FACING, np.array([0, 0, distance]))
-    item = SceneObject(make_surface(sheet(texture)), pose, Material((1, 1, 1), 1.0, 0.0))
+    item = SceneObject(make_surface(sheet(SIDE, texture)), pose, Material((1, 1, 1), 1.0, 0.0))
     scene = scene_of(item, lights=(), ambient=DIM)
     expected = encoded(0.4 * supersampled(texture, pose, scene))
     known = np.isfinite(expected)
@@ -91,12 +85,8 @@ def test_ycb_models_match_supersampling(ycb_root: Path, name: str, distance: flo
     assert part.mesh is not None
     surface = make_surface(part.mesh)
     # One side is seen at a grazing angle.
-    pose = make_transform(
-        rotation_vector_to_matrix(np.array([0, 0, 0.4])) @ rotation_vector_to_matrix(
-            np.array([1.8, 0.4, 0.2])
-        ),
-        np.array([0, 0, distance]),
-    )  # fmt: skip
+    turn, tilt = (rotation_vector_to_matrix(np.array(v)) for v in ((0, 0, 0.4), (1.8, 0.4, 0.2)))
+    pose = make_transform(turn @ tilt, np.array([0, 0, distance]))
     K = np.array([[400.0, 0, 79.5], [0, 400.0, 79.5], [0, 0, 1]])
     errors = []
     for candidate in (surface, unfiltered(surface)):
@@ -115,11 +105,11 @@ def test_ycb_models_match_supersampling(ycb_root: Path, name: str, distance: flo
     assert errors[0] < 0.6 * errors[1]
 
 
-def test_unused_texels_leave_no_seams(scene_of: MakeScene) -> None:
+def test_unused_texels_leave_no_seams(scene_of: MakeScene, sheet: Callable[..., Mesh]) -> None:
     # Only the left half of the texture is used; the rest is of a colour that nobody should see.
     texture = np.full((128, 128, 3), (120, 120, 120), np.uint8)
     texture[:, 64:] = (255, 0, 255)
-    mesh = sheet(texture)
+    mesh = sheet(SIDE, texture)
     assert mesh.uv is not None
     mesh = replace(mesh, uv=mesh.uv * (0.5, 1.0))
     item = SceneObject(
@@ -136,7 +126,6 @@ def test_the_coarsest_level_is_the_mean_light(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
     uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     texture = make_texture(image, uv, np.array([(0, 1, 2), (0, 2, 3)], np.int32))
-    assert isinstance(texture, Texture)
     assert texture.images[-1].shape == (1, 1, 3)
     np.testing.assert_array_equal(texture.images[0], image)
     expected = encoded(linear(image.astype(float)).mean(axis=(0, 1)))

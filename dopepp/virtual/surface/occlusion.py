@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.light import lit_share
-from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, project_vertices, rasterise
+from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
 _DIRECTIONS: Final = (24, 256)
 """Fewest and most directions a mesh is drawn from."""
@@ -74,11 +73,8 @@ def bake_open_sky(
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
     if _hides_nothing(vertices, faces, flat, closed):
-        return OpenSky(
-            np.ones(len(faces), np.int32),
-            np.zeros(len(faces), np.int64),
-            np.ones((2, 3), np.float32),
-        )
+        steps, firsts = np.ones(len(faces), np.int32), np.zeros(len(faces), np.int64)
+        return OpenSky(steps, firsts, np.ones((2, 3), np.float32))
     used = corners.reshape(-1, 3)
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = math.sqrt(float(((used - centre) ** 2).sum(axis=1).max()))
@@ -124,22 +120,13 @@ def _is_convex(vertices: Array, faces: Array, flat: Array, both: bool, slack: fl
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
     """Choose every triangle's steps so that the points are few and evenly spaced."""
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
-    low, high = _FINEST * size, size
-    most = 3 * len(corners) + _EXTRA_POINTS
-
-    def steps_at(spacing: float) -> Array:
-        steps = np.ceil(longest / spacing).clip(1, round(1 / _FINEST))
-        return np.asarray(steps.astype(np.int32))
-
-    def count(steps: Array) -> int:
-        return int(((steps.astype(np.int64) + 1) * (steps + 2) // 2).sum())
-
-    for _ in range(12):
-        if count(steps_at(low)) <= most:
+    spacing, most = _FINEST * size, 3 * len(corners) + _EXTRA_POINTS
+    for _ in range(13):
+        steps = np.ceil(longest / spacing).clip(1, round(1 / _FINEST)).astype(np.int32)
+        sizes = (steps.astype(np.int64) + 1) * (steps + 2) // 2
+        if sizes.sum() <= most:
             break
-        low = min(low * 1.3, high)
-    steps = steps_at(low)
-    sizes = (steps.astype(np.int64) + 1) * (steps + 2) // 2
+        spacing = min(spacing * 1.3, size)
     firsts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     return steps, firsts, int(sizes.sum())
 
@@ -181,20 +168,10 @@ def _spread(
 
 @compiled()
 def _bake(
-    vertices: Array,
-    faces: Array,
-    closed: bool,
-    centre: Array,
-    radius: float,
-    directions: Array,
-    side: int,
-    samples: Array,
-    points: Array,
-    upright: Array,
-    flat: Array,
-    ground: Array,
+    vertices: Array, faces: Array, closed: bool, centre: Array, radius: float, directions: Array,
+    side: int, samples: Array, points: Array, upright: Array, flat: Array, ground: Array,
     sums: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Sum the open and all of the cosine over directions, for front and back sides.
 
     Args:

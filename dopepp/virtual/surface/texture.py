@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.fragments import edge_functions
-from dopepp.virtual.renderers.raster.light import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
-from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
 _MOST_PROBES: Final = 16
 """Along a footprint's longer axis; beyond this stretch a texture blurs."""
@@ -167,18 +166,9 @@ def _bilinear(
 
 @compiled(fastmath=True)
 def sample_texture(
-    face: Array,
-    share: Array,
-    x: Array,
-    y: Array,
-    hom: Array,
-    faces: Array,
-    uv: Array,
-    texels: Array,
-    levels: Array,
-    decode: Array,
-    out: Array,
-) -> None:
+    face: Array, share: Array, x: Array, y: Array, hom: Array, faces: Array, uv: Array,
+    texels: Array, levels: Array, decode: Array, out: Array,
+) -> None:  # fmt: skip
     """Look up the texture at an object's fragments, filtered over a pixel.
 
     Args:
