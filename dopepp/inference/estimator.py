@@ -171,12 +171,7 @@ def letterboxed(
     image: UInt8[np.ndarray, "height width 3"], letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
-    size = (letterbox.width, letterbox.height)
-    if size != (image.shape[1], image.shape[0]):
-        shrinks = letterbox.scale_x < 1
-        image = cv2.resize(
-            image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        )
+    image = letterbox.image(image)
     rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
 

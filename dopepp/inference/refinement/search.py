@@ -33,6 +33,9 @@ HIDDEN: Final = 0.5
 PENALTY: Final = 0.03
 """Share of the points that a shift by one standard deviation of the prior must gain."""
 
+LEAST_POINTS: Final = 20
+"""Points that must find their depth."""
+
 
 def best_shift(
     view: DepthView,
@@ -61,10 +64,6 @@ def best_shift(
         view.depth, view.K, chosen, information, moved, step, view.noise, half, tolerance, shift
     )
     return shift if agreeing >= LEAST_POINTS else None
-
-
-LEAST_POINTS: Final = 20
-"""Points that must find their depth."""
 
 
 @compiled()
