@@ -52,7 +52,9 @@ class PoseEstimator:
         device: str | torch.device = "cpu",
         refine: str | None = None,
     ) -> None:
-        self.refiner = _refiner(refine, checkpoint.parts)
+        if refine not in (None, "depth"):
+            raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
+        self.refiner = None if refine is None else DepthRefiner(checkpoint.parts)
         self.device = torch.device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.checkpoint = checkpoint
@@ -203,15 +205,6 @@ def _checked_distortion(
             "pass the camera's calibration, or None for an undistorted image",
         )
     return coefficients
-
-
-def _refiner(refine: str | None, parts: Sequence[Part]) -> DepthRefiner | None:
-    """Make what refines poses, by its name."""
-    if refine is None:
-        return None
-    if refine != "depth":
-        raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
-    return DepthRefiner(parts)
 
 
 def _refined(

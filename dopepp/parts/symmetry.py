@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.geometry.symmetry import ContinuousSymmetry, exact_group
+from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
 from dopepp.parts.mesh.measure import SurfaceTree, largest_distance
 from dopepp.parts.part import Mesh
 from dopepp.parts.symmetry_candidates import Candidates, turn
@@ -31,9 +31,6 @@ MAX_ORDER: Final = 12
 
 _PRIMES: Final = (11, 7, 5, 3, 2)
 """Every axis of up to twelve turns has one of these. The largest first: it finds round shapes."""
-
-_SAME: Final = np.radians(10.0)
-"""Rotations closer than this are one: a third of a 12-fold axis' step."""
 
 _NUM_ANGLES: Final = 36
 """Turns that tell a round shape, spread over all angles by the golden ratio, so that they hit the
@@ -147,7 +144,7 @@ def _search(
         for axis in candidates.axes(prime):
             rotation = turn(axis, 2 * np.pi / prime)
             away = rotation_angle(rotation @ np.swapaxes(group, 1, 2)).min()
-            if away <= _SAME or not shape.fits(rotation):
+            if away <= SAME_TURN or not shape.fits(rotation):
                 continue
             if shape.is_round(axis):
                 return _signed(axis), []

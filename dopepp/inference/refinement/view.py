@@ -254,18 +254,10 @@ def _offsets(
     limit: float,
     offset: Array,
 ) -> None:
-    """Compare a view with the planes of its pixels' nearest points.
+    """Fill ``offset``: each pixel's depth less that of its nearest point's plane, metres.
 
-    Args:
-        depth: Metres, shape (H, W).
-        rays: Of its pixels, shape (H, W, 3).
-        distance: To the nearest points, shape (H, W).
-        nearest: Which these are, shape (H, W).
-        points: Camera frame, metres, shape (N, 3).
-        normals: Camera frame, shape (N, 3).
-        farthest: Distance beyond which nothing is compared.
-        limit: A plane's depth differs from its point's by no more, metres.
-        offset: The result, metres, NaN where nothing is compared, shape (H, W).
+    It is NaN where the nearest point is beyond ``farthest``. A plane's depth differs from its
+    point's by no more than ``limit``.
     """
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
