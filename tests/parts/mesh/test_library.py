@@ -37,10 +37,10 @@ def obj(faces: str, before: str = "") -> str:
 HEXAGON = "v 2 0 0\nv 1 2 0\nv -1 2 0\nv -2 0 0\nv -1 -2 0\nv 1 -2 0\nvt 0 0\n"
 
 
-def ply_faces(*faces: list[int], form: str = "<", lists: str = "B{}i") -> bytes:
+def ply_faces(*faces: list[int]) -> bytes:
     header = export_ply(BOX).split(b"end_header")[0]
     header = re.sub(rb"element face \d+", b"element face %d" % len(faces), header)
-    rows = [struct.pack(form + lists.format(len(face)), len(face), *face) for face in faces]
+    rows = [struct.pack(f"<B{len(face)}i", len(face), *face) for face in faces]
     return header + b"end_header\n" + BOX.vertices.astype("<f4").tobytes() + b"".join(rows)
 
 
@@ -62,7 +62,6 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
     "zero.obj": (obj("f 0 2 3\n"), 1, "index 0 among 4"),
     "outside.obj": (obj("f 1 2 3\nf 1 2 5\n"), -1, "index 5 among 4"),
     "tab.obj": (obj("f 1 2 3\nf\t1 3 4\n"), 1, 2),
-    "relative.obj": (obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n", 2, 2),
     "hexagon.obj": (HEXAGON + "f 1/1 2/1 3/1\nf 1 2 3 4 5 6\n", 2, 5),
     "library.obj": (obj("usemtl m\nf 1/1 2/2 3/1\n", "mtllib gone.mtl\n"), 1, "does not exist"),
     "cut.stl": (export_stl_ascii(BOX) + export_stl_ascii(BOX)[:900], 12, "begun and 12 ended"),
@@ -88,14 +87,8 @@ def test_what_trimesh_makes_of_it(write: Write, refused: Refused, name: str) -> 
         assert len(read_mesh(path, "cm").faces) == ours
 
 
-def test_trimesh_reads_garbage_where_the_sizes_of_polygons_agree(write: Write) -> None:
-    path = write("a.ply", ply_faces(*PENTAGON_AND_TRIANGLE))
-    assert trimesh.load_mesh(path, process=False).faces.max() > 8
-    assert read_mesh(path, "mm").faces.max() < 8
-
-
 def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write: Write) -> None:
-    path = write("a.obj", WRONG["relative.obj"][0])
+    path = write("a.obj", obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n")
     theirs = trimesh.load_mesh(path, process=False)
     assert theirs.vertices[theirs.faces[0]].tolist() == [[1, 0, 0], [1, 1, 0], [0, 1, 0]]
     ours = read_mesh(path, "m")
@@ -262,87 +255,72 @@ def test_a_glb_texture_lies_as_that_of_an_obj_file(tmp_path: Path, write: Write)
     np.testing.assert_allclose(loaded.uv[loaded.faces], same.uv[same.faces], atol=1e-7)
 
 
-def set_info(**info: Any) -> Callable[[dict[str, Any]], object]:
+def info(**fields: Any) -> Callable[[dict[str, Any]], object]:
     def edit(header: dict[str, Any]) -> None:
-        header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] |= info
+        header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] |= fields
 
     return edit
 
 
-def set_array(name: str, **fields: Any) -> Callable[[dict[str, Any]], object]:
+def array(name: str, **fields: Any) -> Callable[[dict[str, Any]], object]:
     def edit(header: dict[str, Any]) -> None:
-        primitive = header["meshes"][0]["primitives"][0]
-        index = primitive["indices"] if name == "indices" else primitive["attributes"][name]
+        index = header["meshes"][0]["primitives"][0]["attributes"][name]
         header["accessors"][index] |= fields
 
     return edit
 
 
-def set_primitive(**fields: Any) -> Callable[[dict[str, Any]], object]:
-    return lambda header: header["meshes"][0]["primitives"][0].update(fields)
-
+SPARSE = {"count": 1, "indices": {}, "values": {}}
+MOVED = {"KHR_texture_transform": {"scale": [2, 2]}}
+TWICE = [{"children": [1]}, {"mesh": 0}, {"children": [1], "scale": [2, 2, 2]}]
 
 GLB_CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "a moved texture": (
-        set_info(extensions={"KHR_texture_transform": {"scale": [2, 2]}}),
-        "a texture with a transform",
-    ),
-    "other coordinates": (set_info(texCoord=1), "second texture coordinates"),
+    "a moved texture": (info(extensions=MOVED), "a texture with a transform"),
+    "other coordinates": (info(texCoord=1), "second texture coordinates"),
     "coordinates in bytes": (
-        set_array("TEXCOORD_0", componentType=5121, normalized=True),
+        array("TEXCOORD_0", componentType=5121, normalized=True),
         "coordinates that are floats",
     ),
-    "sparse positions": (
-        set_array("POSITION", sparse={"count": 1, "indices": {}, "values": {}}),
-        "compressed, sparse or left out",
+    "too few coordinates": (
+        array("TEXCOORD_0", count=3), "3 texture coordinates of 4 vertices"
     ),
-    "a fan": (set_primitive(mode=6), "a fan of triangles"),
+    "sparse positions": (array("POSITION", sparse=SPARSE), "compressed, sparse or left out"),
+    "a fan": (
+        lambda header: header["meshes"][0]["primitives"][0].update(mode=6), "a fan of triangles"
+    ),
     "a quantised mesh": (
         lambda header: header.update(extensionsRequired=["KHR_mesh_quantization"]),
         "the extension KHR_mesh_quantization",
     ),
     "a node in two places": (
-        lambda header: header.update(
-            nodes=[{"children": [1]}, {"mesh": 0}, {"children": [1], "scale": [2, 2, 2]}],
-            scenes=[{"nodes": [0, 2]}],
-        ),
+        lambda header: header.update(nodes=TWICE, scenes=[{"nodes": [0, 2]}]),
         "a node in two places",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", GLB_CASES)
-def test_what_trimesh_passes_over_in_a_glb_file_is_refused(write: Write, name: str) -> None:
+def test_what_trimesh_passes_over_in_a_glb_file_is_refused(
+    write: Write, refused: Refused, name: str
+) -> None:
     edit, message = GLB_CASES[name]
-    path = write("a.glb", edited(exported(textured_square(), "glb"), edit))
-    trimesh.load_scene(path)  # without a word
-    with pytest.raises(UserError, match=message) as caught:
-        read_mesh(path)
-    assert "\n" not in str(caught.value)
+    content = edited(exported(textured_square(), "glb"), edit)
+    trimesh.load_scene(write("a.glb", content))  # without a word
+    refused("a.glb", content, message)
 
 
-def test_texture_coordinates_must_be_as_many_as_vertices(write: Write) -> None:
-    content = edited(exported(textured_square(), "glb"), set_array("TEXCOORD_0", count=3))
-    with pytest.raises(UserError, match="3 texture coordinates of 4 vertices"):
-        read_mesh(write("a.glb", content))
-
-
-def test_one_texture_must_cover_a_glb_file(write: Write) -> None:
+def test_one_texture_must_cover_a_glb_file(refused: Refused) -> None:
     scene = trimesh.Scene([textured_square(), BOX])
-    with pytest.raises(UserError, match=r"faces of 2 textures; .* bake"):
-        read_mesh(write("a.glb", exported(scene, "glb")))
+    refused("a.glb", exported(scene, "glb"), r"faces of 2 textures; .* bake")
 
 
-def test_a_glb_file_without_its_data_is_cut_short(write: Write) -> None:
+def test_a_glb_file_without_its_data_is_cut_short(refused: Refused) -> None:
     content = exported(BOX, "glb")
     end = 20 + int.from_bytes(content[12:16], "little")
-    path = write("a.glb", content[:8] + struct.pack("<I", end) + content[12:end])
-    with pytest.raises(UserError, match=r"a\.glb with error: unpack_from"):
-        read_mesh(path)
+    nothing = content[:8] + struct.pack("<I", end) + content[12:end]
+    refused("a.glb", nothing, r"a\.glb with error: unpack_from")
     short = content[:end] + struct.pack("<I", 4) + b"BIN\0" + bytes(4)
-    path = write("b.glb", short[:8] + struct.pack("<I", len(short)) + short[12:])
-    with pytest.raises(UserError, match=r"b\.glb with"):
-        read_mesh(path)
+    refused("b.glb", short[:8] + struct.pack("<I", len(short)) + short[12:], r"b\.glb with")
 
 
 # 3MF
@@ -407,10 +385,9 @@ def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write: Write) -> None
     )
 
 
-def test_a_3mf_model_that_ends_too_early_is_refused(write: Write) -> None:
+def test_a_3mf_model_that_ends_too_early_is_refused(refused: Refused) -> None:
     content = exported(BOX, "3mf")
     size = len(repacked(content, lambda model: model))
     for length in range(500, size, 97):
-        path = write("a.3mf", repacked(content, lambda model, n=length: model[:n]))
-        with pytest.raises(UserError, match=r"a\.3mf with .*export the mesh again"):
-            read_mesh(path)
+        cut = repacked(content, lambda model, n=length: model[:n])
+        refused("a.3mf", cut, r"a\.3mf with .*export the mesh again")
