@@ -59,20 +59,6 @@ _NAMES: Final = {
 has ``bytearray`` and tensor classes, which allocate what a number says (case "a call that fills the
 memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set on a tensor")."""
 
-_CONSTANTS: Final = {
-    *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
-    *("BINUNICODE", "SHORT_BINSTRING", "GLOBAL"),
-}
-_PUT: Final = {"BINPUT", "LONG_BINPUT"}
-_GET: Final = {"BINGET", "LONG_BINGET"}
-_TUPLES: Final = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
-_OPERATIONS: Final = {
-    *(*_CONSTANTS, *_PUT, *_GET, *_TUPLES, "PROTO", "STOP", "MARK", "EMPTY_LIST", "EMPTY_DICT"),
-    *("EMPTY_TUPLE", "APPEND", "APPENDS", "SETITEM", "SETITEMS", "REDUCE", "BUILD", "BINPERSID"),
-}
-"""What ``torch.save`` writes; torch's own reader also makes sets, a byte each (case "a million
-sets")."""
-
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
     """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
@@ -276,16 +262,21 @@ def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
     num_tuples = 0
     for operation, argument, _ in pickletools.genops(stream):
         name = operation.name
-        num_tuples += name in _TUPLES
-        _check_operation(name, argument, num_tuples)
-        if name in _PUT:
-            memo[argument] = top
-            continue
+        num_tuples += name.startswith("TUPLE")
+        if num_tuples > _MAX_TUPLES:
+            raise ValueError(f"over {_MAX_TUPLES} tuples")
+        # torch only warns of "another protocol", and makes 200 bytes of one in "a million sets".
+        if (name == "PROTO" and argument != 2) or name == "EMPTY_SET":
+            raise ValueError(f"operation {name} {argument}")
+        if name == "GLOBAL" and argument not in _NAMES:
+            raise ValueError(f"the name {argument.replace(' ', '.')!r:.100}")
         if name == "BINPERSID":
             yield _storage_reference(top)
-        if name in _GET or name in _CONSTANTS:
+        if name in ("BINPUT", "LONG_BINPUT"):
+            memo[argument] = top
+        elif operation.stack_after and not operation.stack_before and name != "MARK":
             constant = _Name(argument) if name == "GLOBAL" else argument
-            top = memo[argument] if name in _GET else constant
+            top = memo[argument] if name in ("BINGET", "LONG_BINGET") else constant
             items.append(top)
         else:
             top = tuple(items) if name == "TUPLE" else None
@@ -298,15 +289,3 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
             if kind in _STORAGE_BYTES and key.isascii():
                 return kind, key, count
     raise ValueError("a reference to something that is no storage")
-
-
-def _check_operation(name: str, argument: Any, num_tuples: int) -> None:
-    """Refuse what no file of ``torch.save`` has."""
-    if name not in _OPERATIONS:
-        raise ValueError(f"operation {name}")
-    if name == "PROTO" and argument != 2:
-        raise ValueError(f"protocol {argument}")
-    if name == "GLOBAL" and argument not in _NAMES:
-        raise ValueError(f"the name {argument.replace(' ', '.')!r:.100}")
-    if num_tuples > _MAX_TUPLES:
-        raise ValueError(f"over {_MAX_TUPLES} tuples")
