@@ -21,9 +21,9 @@ from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.sources import build_datamodule, held_out_seed
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.evaluate import measure_and_record, tune_and_record
+from dopepp.experiment.reports.conditions import check_masks
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.reports.shading import check_masks
 from dopepp.experiment.runs import display, readme, record
 from dopepp.experiment.runs.images import describe_images
 from dopepp.experiment.runs.resume import ConfigDifference, check_resume, remember_overrides

@@ -1,11 +1,11 @@
-"""The same test images through every model (paper Fig. 14): truth green, predictions beside it.
+"""What a comparison of runs shows beside its table: test images and curves of training.
 
-What the runs logged while they trained, as lines to overlay (paper Fig. 12).
+The same test images go through every model (paper Fig. 14); what the runs logged while they trained
+becomes lines in one figure (paper Fig. 12).
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from dopepp.drawing.sheet import Tile
 from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.sources import build_test_source, held_out_seed
 from dopepp.experiment.config.chosen_data import chosen_data, trained_on
-from dopepp.experiment.reports.compare.entries import Entry
-from dopepp.experiment.reports.compare.runs import Run
+from dopepp.experiment.reports.entries import Entry, Run
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.inference.estimator import PoseEstimator
 
 LOG_FILE: Final = "metrics.csv"
@@ -57,11 +57,7 @@ def training_lines(
 
 def logged(path: Path, column: str) -> Series:
     """Return what a log holds in a column; empty where there is no such file or column."""
-    if not path.is_file():
-        return {}
-    with path.open(newline="", errors="replace") as stream:
-        rows = list(csv.DictReader(stream))
-    cells = ((_number(row.get("step")), _number(row.get(column))) for row in rows)
+    cells = ((_number(row.get("step")), _number(row.get(column))) for row in read_csv(path))
     return {int(step): value for step, value in cells if step is not None and value is not None}
 
 
