@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.experiment.build.hardware import num_processes
+from dopepp.experiment.config.run import TrainerConfig
 
 
 @pytest.fixture(autouse=True)
@@ -40,12 +40,12 @@ def test_how_many_processes_there_will_be(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
-    assert num_processes(options) == count
+    assert TrainerConfig(max_epochs=1, **options).num_processes == count
 
 
 def test_processes_that_torchrun_has_started_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert num_processes({"devices": 1}) == 2
+    assert TrainerConfig(max_epochs=1, devices=1).num_processes == 2
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_processes_that_torchrun_has_started_count_too(monkeypatch: pytest.Monke
 )  # fmt: skip
 def test_a_number_that_means_nothing_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(UserError, match=r"trainer\.(devices|num_nodes)="):
-        num_processes(options)
+        _ = TrainerConfig(max_epochs=1, **options).num_processes
 
 
 def test_a_runs_failure_is_one_line() -> None:

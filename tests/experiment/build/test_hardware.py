@@ -1,18 +1,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
 
 import pytest
 import torch
 
 from dopepp.experiment.build import hardware
 from dopepp.experiment.build.hardware import choose_precision, estimate_training_s
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system
+from dopepp.experiment.config.run import RunConfig
 
-Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 
 
 @pytest.mark.parametrize("accelerator", ["cpu", "cuda", "mps"])
@@ -43,14 +43,15 @@ def test_other_accelerators_are_not_guessed_at() -> None:
     assert choose_precision("auto", "mps")[0] == "32-true"
 
 
-def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Composer) -> None:
+def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Parser) -> None:
     config = tiny("model.backbone.batch_norm=true")
-    parts = build_parts(config["data"])
-    module, system = build_datamodule(config["data"], parts, 0), build_system(config, parts, "")
+    parts = build_parts(config.data)
+    module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
     before = {name: value.clone() for name, value in system.network.state_dict().items()}
-    trainer = {**config["trainer"], "max_epochs": 1000, "max_steps": -1}
+    trainer = replace(config.trainer, max_epochs=1000, max_steps=-1)
     long = estimate_training_s(system.network, module, trainer, "32-true")
-    short = estimate_training_s(system.network, module, {**trainer, "max_steps": 2}, "32-true")
+    trainer = replace(trainer, max_steps=2)
+    short = estimate_training_s(system.network, module, trainer, "32-true")
     assert 0 < short < long
     assert system.network.training
     for name, value in system.network.state_dict().items():

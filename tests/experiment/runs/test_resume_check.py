@@ -14,6 +14,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.images import describe_images, differing_images
 from dopepp.experiment.runs.resume import (
@@ -25,7 +26,7 @@ from dopepp.experiment.runs.resume import (
 )
 from dopepp.models.checkpoint.schema import Checkpoint
 
-Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 
 
 class Pictures:
@@ -72,11 +73,11 @@ def test_a_description_of_images_tells_what_is_another() -> None:
 
 
 @pytest.fixture
-def resumed(tiny: Composer, tmp_path: Path) -> Callable[..., list[str]]:
+def resumed(tiny: Parser, tmp_path: Path) -> Callable[..., list[str]]:
     """Resume a run with these overrides and say which differences are accepted."""
     (tmp_path / "run").mkdir()
     started = tiny()
-    record.write_config(tmp_path / "run", started)
+    record.write_config(tmp_path / "run", started.plain)
     images = {split: describe_images(Pictures()) for split in ("train", "val", "test")}
 
     def go_on(*overrides: str, spec: str = "a", **splits: Pictures) -> list[str]:
