@@ -158,15 +158,7 @@ class RehearsedEstimator(PoseEstimator):
 
 
 def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
-    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times.
-
-    Args:
-        config: The whole config.
-        run_dir: Folder that everything is written to.
-
-    Raises:
-        UserError: A choice is wrong.
-    """
+    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times."""
     torch.manual_seed(config.seed)
     has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
     parts = build_parts(config.data)
@@ -212,13 +204,13 @@ def time_frames(
     num_frames: int,
     seed: int,
 ) -> FrameTimes:
-    """Time frames from picture to poses.
+    """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
 
     Args:
         estimator: With any weights.
         samples: Pictures with their truth, taken in turn.
         geometry: Of the maps that a trained network would answer.
-        num_frames: Timed frames, after :data:`WARM_UP` that are not.
+        num_frames: How many are timed.
         seed: Of the maps' noise.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -241,13 +233,9 @@ def likely_maps(
     geometry: MapGeometry,
     generator: torch.Generator,
 ) -> Maps:
-    """Return the maps that a trained network would answer: a picture's true ones, with noise.
+    """Return the maps that a trained network would answer to a picture: the true ones, with noise.
 
-    Args:
-        sample: The picture with its truth, at its own resolution.
-        estimator: Whose input they are for, and on whose device they are put.
-        geometry: Stride, peak width and disc radius.
-        generator: Of the noise.
+    They are those of the estimator's input, and on its device.
     """
     size = estimator.checkpoint.input_size
     letterbox = Letterbox.fit(sample.size, size)
@@ -273,13 +261,9 @@ def read_frames(path: Path) -> FrameTimes:
 
 
 def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
-    """Draw frames a second over time, two curves per network (paper Fig. 13).
+    """Draw frames a second over time into a PNG, two curves per network (paper Fig. 13).
 
-    From picture to poses, and dashed what the network alone would reach.
-
-    Args:
-        path: The PNG.
-        frames: Times of each frame, by name.
+    One is from picture to poses, the dashed one what the network alone would reach.
     """
     lines = [
         PlotLine(

@@ -135,18 +135,7 @@ def tune_and_record(
     run_dir: Path,
     target: FalsePositiveTarget,
 ) -> Path:
-    """Tune a checkpoint, write the tuned one beside it and say what came of it.
-
-    Args:
-        estimator: Of the checkpoint.
-        path: The checkpoint.
-        parts: The objects as the data have them.
-        data: Where the images are from.
-        run_dir: Folder that ``tuning.json`` is written to.
-        target: Demanded where no object is.
-
-    Returns:
-        The tuned checkpoint.
+    """Tune a checkpoint, write the tuned one beside it, say what came of it; returns its path.
 
     Raises:
         UserError: Validation images teach nothing, see :func:`~dopepp.experiment.tuning.tune`.
@@ -201,13 +190,10 @@ def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part
 
 
 def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
-    """Measure a checkpoint, a file of another method's poses, or both, on a test set.
+    """Parse ``evaluate.py``'s composed config and measure what it names on a test set.
 
-    The test set is the checkpoint's own one or another one.
-
-    Args:
-        config: ``evaluate.py``'s composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
+    That is a checkpoint, a file of another method's poses, or both; the test set is the
+    checkpoint's own one or another one.
 
     Raises:
         UserError: A checkpoint, an option, a file or the data are wrong.

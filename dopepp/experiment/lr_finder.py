@@ -33,10 +33,6 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
 
     The chosen optimiser with its other settings; no schedule, no validation, no checkpoint.
 
-    Args:
-        config: The whole config.
-        run_dir: Folder that everything is written to.
-
     Raises:
         UserError: A choice is wrong.
         RunError: The loss is not finite from the start.

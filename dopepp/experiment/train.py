@@ -54,14 +54,10 @@ QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickst
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
-    """Do what ``train.py``'s config names under ``job``.
-
-    Args:
-        config: The composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
+    """Parse ``train.py``'s composed config and do the job that it names.
 
     Raises:
-        UserError: There is no such job, or it refuses the config.
+        UserError: An option is wrong.
     """
     parsed = RunConfig.of(config)
     if parsed.table is not None:
@@ -85,10 +81,6 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
 
 def train(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
-
-    Args:
-        config: The whole config.
-        run_dir: Folder that everything is written to.
 
     Raises:
         UserError: A choice, a file or an option is wrong.

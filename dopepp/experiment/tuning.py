@@ -126,12 +126,6 @@ def tune(
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
-    Args:
-        estimator: The trained network.
-        data: The data config.
-        parts: The objects as the data have them.
-        target: Demanded where no object is.
-
     Raises:
         UserError: The network finds nothing, or everything it finds is right or wrong.
     """

@@ -86,10 +86,7 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
 def build_datamodule(data: DataConfig, parts: Sequence[Part], seed: int) -> PoseDataModule:
     """Build training, validation and test data and say in one line where real frames are missing.
 
-    Args:
-        data: What they are.
-        parts: The objects to learn.
-        seed: Of the training images; the others have ``data.eval_seed``.
+    The seed is that of the training images; the others have ``data.eval_seed``.
 
     Raises:
         UserError: An option or a file is wrong.

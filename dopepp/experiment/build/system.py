@@ -39,11 +39,7 @@ def build_system(
 ) -> PoseSystem:
     """Build the network, its loss and its optimiser as the config names them.
 
-    Args:
-        config: The whole config.
-        parts: The objects.
-        fingerprint: Of the data, for the checkpoint.
-        images: What the images are, by split, for the checkpoint.
+    Fingerprint and description of the data's images, by split, are kept in the checkpoint.
     """
     network, description = build_untrained(config, parts)
     description = replace(
@@ -89,15 +85,9 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
     }
     network = build_network(spec)
     sigma = config.maps.sigma
-    return network, Checkpoint(
-        spec=spec,
-        state_dict={},
-        parts=parts,
-        input_size=config.data.input_size,
-        stride=network.stride,
-        sigma=sigma,
-        recovery=vars(parse_recovery({"sigma": sigma, **config.recovery})),
-    )
+    recovery = vars(parse_recovery({"sigma": sigma, **config.recovery}))
+    size = config.data.input_size
+    return network, Checkpoint(spec, {}, parts, size, network.stride, sigma, recovery)
 
 
 def map_geometry(maps: MapsConfig, stride: int) -> MapGeometry:
@@ -124,23 +114,18 @@ def build_trainer(
     further: Sequence[Callback] = (),
     trackers: Sequence[Logger] = (),
 ) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks.
+    """Build Lightning's trainer with the config's callbacks and further ones.
 
-    Args:
-        config: The whole config.
-        run_dir: Folder that everything is written to.
-        further: Callbacks besides the config's.
-        trackers: Loggers besides the CSV table that is always on.
+    Trackers are loggers besides the CSV table that is always on.
 
     Raises:
         UserError: A callback is wrong, or Lightning refuses an option.
     """
-    options = config.trainer
-    accelerator = options.accelerator
-    if accelerator == "auto":
-        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
-    elif accelerator == "gpu" and torch.cuda.is_available():
+    options, accelerator = config.trainer, config.trainer.accelerator
+    if accelerator in ("auto", "gpu") and torch.cuda.is_available():
         accelerator = "cuda"
+    elif accelerator == "auto":
+        accelerator = "cpu"
     precision, reason = choose_precision(options.precision, accelerator)
     display.console.print(f"precision {precision}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config.callbacks.values()]

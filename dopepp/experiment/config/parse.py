@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import (
     Annotated,
     Any,
@@ -81,9 +81,10 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     if origin is Annotated:
         bounds = arguments[1]
         check = check_integer if arguments[0] is int else check_number
-        return check(name, value, bounds.lowest, bounds.highest)
-    if origin in (Union, UnionType):  # the former where one of them is Annotated
-        return _one_of(arguments, value, name)
+        check(name, value, bounds.lowest, bounds.highest)
+        return value  # as it was written: 1 stays an integer where any number is allowed
+    if origin in (Union, UnionType):  # X | None
+        return None if value is None else _value(arguments[0], value, name)
     if origin is Literal:
         if value not in arguments:
             raise UserError(f"{name}={value!r:.100}", ", ".join(arguments), "choose one of them")
@@ -101,26 +102,17 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     return value if hint is Any else _plain(hint, value, name)
 
 
-def _one_of(hints: Sequence[Any], value: Any, name: str) -> Any:
-    """Return a value that may be of several types; it is the last one's mistake if of none."""
-    if value is None and NoneType in hints:
-        return None
-    others = [hint for hint in hints if hint is not NoneType]
-    fitting = [hint for hint in others if isinstance(hint, type) and type(value) is hint]
-    return _value((fitting or others[-1:])[0], value, name)
-
-
-def _plain(kind: type[Any], value: object, name: str) -> Any:
+def _plain(kind: type[Any], value: Any, name: str) -> Any:
     """Return text, a path, a flag or a number without bounds."""
     if kind is bool:
         return check_flag(name, value)
-    if kind is Path and isinstance(value, str):
+    if kind is float and type(value) in (int, float) and math.isfinite(value):
+        return value
+    if kind is Path and type(value) is str:
         return Path(value)
-    if type(value) is kind and (kind is not float or math.isfinite(value)):  # type: ignore[arg-type]
-        return value
-    if kind is float and type(value) is int:
-        return value
-    raise UserError(f"{name}={value!r:.100}", _WORDS[kind], f"change {name}")
+    if type(value) is not kind or kind is float:
+        raise UserError(f"{name}={value!r:.100}", _WORDS[kind], f"change {name}")
+    return value
 
 
 FORMER_TARGETS: Final = {
@@ -155,6 +147,18 @@ def with_present_names(node: Any) -> Any:
             for key, value in node.items()
         }
     return node
+
+
+def as_written_now(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config of any version's run as this one writes it.
+
+    Classes go by their present names, and ``data`` does not say again what ``virtual`` says.
+    """
+    present: dict[str, Any] = with_present_names(config)
+    data = present.get("data")
+    if isinstance(data, dict):
+        present["data"] = {key: value for key, value in data.items() if key != "virtual"}
+    return present
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:

@@ -201,7 +201,7 @@ class MeasurementConfig:
     protocols: Protocols
     tune: bool
     false_positives: FalsePositiveTarget
-    output_dir: str
+    output_dir: Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +307,7 @@ class EvaluationConfig(MeasurementConfig):
     bop_csv: bool
     all_measures: bool
     refine: str | None
-    device: str
+    device: Any
     num_pictures: Annotated[int, Range(0, _MOST)]
 
     @classmethod

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.build.sources import build_test_source
 from dopepp.experiment.config.data import DataConfig, trained_on
@@ -163,7 +164,11 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Sequen
     stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
     if not isinstance(stored, dict) or config is None:
         return  # a checkpoint of an earlier version does not say
-    if _test_set(DataConfig.of(config, config.get("virtual"))) != _test_set(data):
+    try:
+        own = DataConfig.of(config, config.get("virtual"))
+    except UserError:
+        return  # nor does one whose data nobody can read
+    if _test_set(own) != _test_set(data):
         return
     found = differing_images(stored["test"], describe_images(build_test_source(data, parts)))
     if found:

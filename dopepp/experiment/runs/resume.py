@@ -21,7 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.config.parse import below, flat, with_present_names
+from dopepp.experiment.config.parse import as_written_now, below, flat
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.images import differing_images
@@ -45,8 +45,6 @@ _NOT_LEARNT_FROM: Final = (
 _THIS_CALL: Final = ("resume", "resume_anyway", "output_dir")
 _NETWORK: Final = ("model.backbone", "model.attention", "model.head", "model.width")
 _OPTIMIZER: Final = "optimizer._target_"
-_COPY: Final = "data.virtual"
-"""Where runs of earlier versions say again what the node ``virtual`` says."""
 
 _ABSENT: Final = "not set"
 _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re.DOTALL)
@@ -116,11 +114,11 @@ def check_resume(
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
     """Return the options in which two configs differ, but for what belongs to one call alone."""
-    one, other = (dict(flat(with_present_names(config))) for config in (old, new))
+    one, other = (dict(flat(as_written_now(config))) for config in (old, new))
     return [
         ConfigDifference(key, _text(one, key), _text(other, key))
         for key in {**one, **other}
-        if one.get(key) != other.get(key) and not below(key, (*_THIS_CALL, _COPY))
+        if one.get(key) != other.get(key) and not below(key, _THIS_CALL)
     ]
 
 

@@ -85,6 +85,7 @@ def test_a_file_names_only_allowed_targets(path: Path) -> None:
 @pytest.mark.parametrize(("group", "name"), CHOICES, ids=lambda text: str(text))
 def test_every_choice_composes(group: str, name: str, composed: Composer) -> None:
     config = composed(f"{group}={name}")
+    RunConfig.of(config)
     node: Any = config
     for key in group.split("/"):
         # Overlays (`# @package _global_`) leave no key of their own.

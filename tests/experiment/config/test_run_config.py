@@ -45,7 +45,16 @@ Composer = Callable[..., dict[str, Any]]
         ("maps.sigma=0", "maps.sigma=0"),
         ("recovery.max_peaks=all", "recovery.max_peaks='all'"),
         ("data.eval_seed=-1", "data.eval_seed=-1"),
+        ("data.parts=pivconnector", "data.parts=pivconnector"),
         ("data.parts=[1]", "data.parts[0]=1"),
+        ("data.batch_size=0", "data.batch_size=0"),
+        ("data.batch_size=many", "data.batch_size='many'"),
+        ("data.num_val=0", "data.num_val=0"),
+        ("data.num_workers=-1", "data.num_workers=-1"),
+        ("data.real_fraction=1.5", "data.real_fraction=1.5"),
+        ("data.input_size=[100,64]", "data.input_size=[100, 64]"),
+        ("data.input_size=64", "data.input_size=64"),
+        ("data.cache=tape", "data.cache='tape'"),
         ("data.root=1", "data.root=1"),
         ("data.test.cache=tape", "data.test.cache='tape'"),
         ("data.masking=none", "data.masking='none'"),
@@ -85,6 +94,7 @@ def test_values_are_typed_and_the_plain_config_stays(composed: Composer) -> None
     assert (config.data.input_size, config.data.parts[0]) == ((416, 416), "servoholder")
     assert config.trainer.lightning["limit_val_batches"] == 2
     assert config.protocols.shading == (0.4,)
+    assert type(config.recovery["max_peaks"]) is int
     assert config.false_positives.num_empty == 500
     assert config.stored_data()["virtual"] == plain["virtual"]
     assert (config.ema, config.logger, config.search) == (0.5, None, None)
