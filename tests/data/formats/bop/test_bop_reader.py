@@ -218,22 +218,12 @@ def test_matrices_may_be_nested_and_numbers_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
 
 
-def test_bad_images_are_named(scene: Scene) -> None:
+def test_what_contradicts_an_image_is_named(scene: Scene) -> None:
     def refused(match: str, **options: Any) -> None:
         with pytest.raises(UserError, match=match):
             BopSource(scene.root, [block(2)], "test", **options).sample(0)
 
-    small = np.zeros((10, 10), np.uint8)
-    scene.image("mask_visib/000003_000001.png", small)
-    refused(r"mask_visib/000003_000001.png: size: 10×10 pixels; allowed: 64×48")
-    (scene.folder / "mask_visib" / "000003_000001.png").unlink()
-    scene.image("depth/000003.png", small)
-    refused(r"depth/000003.png: size: 10×10 pixels; allowed: 64×48")
-    (scene.folder / "depth" / "000003.png").unlink()
-    refused(r"depth/000003.png: No such file")
     content = (scene.folder / "rgb" / "000003.png").read_bytes()
-    (scene.folder / "rgb" / "000003.png").write_bytes(content[:-40])
-    refused(r"rgb/000003.png: .* bytes")
     (scene.folder / "rgb" / "000003.jpg").write_bytes(content)
     refused(r"rgb/000003.*: image 3 twice, also as 000003.*one file an image")
     (scene.folder / "rgb" / "000003.png").unlink()
@@ -264,18 +254,6 @@ def _saved(image: Image.Image, name: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, name, **options)
     return buffer.getvalue()
-
-
-@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
-@pytest.mark.parametrize("name", ["PNG", "JPEG", "TIFF"])
-def test_an_image_cut_short_is_refused(name: str) -> None:
-    rng = np.random.default_rng(0)
-    picture = Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8))
-    content = _saved(picture, name)
-    assert decode_rgb(content, "x").shape == (40, 50, 3)
-    for length in (0, 1, 10, len(content) // 2, len(content) - 30):
-        with pytest.raises(UserError, match=r"some/file\.x: image"):
-            decode_rgb(content[:length], "some/file.x")
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses

@@ -15,10 +15,9 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.labels import make_labels
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
-from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.formats.bop.writer import BopWriter, make_labels
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part

@@ -4,8 +4,6 @@ import http.server
 import io
 import json
 import pickle
-import subprocess
-import sys
 import tarfile
 import threading
 from collections.abc import Callable, Iterator
@@ -129,25 +127,6 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
     assert writer.written(0) == {998, 999}
     assert writer.written(2) == set()
     assert contents(root) == contents(written)
-
-
-def test_staging_needs_no_torch(tmp_path: Path) -> None:
-    code = (
-        "import sys, numpy as np\n"
-        "from dopepp.data.formats.webdataset.writer import WebdatasetWriter\n"
-        "from dopepp.data.formats.webdataset.source import WebdatasetSource\n"
-        "from dopepp.data.formats.bop.source import BopSource\n"
-        "from dopepp.data.formats.bop.writer import BopWriter\n"
-        "from dopepp.data.sample import Sample\n"
-        "from dopepp.parts.catalogue import servoholder\n"
-        f"writer = WebdatasetWriter({str(tmp_path)!r}, [servoholder()])\n"
-        "writer.prepare()\n"
-        "image, depth = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)\n"
-        "writer.write(0, Sample(image, np.eye(3), [], depth))\n"
-        "assert writer.written(0) == {0}\n"
-        "sys.exit(bool({'torch', 'lightning', 'webdataset'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @settings(max_examples=60, deadline=None)
