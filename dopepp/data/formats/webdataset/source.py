@@ -17,6 +17,7 @@ from jaxtyping import Bool
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES
+from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import (
@@ -28,7 +29,6 @@ from dopepp.data.formats.bop.records import (
     read_cameras,
     read_poses,
 )
-from dopepp.data.formats.bop.source import share
 from dopepp.data.formats.problems import STRICT, Problems, decode_json, entries, mapping
 from dopepp.data.formats.webdataset.shards import find_shards
 from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard

@@ -16,8 +16,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb, encode_png
-from dopepp.data.formats.bop.source import BopSource, share
+from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.sample import Sample
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
