@@ -269,14 +269,14 @@ class RunConfig(MeasurementConfig):
         """
         plain = with_present_names(config)
         nodes = {
-            "data": DataConfig.of(plain["data"], plain["virtual"]),
-            "trainer": TrainerConfig.of(plain["trainer"]),
+            "data": DataConfig.of(plain.get("data"), plain.get("virtual")),
+            "trainer": TrainerConfig.of(plain.get("trainer") or {}),
         }
         return _parsed(cls, plain, ("virtual", *nodes), **nodes)
 
     def stored_data(self) -> dict[str, Any]:
         """Return what a checkpoint says of its data: the node ``data`` with ``virtual`` in it."""
-        return {**self.plain["data"], "virtual": self.plain["virtual"]}
+        return {**self.plain["data"], "virtual": self.plain.get("virtual")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,7 +322,8 @@ class EvaluationConfig(MeasurementConfig):
 
 def _parsed(kind: type[T], plain: Mapping[str, Any], read: Sequence[str] = (), **known: Any) -> T:
     """Parse a config, of which some nodes have been read, with what a measurement asks for."""
-    silent = {one.name: plain[one.name] for one in fields(FalsePositiveTarget)}
+    names = [one.name for one in fields(FalsePositiveTarget)]
+    silent = {name: plain[name] for name in names if name in plain}
     done = {*read, *silent, "shading", "scale_factors", "by", "num_bins"}
     return parse(
         kind,
