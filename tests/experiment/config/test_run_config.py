@@ -65,6 +65,7 @@ Composer = Callable[..., dict[str, Any]]
         ("lr_finder.num_steps=9", "lr_finder.num_steps=9"),
         ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
         ("trainer.max_epochs=0", "trainer.max_epochs=0"),
+        ("+trainer.num_nodes=0", "trainer.num_nodes=0"),
         ("trainer.ddp_timeout_s=0", "trainer.ddp_timeout_s=0"),
         ("trainer.profiler=slow", "trainer.profiler='slow'"),
     ],
