@@ -22,8 +22,15 @@ from dopepp.experiment.build.sources import (
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports.breakdown import record_breakdown
-from dopepp.experiment.reports.compare.compare import compare_reports
-from dopepp.experiment.reports.condition import record_condition
+from dopepp.experiment.reports.compare import compare_reports
+from dopepp.experiment.reports.conditions import (
+    SCALE,
+    SHADING,
+    check_masks,
+    measure_scales,
+    measure_shading,
+    record_condition,
+)
 from dopepp.experiment.reports.evaluators import (
     EstimatorMethod,
     FileMethod,
@@ -33,8 +40,6 @@ from dopepp.experiment.reports.evaluators import (
 )
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.reports.report import Report, measure
-from dopepp.experiment.reports.scale import SCALE, measure_scales
-from dopepp.experiment.reports.shading import SHADING, check_masks, measure_shading
 from dopepp.experiment.reports.tables import reported_rates
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.images import warn_of_other_images

@@ -29,9 +29,9 @@ from dopepp.experiment.config.run import RunConfig, TrainerConfig
 from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.evaluate import measure_and_record, tune_and_record
 from dopepp.experiment.lr_finder import find_learning_rate
+from dopepp.experiment.reports.conditions import check_masks
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.reports.shading import check_masks
 from dopepp.experiment.runs import display, readme, record
 from dopepp.experiment.runs.images import describe_images
 from dopepp.experiment.runs.resume import ConfigDifference, check_resume, remember_overrides

@@ -25,6 +25,7 @@ from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.assignment import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.parts.part import Part
 
@@ -40,20 +41,8 @@ _BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
 _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
-class Posed(Protocol):
+class Posed(PredictedPose, Protocol):
     """What a measurement reads of a detection."""
-
-    @property
-    def object(self) -> str:
-        """Name of the part."""
-
-    @property
-    def score(self) -> float:
-        """Confidence."""
-
-    @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
-        """Estimated pose, metres."""
 
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:

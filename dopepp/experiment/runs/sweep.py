@@ -10,8 +10,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from dopepp.experiment.cost import COST_FILE
-from dopepp.experiment.reports.compare.compare import compare_runs
-from dopepp.experiment.reports.compare.runs import read_run
+from dopepp.experiment.reports.compare import compare_runs
+from dopepp.experiment.reports.entries import read_run
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_sweep_readme

@@ -21,13 +21,13 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.build.registries import LOGGERS
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.reports.compare.compare import (
+from dopepp.experiment.reports.compare import (
     CURVES_FILE,
     LOSS_FILE,
     PICTURES_FILE,
     TABLE_FILE,
 )
-from dopepp.experiment.reports.compare.runs import overrides_of
+from dopepp.experiment.reports.entries import overrides_of
 from dopepp.experiment.reports.paper_table import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import read_csv

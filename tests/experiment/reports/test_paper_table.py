@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from dopepp.experiment.reports.compare.compare import compare_paths
 from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.reports.compare.compare import compare_paths
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import Report

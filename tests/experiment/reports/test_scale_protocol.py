@@ -12,6 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from dopepp.experiment.reports.condition import record_condition
+from dopepp.experiment.reports.scale import SCALE, measure_scales
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Sample
@@ -24,11 +26,9 @@ from dopepp.experiment.build.system import build_system
 from dopepp.experiment.command_line import entry
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.evaluate import measure_and_record
-from dopepp.experiment.reports.condition import record_condition
 from dopepp.experiment.reports.evaluators import Cost, FileMethod, FilePose, ImageId
 from dopepp.experiment.reports.protocols import SHORT_NAMES, Protocols
 from dopepp.experiment.reports.report import measure
-from dopepp.experiment.reports.scale import SCALE, measure_scales
 from dopepp.experiment.reports.tables import ADD_01D, ADD_5CM
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint.schema import load_network, write_atomic
