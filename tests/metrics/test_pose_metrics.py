@@ -17,15 +17,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.metrics.functional import (
-    add,
-    add_s,
-    auc,
-    mspd,
-    mssd,
-    pass_rate,
-    rotation_error_deg,
-)
+from dopepp.metrics.functional import add, add_s, auc, mspd, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow
 from dopepp.parts.part import Mesh, Part
@@ -90,22 +82,29 @@ def test_rows_agree_with_the_functions() -> None:
     assert metric.compute()[MEAN].auc_10cm == row.auc_10cm
 
 
-def test_duplicates_are_false_positives_and_the_better_score_counts() -> None:
-    metric = PoseMetrics([part("box")])
-    metric.update(
-        [Detection("box", 0.2, pose(0)), Detection("box", 0.9, pose(0.03))], [truth("box", pose())]
-    )
-    row = metric.compute()["box"]
-    assert metric.errors("box") == pytest.approx([0.03])
-    assert (row.false_positives, row.precision, row.miss_rate) == (1, 0.5, 0)
+BAD = [np.full((4, 4), bad) for bad in (math.nan, math.inf)]
 
 
-def test_a_prediction_farther_than_ten_centimetres_is_a_miss_and_a_false_positive() -> None:
+@pytest.mark.parametrize(
+    ("found", "error", "counts"),
+    [
+        # Of two the better score counts; the other is a false positive.
+        ([(0.2, pose(0)), (0.9, pose(0.03))], 0.03, (1, 0.5, 0)),
+        # Farther than ten centimetres, or no pose at all: a miss and a false positive.
+        ([(0.9, pose(0.11))], math.inf, (1, 0, 1)),
+        ([(0.9, BAD[0])], math.inf, (1, 0, 1)),
+        ([(0.9, BAD[1])], math.inf, (1, 0, 1)),
+    ],
+)
+def test_what_stands_for_an_instance(
+    found: list[tuple[float, Array]], error: float, counts: tuple[float, ...]
+) -> None:
     metric = PoseMetrics([part("box")])
-    metric.update([Detection("box", 0.9, pose(0.11))], [truth("box", pose())])
+    metric.update([Detection("box", score, T) for score, T in found], [truth("box", pose())])
     row = metric.compute()["box"]
-    assert (row.miss_rate, row.precision, row.false_positives) == (1, 0, 1)
-    assert metric.errors("box").tolist() == [math.inf]
+    assert (row.false_positives, row.precision, row.miss_rate) == counts
+    assert metric.errors("box") == pytest.approx([error])
+    assert not any(isinstance(v, float) and math.isnan(v) for v in row.to_record().values())
 
 
 def test_the_distance_is_taken_between_centres_not_origins() -> None:
@@ -162,27 +161,10 @@ def test_all_missed_gives_zero_and_no_nan() -> None:
     for _ in range(3):
         metric.update([], [truth("box", pose())])
     row = metric.compute()["box"]
-    assert row == PoseRow(
-        object="box",
-        method="estimate",
-        num_instances=3,
-        add_01d=0.0,
-        pass_5cm=0.0,
-        pass_10cm=0.0,
-        auc_10cm=0.0,
-        add_s_01d=0.0,
-        auc_s_10cm=0.0,
-        median_rotation_deg=None,
-        median_translation=None,
-        miss_rate=1.0,
-        precision=0.0,
-        false_positives=0,
-        average_precision=0.0,
-        mssd_01d=0.0,
-        ar_mssd=0.0,
-        ar_mspd=None,
-        median_rotation_s_deg=None,
-    )
+    zeros = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d", "auc_s_10cm",
+             "precision", "average_precision", "mssd_01d", "ar_mssd")  # fmt: skip
+    expected = PoseRow("box", "estimate", 3, miss_rate=1.0, false_positives=0)
+    assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
@@ -208,15 +190,6 @@ def test_an_object_without_ground_truth_stays_out_of_the_mean() -> None:
     assert json.loads(json.dumps(rows["c"].to_record(), allow_nan=False))["add_01d"] is None
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_pose_that_is_not_finite_is_a_miss_and_a_false_positive(bad: float) -> None:
-    metric = PoseMetrics([part("box")])
-    metric.update([Detection("box", 0.9, np.full((4, 4), bad))], [truth("box", pose())])
-    row = metric.compute()["box"]
-    assert (row.miss_rate, row.false_positives, row.auc_10cm) == (1, 1, 0)
-    assert not any(isinstance(v, float) and math.isnan(v) for v in row.to_record().values())
-
-
 def test_reset_pickle_and_copy() -> None:
     metric = PoseMetrics([part("box")])
     metric.update([Detection("box", 0.9, pose(0.01))], [truth("box", pose())])
@@ -226,13 +199,6 @@ def test_reset_pickle_and_copy() -> None:
     metric.update([], [truth("box", pose())])
     assert metric.compute()["box"].num_instances == 1
     assert metric.errors("box").tolist() == [math.inf]
-
-
-def test_forward_returns_the_image_and_keeps_the_sum() -> None:
-    metric = PoseMetrics([part("box")])
-    assert metric([Detection("box", 1, pose())], [truth("box", pose())])["box"].add_01d == 1
-    assert metric([], [truth("box", pose())])["box"].add_01d == 0
-    assert metric.compute()["box"].add_01d == 0.5
 
 
 def test_references_use_the_instances_that_count() -> None:

@@ -99,6 +99,12 @@ class Figure:
             return None
         return wilson_interval(round(float(self.value) * self.num_instances), self.num_instances)
 
+    @property
+    def ends(self) -> list[str]:
+        """What a table shows of the interval."""
+        signed = self.difference is not None
+        return [self.column.shown(end, signed=signed) for end in self.interval or ()]
+
 
 def heading(measure: str) -> str:
     """Return what stands above a measure in tables, with its unit."""
