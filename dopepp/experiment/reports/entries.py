@@ -16,6 +16,7 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
+from dopepp.experiment.config.parse import as_written_now
 from dopepp.experiment.cost import COST_FILE
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import Report
@@ -192,7 +193,7 @@ def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
     """Return configs as one text, without seed and parts and without what only names places."""
     kept = [
         {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}
-        for config in configs
+        for config in map(as_written_now, configs)
     ]
     for config in kept:
         if isinstance(config.get("data"), dict):

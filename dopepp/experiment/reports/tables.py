@@ -14,13 +14,14 @@ import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
 from dopepp.drawing.curves import RateCurve
+from dopepp.experiment.config.data import DataConfig
 from dopepp.metrics.assignment import symmetries
 from dopepp.metrics.bootstrap import Difference
 from dopepp.metrics.functional import wilson_interval
@@ -211,13 +212,13 @@ ADD_10CM: Final = PassRate("pass_10cm", "add", 0.1, relative=False)
 MSSD_01D: Final = PassRate("mssd_01d", "mssd", 0.1)
 
 
-def reported_rates(data: Mapping[str, Any], parts: Sequence[Part]) -> tuple[PassRate, ...]:
+def reported_rates(data: DataConfig, parts: Sequence[Part]) -> tuple[PassRate, ...]:
     """Return the rates for these data: the paper's and ADD-0.1d.
 
     The paper's is ADD below 0.1 m on images of YCB-Video, below 0.05 m on parts. Where a part has
     symmetries, of which ADD knows nothing, MSSD-0.1d stands beside them.
     """
-    is_ycb = data["root"] is not None and data["format"] == "ycb_video"
+    is_ycb = data.root is not None and data.format == "ycb_video"
     rates = (ADD_10CM if is_ycb else ADD_5CM), ADD_01D
     symmetric = any(len(symmetries(part)) > 1 for part in parts)
     return (*rates, MSSD_01D) if symmetric else rates

@@ -12,9 +12,10 @@ import socket
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dopepp.core.files import write_whole
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text
 from dopepp.experiment.runs import record
@@ -75,11 +76,11 @@ class RunReadme:
     be written goes on without.
 
     Args:
-        config: The resolved config.
-        run_dir: The run's folder.
+        config: Of the run.
+        run_dir: Its folder.
     """
 
-    def __init__(self, config: Mapping[str, Any], run_dir: Path) -> None:
+    def __init__(self, config: RunConfig, run_dir: Path) -> None:
         self._config, self._folder = config, run_dir
         self._begun = False
 
@@ -105,7 +106,7 @@ class RunReadme:
             self._write(state, reason, report)
 
     def _write(self, state: str, reason: str, report: Report | None = None) -> None:
-        name = f"{self._config['model']['name']} on {self._config['data']['name']}"
+        name = f"{self._config.model.name} on {self._config.data.name}"
         sections = [f"# {name}: {state}", reason, _commands(self._folder)]
         if report is not None:
             sections.append(_result(report))
@@ -116,13 +117,13 @@ class RunReadme:
         run = shlex.quote(shown(self._folder))
         details = {} if report is None else report.details
         best = shlex.quote(shown(self._folder / details.get("checkpoint", record.BEST_CHECKPOINT)))
-        if not self._config["keep_checkpoints"]:
+        if not self._config.keep_checkpoints:
             return (
                 "A trial of the program itself (`keep_checkpoints=false`): nothing to go on with."
             )
         lines = [] if state == FINISHED else [f"python train.py resume={run}  # go on"]
         if state == FINISHED:
-            epochs = 2 * int(self._config["trainer"]["max_epochs"])
+            epochs = 2 * self._config.trainer.max_epochs
             lines += [
                 f"python evaluate.py ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
                 f"python train.py resume={run} trainer.max_epochs={epochs}  # train for longer",

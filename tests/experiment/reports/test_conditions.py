@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,9 +12,13 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_scaled_test_source, build_test_source
+from dopepp.experiment.build.sources import (
+    build_parts,
+    build_scaled_test_source,
+    build_test_source,
+)
 from dopepp.experiment.build.system import build_system
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.evaluate import measure_and_record
 from dopepp.experiment.reports.conditions import (
     SCALE,
@@ -34,7 +38,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint.schema import load_network, write_atomic
 from dopepp.parts.part import Part
 
-Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 RATES = (ADD_5CM, ADD_01D)
 NUM_IMAGES = 6
 SHARES = (0.2, 0.6, 0.8)
@@ -148,7 +152,7 @@ def test_shares_that_are_not_reached_are_counted_and_said(
     assert not (tmp_path / "shading_examples.png").exists()
 
 
-def test_what_cannot_be_measured_is_refused_before_anything_is(tiny: Composer) -> None:
+def test_what_cannot_be_measured_is_refused_before_anything_is(tiny: Parser) -> None:
     check_masks(Discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(Discs(masks=False))
@@ -157,19 +161,19 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(tiny: Composer) -
         condition.check_methods(METHODS)
         with pytest.raises(UserError, match=f"{condition.name} with results of posecnn"):
             condition.check_methods({**METHODS, "posecnn": poses})
-    data = {**tiny()["data"], "root": "photos"}
+    data = replace(tiny().data, root=Path("photos"))
     with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
-        build_scaled_test_source(data, [], 0, 2.0)
+        build_scaled_test_source(data, [], 2.0)
     assert "\n" not in str(error.value)
 
 
 def test_every_method_is_measured_at_every_scale(
-    tiny: Composer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tiny: Parser, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    data = tiny()["data"]
+    data = tiny().data
     (part,) = build_parts(data)
-    source = build_test_source(data, [part], 0)
-    scaled = {scale: build_scaled_test_source(data, [part], 0, scale) for scale in (0.5, 20.0)}
+    source = build_test_source(data, [part])
+    scaled = {scale: build_scaled_test_source(data, [part], scale) for scale in (0.5, 20.0)}
     usual = [source.sample(index).instances[0] for index in range(3)]
     far = [scaled[0.5].sample(index).instances[0] for index in range(3)]
     for one, other in zip(usual, far, strict=True):
@@ -209,17 +213,15 @@ def test_every_method_is_measured_at_every_scale(
     check_pictures(tmp_path, SCALE, 3)
 
 
-def test_untrained_networks_end_to_end(tiny: Composer, tmp_path: Path) -> None:
+def test_untrained_networks_end_to_end(tiny: Parser, tmp_path: Path) -> None:
     config = tiny("data.num_test=2")
-    data, parts = config["data"], build_parts(config["data"])
+    data, parts = config.data, build_parts(config.data)
     system = build_system(config, parts, "")
     weights = {f"network.{name}": value for name, value in system.network.state_dict().items()}
     write_atomic({"state_dict": weights, "dopepp": system.payload}, tmp_path / "untrained.ckpt")
     estimator = PoseEstimator(*load_network(tmp_path / "untrained.ckpt"))
     both, protocols = {"dope": estimator, "dopepp": estimator}, Protocols(scales=(0.5,))
-    reports = measure_and_record(
-        both, parts, data, 0, tmp_path, num_pictures=2, protocols=protocols
-    )
+    reports = measure_and_record(both, parts, data, tmp_path, num_pictures=2, protocols=protocols)
     rows = read_csv(tmp_path / "scale.csv")
     assert [(row["method"], row["scale"], row["num_instances"]) for row in rows] == [
         (name, scale, "2") for name in both for scale in ("0.5", "1.0")

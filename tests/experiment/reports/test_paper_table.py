@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.reports.compare import compare_paths
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.paper_table import PaperTable
@@ -22,6 +21,7 @@ from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import read_csv
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
+from dopepp.experiment.train import do_job
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import mean_row, summarise
 
@@ -208,7 +208,7 @@ def test_costs(composed: Composer, tmp_path: Path) -> None:
         folder = tmp_path / str(number)
         job(folder, [f"model={name}"], None)
         (folder / record.FAILURE_FILE).unlink()
-        measure_cost(composed("experiment=table8_time", f"model={name}", *small), folder)
+        do_job(composed("experiment=table8_time", f"model={name}", *small), folder)
     printed = {"DOPE++": {"network": {"ms/frame": 33, "backbone weights": 1106696}}, "DRNet": {}}
     end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS, "paper": printed})
     dope, dopepp = read_table(tmp_path)
