@@ -90,17 +90,6 @@ def test_pass_rate_is_strict_and_misses_count() -> None:
     assert pass_rate(errors[3:], 0.1) == 0.0
 
 
-def test_match_goes_by_score_not_by_distance() -> None:
-    # The better score takes the instance, though the other prediction is nearer to it.
-    distances = torch.tensor([[0.01, 0.5], [0.05, 0.5]])
-    assert match(torch.tensor([0.3, 0.9]), distances).tolist() == [-1, 0]
-
-
-def test_match_gives_what_is_left_to_the_next() -> None:
-    distances = torch.tensor([[0.01, 0.05], [0.02, 0.09], [0.03, 0.04]])
-    assert match(torch.tensor([0.9, 0.8, 0.7]), distances).tolist() == [0, 1, -1]
-
-
 def test_match_breaks_ties_by_order_and_includes_the_limit() -> None:
     assert match(torch.ones(2), torch.full((2, 2), 0.1, dtype=torch.float64)).tolist() == [0, 1]
     assert match(torch.ones(1), torch.tensor([[0.1000001]])).tolist() == [-1]

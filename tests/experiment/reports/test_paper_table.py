@@ -245,12 +245,16 @@ def test_tables_train_as_the_paper_does_at_its_scale_and_as_we_do_on_a_laptop(
     assert paper["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
     assert paper["scheduler"]["_target_"] is None
     assert (paper["data"]["batch_size"], paper["trainer"]["max_epochs"]) == (32, 60)
-    ours = composed(f"experiment={experiment}", "recipe=ours")
+    ours = composed(f"experiment={experiment}", "scale=laptop")
     assert ours["recipe"] == "ours"
     assert ours["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
-    assert composed(f"experiment={experiment}", "scale=laptop")["recipe"] == "ours"
-    assert composed("experiment=paper")["optimizer"] == paper["optimizer"]
+
+
+def test_recipes_are_ours_unless_the_papers_are_asked_for(composed: Composer) -> None:
     assert composed()["recipe"] == "ours"
+    assert composed("experiment=paper")["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
+    table = composed("experiment=table6_dope_vs_dopepp", "recipe=ours")
+    assert table["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
 
 
 @pytest.mark.parametrize(

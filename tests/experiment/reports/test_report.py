@@ -9,7 +9,6 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.errors import UserError
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report
 from dopepp.experiment.runs import record
@@ -76,12 +75,3 @@ def test_json_that_nobody_else_could_read_is_not_written(tmp_path: Path) -> None
     with pytest.raises(ValueError, match="JSON"):
         record.write_json(path, {"a": float("nan")})
     assert record.read_json(path) == {"a": 1}
-
-
-@pytest.mark.parametrize("content", ["", "{", "[1]", None])
-def test_a_damaged_record_is_a_users_error(content: str | None, tmp_path: Path) -> None:
-    path = tmp_path / "metrics.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(UserError, match=r"metrics\.json"):
-        record.read_json(path)
