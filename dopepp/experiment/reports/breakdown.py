@@ -28,7 +28,7 @@ from dopepp.experiment.reports.tables import (
     Row,
     csv_text,
     pivot,
-    rate_curve,
+    rate_curves,
     select,
 )
 from dopepp.experiment.runs import display
@@ -233,12 +233,7 @@ def record_breakdown(
     records = pivot(table, attrgetter("condition", "method"), record)
     path = run_dir / f"by_{quantity}"
     write_whole(path.with_suffix(".csv"), csv_text(records).encode())
-    panels = {
-        rate.title: {
-            name: rate_curve(select(table, method=name, measure=rate.field)) for name in metrics
-        }
-        for rate in rates
-    }
+    panels = {rate.title: rate_curves(select(table, measure=rate.field)) for rate in rates}
     # Between two bins lie no instances; the line stands in the middle of the gap.
     gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]
     edges = np.array([bins[0].low, *gaps, bins[-1].high])

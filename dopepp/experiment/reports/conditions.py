@@ -36,7 +36,7 @@ from dopepp.experiment.reports.tables import (
     heading,
     markdown_text,
     pivot,
-    rate_curve,
+    rate_curves,
     select,
     shown_rows,
 )
@@ -221,13 +221,9 @@ def _draw(
     for name in dict.fromkeys(one.object for one in table if one.object != MEAN):
         for rate in rates:
             measured = select(table, object=name, measure=rate.field)
-            curves = {
-                method: rate_curve(select(measured, method=method), condition.per_unit)
-                for method in dict.fromkeys(one.method for one in measured)
-            }
-            panels[f"{name}: {rate.title}"] = {
-                method: curve for method, curve in curves.items() if len(curve.x)
-            }
+            curves = rate_curves(measured, condition.per_unit)
+            shown = {method: curve for method, curve in curves.items() if len(curve.x)}
+            panels[f"{name}: {rate.title}"] = shown
     figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
     write_png(path, figure_image(figure))
 

@@ -21,7 +21,7 @@ from scipy.stats import t
 from dopepp.core.errors import UserError
 from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.drawing.curves import rates_figure
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
 from dopepp.experiment.reports.conditions import SHADING
 from dopepp.experiment.reports.differences import figures, noise, row_figures, summary
@@ -35,7 +35,7 @@ from dopepp.experiment.reports.tables import (
     csv_text,
     heading,
     markdown_text,
-    rate_curve,
+    rate_curves,
     read_csv,
     select,
 )
@@ -275,10 +275,11 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
         for label, own in measured.items()
         if not own
     ]
-    panels: dict[str, dict[str, RateCurve]] = {}
+    panels = {}
     for name in dict.fromkeys(one.object for one in table):
         for measure in (layout.pass_field, _STRICT):
             baseline: dict[float, list[Figure]] = {}
+            pooled: list[Figure] = []
             head = {_OBJECT: name, _MEASURE: heading(measure)}
             for label in dict.fromkeys(one.method for one in select(table, object=name)):
                 own = select(table, method=label, object=name, measure=measure)
@@ -294,8 +295,8 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
                 if printed and measure == layout.pass_field:
                     texts = {share: _number(value) for share, value in printed.items()}
                     rows.append({_METHOD: f"{label}, {_PAPER}", **head, **texts})
-                panel = panels.setdefault(f"{name}: {heading(measure)}", {})
-                panel[label] = rate_curve(map(_pooled, rates.values()), SHADING.per_unit)
+                pooled += map(_pooled, rates.values())
+            panels[f"{name}: {heading(measure)}"] = rate_curves(pooled, SHADING.per_unit)
     if panels:
         figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
