@@ -122,10 +122,7 @@ def compare_paths(
 
 
 def compare_runs(
-    runs: Sequence[Run],
-    folder: Path,
-    baseline: str | None = None,
-    num_pictures: int = NUM_PICTURES,
+    runs: Sequence[Run], folder: Path, baseline: str | None = None, num_pictures: int = NUM_PICTURES
 ) -> list[Entry]:
     """Print and write a comparison of runs into a folder; returns its methods.
 
