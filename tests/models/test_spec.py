@@ -143,11 +143,11 @@ def tiny_module(monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_a_registered_class_can_be_built(make_spec, tiny_module):
-    gate = Registry("backbone", backbones.Backbone)
+    registry = Registry("backbone", backbones.Backbone)
     with pytest.raises(UserError, match="allowed: nothing"):
-        gate.build({"_target_": f"{tiny_module}.Tiny", "channels": 8})
-    gate.register(f"{tiny_module}.Tiny")
-    assert gate.build({"_target_": f"{tiny_module}.Tiny", "channels": 8}).out_channels == 8
+        registry.build({"_target_": f"{tiny_module}.Tiny", "channels": 8})
+    registry.register(f"{tiny_module}.Tiny")
+    assert registry.build({"_target_": f"{tiny_module}.Tiny", "channels": 8}).out_channels == 8
 
 
 @pytest.mark.parametrize("name", ["Stolen", "run", "missing"])
@@ -270,13 +270,13 @@ class Logger:
 def test_keywords_that_a_class_hands_on(monkeypatch, tiny_module):
     monkeypatch.setattr(Logger, "__module__", tiny_module)
     sys.modules[tiny_module].Logger = Logger
-    gate = Registry("logger", Logger, [f"{tiny_module}.Logger"])
+    registry = Registry("logger", Logger, [f"{tiny_module}.Logger"])
     node = {"_target_": f"{tiny_module}.Logger", "project": "parts"}
-    assert gate.build(node, path="here").more == {"project": "parts"}
+    assert registry.build(node, path="here").more == {"project": "parts"}
     with pytest.raises(UserError, match="argument 'path'"):
-        gate.build({**node, "path": "there"}, path="here")
+        registry.build({**node, "path": "there"}, path="here")
     with pytest.raises(UserError, match="argument '_partial_'"):
-        gate.build({**node, "_partial_": True}, path="here")
+        registry.build({**node, "_partial_": True}, path="here")
 
 
 def test_losses_stand_behind_a_gate():
@@ -304,7 +304,7 @@ def test_the_documented_backbone_works(monkeypatch, make_spec):
     monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
     monkeypatch.setattr(backbones, "Strided", None, raising=False)
     exec(code, vars(backbones))
-    gate = Registry.of_module("backbone", backbones.Backbone, backbones)
-    assert "dopepp.models.backbones.Strided" in gate.targets
-    backbone = gate.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
+    registry = Registry.of_module("backbone", backbones.Backbone, backbones)
+    assert "dopepp.models.backbones.Strided" in registry.targets
+    backbone = registry.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
     assert backbone(torch.zeros(1, 3, 64, 32)).shape == (1, backbone.out_channels, 8, 4)

@@ -269,7 +269,7 @@ def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
         if (name == "PROTO" and argument != 2) or name == "EMPTY_SET":
             raise ValueError(f"operation {name} {argument}")
         if name == "GLOBAL" and argument not in _NAMES:
-            raise ValueError(f"the name {argument.replace(' ', '.')!r:.100}")
+            raise ValueError(f"the name {str(argument).replace(' ', '.')!r:.100}")
         if name == "BINPERSID":
             yield _storage_reference(top)
         if name in ("BINPUT", "LONG_BINPUT"):
