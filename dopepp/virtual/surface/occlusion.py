@@ -80,7 +80,7 @@ def bake_open_sky(
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
-        digest.update(array.tobytes())
+        digest.update(np.ascontiguousarray(array).tobytes())
     key = digest.digest()
     baked = _BAKED.get(key)
     if baked is None:
