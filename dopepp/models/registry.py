@@ -1,11 +1,12 @@
-"""The gate before every object that a config or a checkpoint may name: an explicit allow-list.
+"""Registries: allow-lists of the classes that a config or a checkpoint may name and have built.
 
 A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
 is compared with the allow-list before anything is imported, and what it resolves to is checked
 again, so neither a path through another module (``dopepp.models.spec.os.system``) nor a re-bound
 name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
 
-To allow a class of your own: import its module and call ``GATE.register("package.module.Class")``.
+To add a class of your own, import its module and call ``register("package.module.Class")`` of the
+registry of its kind (``BACKBONES.register(…)``).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Registry(Generic[T]):
     """Builds objects of one kind, and nothing else, from plain nodes.
 
     Args:
-        kind: What the gate builds, for messages: ``"backbone"``, ``"optimizer"``.
+        kind: What the registry builds, for messages: ``"backbone"``, ``"optimizer"``.
         base: The class that every target must inherit from.
         targets: Dotted names of the allowed classes.
     """
@@ -62,7 +63,7 @@ class Registry(Generic[T]):
         """Allow one more class; it is checked now, so a wrong name fails where it was written.
 
         Raises:
-            UserError: The name does not lead to a class of this gate's kind.
+            UserError: The name does not lead to a class of this registry's kind.
         """
         self._load(dotted)
         self._targets.add(dotted)
