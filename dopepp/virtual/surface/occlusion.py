@@ -8,6 +8,7 @@ corners know nothing of a rib in its middle; small triangles keep their three co
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -39,6 +40,9 @@ _MOST_COMPARED: Final = 1000
 _DISTANCE: Final = 20.0
 """Of a direction's camera from the mesh, in radii: as good as parallel."""
 
+_MOST_BAKED: Final = 32
+"""Meshes whose open sky is kept: more than the parts of a run."""
+
 
 @dataclass(frozen=True, eq=False)
 class OpenSky:
@@ -55,6 +59,9 @@ class OpenSky:
     values: Float[np.ndarray, "2 points"]
 
 
+_BAKED: Final[dict[bytes, OpenSky]] = {}
+
+
 def bake_open_sky(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
@@ -63,12 +70,27 @@ def bake_open_sky(
 ) -> OpenSky:
     """Measure the open sky over a mesh; the time grows with the number of triangles.
 
+    The last ones are kept, because a run prepares its parts anew for every set of its data.
+
     Args:
         vertices: Object frame, metres.
         faces: Vertex indices.
         normals: Unit normal of every corner.
         closed: Whether nobody sees the back sides.
     """
+    digest = hashlib.sha256(str((vertices.shape, closed)).encode())
+    for array in (vertices, faces, normals):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    baked = _BAKED.get(key)
+    if baked is None:
+        if len(_BAKED) >= _MOST_BAKED:
+            _BAKED.pop(next(iter(_BAKED)), None)
+        baked = _BAKED[key] = _bake_mesh(vertices, faces, normals, closed)
+    return baked
+
+
+def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)

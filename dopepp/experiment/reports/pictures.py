@@ -1,14 +1,14 @@
-"""The same test images through every model (paper Fig. 14): truth green, predictions beside it.
+"""What a comparison of runs shows beside its table: test images and curves of training.
 
-What the runs logged while they trained, as lines to overlay (paper Fig. 12).
+The same test images go through every model (paper Fig. 14); what the runs logged while they trained
+becomes lines in one figure (paper Fig. 12).
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,11 +19,10 @@ from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
 from dopepp.drawing.panels import PlotLine, message_picture
 from dopepp.drawing.sheet import Tile
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_test_source, held_out_seed
-from dopepp.experiment.config.chosen_data import chosen_data, trained_on
-from dopepp.experiment.reports.compare.entries import Entry
-from dopepp.experiment.reports.compare.runs import Run
+from dopepp.experiment.build.sources import build_parts, build_test_source
+from dopepp.experiment.config.data import chosen_data, trained_on
+from dopepp.experiment.reports.entries import Entry, Run
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.inference.estimator import PoseEstimator
 
 LOG_FILE: Final = "metrics.csv"
@@ -57,11 +56,7 @@ def training_lines(
 
 def logged(path: Path, column: str) -> Series:
     """Return what a log holds in a column; empty where there is no such file or column."""
-    if not path.is_file():
-        return {}
-    with path.open(newline="", errors="replace") as stream:
-        rows = list(csv.DictReader(stream))
-    cells = ((_number(row.get("step")), _number(row.get(column))) for row in rows)
+    cells = ((_number(row.get("step")), _number(row.get(column))) for row in read_csv(path))
     return {int(step): value for step, value in cells if step is not None and value is not None}
 
 
@@ -155,10 +150,10 @@ def _test_images(run: Run, estimator: PoseEstimator, num: int) -> list[Sample]:
     stored = trained_on(estimator.checkpoint.data)
     # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
     given = run.config if "ckpt_path" in run.config else {}
-    data = chosen_data(given, stored, str(run.checkpoint))
-    if data["root"] is not None:
-        data = {**data, "objects": [part.name for part in estimator.parts]}
-    source = build_test_source(data, build_parts(data), held_out_seed(data))
+    data = chosen_data(given.get("data"), given.get("virtual"), stored, str(run.checkpoint))
+    if data.root is not None:
+        data = replace(data, objects=tuple(part.name for part in estimator.parts))
+    source = build_test_source(data, build_parts(data))
     return [source.sample(index, 0) for index in range(min(num, len(source)))]
 
 

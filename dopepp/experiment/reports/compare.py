@@ -1,6 +1,6 @@
-"""Comparing run folders: ``compare.md``, ``compare.csv``, ``compare.png`` and its panels.
+"""Comparing methods: ``compare.csv``, ``compare.md`` and ``compare_auc.{png,csv}``.
 
-Writing a comparison of results: ``compare.csv``, ``compare.md``, ``compare_auc.{png,csv}``.
+Of run folders, ``compare.png`` has curves of training and test pictures as well.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.drawing.curves import accuracy_figure, save_accuracy_curves
 from dopepp.drawing.panels import grid, lines_figure
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.reports.compare.entries import BASELINE, Entry, group, ordered
-from dopepp.experiment.reports.compare.pictures import NUM_PICTURES, picture_tiles, training_lines
-from dopepp.experiment.reports.compare.runs import Run, find_runs
-from dopepp.experiment.reports.compare.table import full, headline, lines, notes
+from dopepp.experiment.reports.differences import figures, full, headline, notes
+from dopepp.experiment.reports.entries import BASELINE, Entry, Run, find_runs, group, ordered
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
+from dopepp.experiment.reports.pictures import NUM_PICTURES, picture_tiles, training_lines
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import Row, csv_text, markdown_text
 from dopepp.experiment.runs import display
@@ -30,9 +29,20 @@ from dopepp.experiment.runs import display
 TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"
 CURVES_FILE: Final = "compare_auc.png"
+PANELS_FILE: Final = "compare.png"
+LOSS_FILE: Final = "compare_loss.png"
+PICTURES_FILE: Final = "compare_pictures.png"
 
+_MIN_COLUMNS: Final = 3
+"""Tiles of fewer methods than this would be larger than anybody needs."""
+_PANEL_PX: Final = 768
+"""Width of a panel, where there is none to take it from."""
+_GAP_PX: Final = 12
+"""Room between tiles."""
 _TOO_WIDE: Final = ("Δ rotation °", "parameters", "GMACs")
 """What a terminal has no room for."""
+
+Picture = UInt8[np.ndarray, "height width 3"]
 
 
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:
@@ -48,7 +58,7 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
         entries: The methods, the baseline first.
         folder: Where the files go.
     """
-    table = lines(entries)
+    table = figures(entries)
     compact, said = headline(table), notes(entries, table)
     display.show_table(
         "comparison",
@@ -75,20 +85,6 @@ def accuracy_curves(entries: Sequence[Entry]) -> dict[str, np.ndarray]:
         for entry in entries
         if entry.reports
     }
-
-
-PANELS_FILE: Final = "compare.png"
-LOSS_FILE: Final = "compare_loss.png"
-PICTURES_FILE: Final = "compare_pictures.png"
-
-_MIN_COLUMNS: Final = 3
-"""Tiles of fewer methods than this would be larger than anybody needs."""
-_PANEL_PX: Final = 768
-"""Width of a panel, where there is none to take it from."""
-_GAP_PX: Final = 12
-"""Room between tiles."""
-
-Picture = UInt8[np.ndarray, "height width 3"]
 
 
 def compare_paths(
