@@ -156,7 +156,7 @@ def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
     return Plane(triple(T_cam_table[:3, 2]), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
 
 
-def inverse_depth_of(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def inverse_depth_row(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Return what a homogeneous pixel is multiplied with to give the plane's 1/depth, 1/m.
 
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
@@ -180,7 +180,7 @@ def _beyond(
 ) -> Bool[np.ndarray, "height width"] | None:
     """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
     width, height = size
-    slope = inverse_depth_of(plane_of(T_cam_table), K)
+    slope = inverse_depth_row(plane_of(T_cam_table), K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
     if across.min() + down.min() >= 1 / end:
         return None
