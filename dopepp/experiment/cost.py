@@ -19,8 +19,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.checks import check_integer
+from dopepp.core.files import write_png, write_whole
 from dopepp.data.sample import Sample
+from dopepp.drawing.curves import figure_image
 from dopepp.drawing.panels import PlotLine, lines_figure
 from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.sources import build_test_source, held_out_seed
@@ -30,7 +32,6 @@ from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.timing import WARM_UP, FrameTimes, RehearsedEstimator, time_frames
 from dopepp.models.network import PoseNetwork, network_cost
-from dopepp.models.registry import check_integer
 from dopepp.parts.part import Part
 
 COST_FILE: Final = "cost.json"

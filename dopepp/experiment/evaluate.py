@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from dopepp.core.checks import check_flag
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
@@ -41,7 +42,6 @@ from dopepp.experiment.runs.images import warn_of_other_images
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.registry import check_flag
 from dopepp.parts.part import Part
 
 

@@ -9,16 +9,16 @@ from typing import Any, Final
 import numpy as np
 from lightning.pytorch import seed_everything
 
+from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import figure_with_axes
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.sources import build_datamodule
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
-from dopepp.models.registry import check_integer, check_number
 from dopepp.training.callbacks.rate_sweep import RateSweep, Suggestion, exponential, smooth, suggest
 
 TABLE_FILE: Final = "lr_finder.csv"

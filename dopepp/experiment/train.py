@@ -13,6 +13,7 @@ from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
+from dopepp.core.checks import check_flag, check_integer
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
@@ -30,7 +31,6 @@ from dopepp.experiment.runs.resume import ConfigDifference, check_resume, rememb
 from dopepp.experiment.runs.tracking import log_report, tracked
 from dopepp.experiment.tuning import FalsePositiveTarget
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.registry import check_flag, check_integer
 from dopepp.parts.part import Part
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import FOLDER as PROFILE

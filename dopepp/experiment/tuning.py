@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
 from dopepp.data.sources.rendered import MAX_ITEMS
@@ -32,7 +33,6 @@ from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.checkpoint.storage import write_atomic
-from dopepp.models.registry import check_integer, check_number
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import (
     FEATURES,

@@ -13,10 +13,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.drawing.curves import (
     accuracy_curve,
     accuracy_figure,
+    figure_image,
     save_accuracy_curves,
 )
 from dopepp.metrics.functional import auc

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopepp.core.files import figure_image
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
 
 
 def curve(*rates: float) -> RateCurve:

@@ -3,7 +3,7 @@
 Items are written one by one and finalized chunk by chunk. An item's last file is its marker, so
 what is there is complete; files that a chunk's items share (``scene_gt.json``, a tar shard) are
 assembled when all of them are there. To add a format, write such a class and one line in
-``WRITERS`` of :mod:`dopepp.data.jobs.work`.
+``WRITERS`` of :mod:`dopepp.data.jobs.job`.
 """
 
 from __future__ import annotations

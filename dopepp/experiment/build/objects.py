@@ -7,12 +7,12 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Final
 
+from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.ycb_video.frame import read_classes
 from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sources.rendered import MAX_ITEMS
-from dopepp.models.registry import check_integer, check_number
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Part

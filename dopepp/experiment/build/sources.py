@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.machine import available_cores
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
@@ -22,7 +23,6 @@ from dopepp.experiment.build.splits import (
     training_renders,
 )
 from dopepp.experiment.config.chosen_data import are_renders
-from dopepp.models.registry import check_integer
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -46,19 +46,12 @@ def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) 
         object_names=[part.name for part in parts],
         input_size=input_size,
         batch_size=data["batch_size"],
-        num_workers=_num_cores() if workers is None else workers,
+        num_workers=available_cores() if workers is None else workers,
         seed=seed,
         masking=build_optional(MASKINGS, data["masking"]),
         augment=build_optional(AUGMENTATIONS, data["augment"]),
         backgrounds=backgrounds,
     )
-
-
-def _num_cores() -> int:
-    """Return the cores that this process may use, where the system tells (Linux), else all."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def held_out_seed(data: Mapping[str, Any]) -> int:

@@ -12,6 +12,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 
+from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.experiment.build.hardware import choose_precision, num_processes
 from dopepp.experiment.build.registries import (
@@ -24,7 +25,6 @@ from dopepp.inference.estimator import parse_recovery
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
-from dopepp.models.registry import check_integer, check_number
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.training.callbacks.averaging import AveragedWeights

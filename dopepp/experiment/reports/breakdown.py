@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
 from dopepp.experiment.reports.tables import PassRate, csv_text
 from dopepp.experiment.runs import display
 from dopepp.geometry.camera import project_keypoints

@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.experiment.reports.evaluators import FileMethod, Method
 from dopepp.experiment.reports.tables import PassRate, csv_text, heading, markdown_text

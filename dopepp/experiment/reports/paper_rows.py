@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from scipy.stats import t
 
-from dopepp.core.files import figure_image, write_png
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.core.files import write_png
+from dopepp.drawing.curves import RateCurve, figure_image, rates_figure
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, read_frames, save_frame_rates
 from dopepp.experiment.reports.compare.entries import Entry, differences
 from dopepp.experiment.reports.compare.runs import Run

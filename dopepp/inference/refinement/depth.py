@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import require
 from dopepp.geometry.camera import invert_transform, make_transform, transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.fit import Fit, Prior, Terms, fit_of, make_prior, outline_terms
@@ -239,11 +239,5 @@ def _moved(
 
 def _small_gicp() -> ModuleType:
     """Import small_gicp when it is asked for."""
-    try:
-        return import_module("small_gicp")
-    except ImportError as error:
-        raise UserError(
-            "refine=depth without the package small_gicp",
-            "an installation with the extra: pip install 'dopepp[depth]'",
-            "install it, or leave refine out",
-        ) from error
+    require("small_gicp", "refine=depth", "depth")
+    return import_module("small_gicp")

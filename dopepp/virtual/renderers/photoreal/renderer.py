@@ -25,6 +25,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from dopepp.core.errors import require
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, make_shapes, make_surroundings
 from dopepp.virtual.renderers.photoreal.table import (
     TableTop,
@@ -36,7 +37,7 @@ from dopepp.virtual.renderers.photoreal.table import (
     shadowed,
     split_light,
 )
-from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads, require
+from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads
 from dopepp.virtual.renderers.raster.light import CODE_STEPS, TONE_CURVE
 from dopepp.virtual.renderers.raster.plane import inverse_depth_of, plane_depth
 from dopepp.virtual.renderers.raster.projection import project_object
@@ -87,7 +88,6 @@ def denoise(
 @cache
 def _device() -> tuple[Any, Any]:
     """Return pyoidn's C interface and a device, made once a process."""
-    require("pyoidn")
     package = find_spec("pyoidn")
     assert package is not None
     assert package.origin is not None
@@ -113,7 +113,8 @@ def _check(interface: Any, device: Any) -> None:
         raise RuntimeError(f"Open Image Denoise: {text}")
 
 
-require("mitsuba", "pyoidn")
+require("mitsuba", "renderer 'photoreal'", "photoreal")
+require("pyoidn", "renderer 'photoreal'", "photoreal")
 
 SAMPLES_PER_PIXEL: Final = 16
 

@@ -24,11 +24,12 @@ import sys
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import UserError, require
+from dopepp.core.files import write_whole
+from dopepp.core.machine import available_cores, cache_folder
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ def mitsuba() -> Any:
         UserError: It is not installed, a setting is wrong, or this process was forked from one
             that has rendered, whose threads it lacks.
     """
-    require("mitsuba")
+    require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
     if pid != os.getpid():
         raise UserError(
@@ -76,21 +77,6 @@ def mitsuba() -> Any:
             "start workers with multiprocessing.get_context('spawn')",
         )
     return import_module("mitsuba")
-
-
-def require(*packages: str) -> None:
-    """Check, without importing them, that packages of the extra are installed.
-
-    Raises:
-        UserError: One is missing.
-    """
-    for package in packages:
-        if find_spec(package) is None:
-            raise UserError(
-                f"renderer 'photoreal' without the package {package}",
-                "an installation with the extra photoreal",
-                "pip install 'dopepp[photoreal]'",
-            )
 
 
 def num_threads() -> int:
@@ -106,8 +92,7 @@ def num_threads() -> int:
         return int(setting)
     if multiprocessing.parent_process() is not None:
         return 1
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    return available_cores()
 
 
 @cache
@@ -193,8 +178,7 @@ def _probe(library: Path) -> bool | None:
 
 
 def _cache_path() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "dopepp" / "mitsuba_libllvm.json"
+    return cache_folder() / "mitsuba_libllvm.json"
 
 
 def _read_cache() -> dict[str, bool]:
@@ -210,9 +194,6 @@ def _read_cache() -> dict[str, bool]:
 
 
 def _write_cache(known: dict[str, bool]) -> None:
-    # Imported here because it brings matplotlib along, which rendering does without.
-    from dopepp.core.files import write_whole
-
     try:
         write_whole(_cache_path(), json.dumps(known, indent=1).encode())
     except OSError as error:
