@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from lightning.pytorch import seed_everything
 
-from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import write_png, write_whole
 from dopepp.drawing.curves import figure_image, figure_with_axes
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
@@ -24,42 +23,36 @@ from dopepp.training.callbacks.rate_sweep import RateSweep, Suggestion, exponent
 TABLE_FILE: Final = "lr_finder.csv"
 PICTURE_FILE: Final = "lr_finder.png"
 
-_LOWEST: Final = 1e-12
-_HIGHEST: Final = 1e3
 _MIN_STEPS: Final = 10
 _MOST: Final = 10**6
-"""Steps; and epochs, since the steps end the sweep."""
+"""Epochs, since the steps end the sweep."""
 
 
-def find_learning_rate(config: dict[str, Any], run_dir: Path) -> Suggestion | None:
+def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """Train with a rate that grows from step to step; print, write and return what it suggests.
 
     The chosen optimiser with its other settings; no schedule, no validation, no checkpoint.
 
-    Args:
-        config: The composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
-
     Raises:
-        UserError: A choice or an option is wrong.
+        UserError: A choice is wrong.
         RunError: The loss is not finite from the start.
     """
-    first, last, num_steps = _range(config["lr_finder"])
-    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
-    if config["resume"] is not None:
+    first, last = config.lr_finder.min_lr, config.lr_finder.max_lr
+    if config.resume is not None:
         raise UserError(
-            f"resume={config['resume']} with job=lr_finder", "init_from=…, or neither", "leave it"
+            f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "leave it"
         )
-    seed_everything(seed, verbose=False)
-    parts = build_parts(config["data"])
-    datamodule = build_datamodule(config["data"], parts, seed)
+    seed_everything(config.seed, verbose=False)
+    parts = build_parts(config.data)
+    datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
-    system = build_system(_at_rate(config, first), parts, "")
+    short = _short_training(config, first)
+    system = build_system(short, parts, "")
     system.make_scheduler = exponential(first, last)
     sweep = RateSweep()
-    trainer = build_trainer(_sweep_config(config, num_steps), run_dir, [sweep])
-    record.write_config(run_dir, config)
-    record.write_environment(run_dir, seed, "")
+    trainer = build_trainer(short, run_dir, [sweep])
+    record.write_config(run_dir, config.plain)
+    record.write_environment(run_dir, config.seed, "")
     trainer.fit(system, datamodule=datamodule)
     if len(sweep.rates) < _MIN_STEPS:
         raise RunError(
@@ -67,38 +60,29 @@ def find_learning_rate(config: dict[str, Any], run_dir: Path) -> Suggestion | No
             "set a smaller lr_finder.min_lr"
         )
     found = _report(sweep, run_dir)
-    write_job_readme(run_dir, f"Learning rate of {config['model']['name']}")
+    write_job_readme(run_dir, f"Learning rate of {config.model.name}")
     return found
 
 
-def _range(options: Mapping[str, Any]) -> tuple[float, float, int]:
-    first = check_number("lr_finder.min_lr", options["min_lr"], _LOWEST, _HIGHEST)
-    last = check_number("lr_finder.max_lr", options["max_lr"], _LOWEST, _HIGHEST)
-    if last <= first:
-        raise UserError(
-            f"lr_finder.max_lr={last:g}", f"above lr_finder.min_lr={first:g}", "widen the range"
-        )
-    name = "lr_finder.num_steps"
-    return first, last, check_integer(name, options["num_steps"], _MIN_STEPS, _MOST)
-
-
-def _at_rate(config: dict[str, Any], rate: float) -> dict[str, Any]:
-    return {**config, "optimizer": {**config["optimizer"], "lr": rate}, "scheduler": {}}
-
-
-def _sweep_config(config: Mapping[str, Any], num_steps: int) -> dict[str, Any]:
-    """Return the config of the short training."""
-    trainer = {
-        **config["trainer"],
-        "max_steps": num_steps,
-        "max_epochs": _MOST,
-        "limit_val_batches": 0,
-        "enable_checkpointing": False,
-        "devices": 1,
-        "num_nodes": 1,
-        "strategy": "auto",
-    }
-    return {**config, "trainer": trainer, "callbacks": {}, "ema": None}
+def _short_training(config: RunConfig, rate: float) -> RunConfig:
+    """Return the config of a training that begins at a rate, without all that is not needed."""
+    trainer = replace(
+        config.trainer,
+        max_steps=config.lr_finder.num_steps,
+        max_epochs=_MOST,
+        devices=1,
+        num_nodes=1,
+        strategy="auto",
+        lightning={
+            **config.trainer.lightning,
+            "limit_val_batches": 0,
+            "enable_checkpointing": False,
+        },
+    )
+    optimizer = {**config.optimizer, "lr": rate}
+    return replace(
+        config, trainer=trainer, optimizer=optimizer, scheduler={}, callbacks={}, ema=None
+    )
 
 
 def _report(sweep: RateSweep, run_dir: Path) -> Suggestion | None:
