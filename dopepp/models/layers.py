@@ -14,8 +14,8 @@ from typing import Final
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
-from dopepp.models.registry import check_number
 
 MIN_WIDTH: Final = 1 / 64
 MAX_WIDTH: Final = 4.0

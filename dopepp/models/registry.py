@@ -12,7 +12,6 @@ registry of its kind (``BACKBONES.register(…)``).
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
@@ -190,41 +189,3 @@ def _check_plain(value: object, where: str) -> None:
             "null, true/false, numbers, text, and lists and mappings of them",
             "write a plain value",
         )
-
-
-def check_number(name: str, value: object, lowest: float, highest: float) -> float:
-    """Return a finite real number of a closed range.
-
-    Raises:
-        UserError: It is not a number of that range.
-    """
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or not lowest <= value <= highest:  # type: ignore[arg-type, operator]
-        raise UserError(
-            f"{name}={value!r:.100}", f"a number from {lowest:g} to {highest:g}", f"change {name}"
-        )
-    return float(value)  # type: ignore[arg-type]
-
-
-def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
-    """Return an integer of a closed range.
-
-    Raises:
-        UserError: It is not an integer of that range.
-    """
-    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
-        raise UserError(
-            f"{name}={value!r:.100}", f"an integer from {lowest} to {highest}", f"change {name}"
-        )
-    return value
-
-
-def check_flag(name: str, value: object) -> bool:
-    """Return a truth value.
-
-    Raises:
-        UserError: It is neither true nor false.
-    """
-    if not isinstance(value, bool):
-        raise UserError(f"{name}={value!r:.100}", "true or false", f"change {name}")
-    return value

@@ -25,8 +25,9 @@ from typing import (
     get_type_hints,
 )
 
+from dopepp.core.checks import check_flag, check_integer, check_number
 from dopepp.core.errors import UserError
-from dopepp.models.registry import TARGET, check_flag, check_integer, check_number
+from dopepp.models.registry import TARGET
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import rates_figure
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.reports.tables import (
     Figure,
     PassRate,

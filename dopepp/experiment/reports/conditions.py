@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.data.sample import Sample, Source
 from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
-from dopepp.drawing.curves import rates_figure
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.experiment.reports.evaluators import FileMethod, Method, image_id
 from dopepp.experiment.reports.report import Measured, Report, accumulators, measure

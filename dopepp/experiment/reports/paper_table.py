@@ -19,9 +19,9 @@ import numpy as np
 from scipy.stats import t
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.drawing.curves import rates_figure
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
 from dopepp.experiment.reports.conditions import SHADING
 from dopepp.experiment.reports.differences import figures, noise, row_figures, summary

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.experiment.reports.breakdown import QUANTITIES
-from dopepp.models.registry import check_integer
 
 SHORT_NAMES: Final = {"scale": "scale_factors"}
 """What evaluate.py calls an option on the command line, and the option: ``scale`` alone, without

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import require
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -241,11 +241,5 @@ def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
 
 def _small_gicp() -> ModuleType:
     """Import small_gicp when it is asked for."""
-    try:
-        return import_module("small_gicp")
-    except ImportError as error:
-        raise UserError(
-            "refine=depth without the package small_gicp",
-            "an installation with the extra: pip install 'dopepp[depth]'",
-            "install it, or leave refine out",
-        ) from error
+    require("small_gicp", "refine=depth", "depth")
+    return import_module("small_gicp")

@@ -56,14 +56,14 @@ class Table:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_range(self, "distance", 0.02, 100.0, "metres")
-        check_range(self, "elevation_deg", 10.0, 90.0, "degrees")
-        check_number(self, "roll_deg", 0.0, 180.0, "degrees")
-        check_number(self, "tilted_share", 0.0, 1.0, "share")
-        check_range(self, "tilt_deg", 0.0, 90.0, "degrees")
-        check_flag(self, "heaped")
-        check_range(self, "heap_radius", 0.0, 10.0, "diameters")
-        check_range(self, "picture_width", 0.1, 20.0, "camera distances")
+        check_range("distance", self.distance, 0.02, 100.0, "metres", of=self)
+        check_range("elevation_deg", self.elevation_deg, 10.0, 90.0, "degrees", of=self)
+        check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
+        check_number("tilted_share", self.tilted_share, 0.0, 1.0, "share", of=self)
+        check_range("tilt_deg", self.tilt_deg, 0.0, 90.0, "degrees", of=self)
+        check_flag("heaped", self.heaped, of=self)
+        check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
+        check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
 
     def draw_view(self, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
