@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
@@ -66,9 +67,7 @@ class Wireframe:
 
 
 def overlay(
-    image: UInt8[np.ndarray, "height width 3"],
-    wireframes: Sequence[Wireframe],
-    min_width_px: int = MIN_WIDTH_PX,
+    image: Picture, wireframes: Sequence[Wireframe], min_width_px: int = MIN_WIDTH_PX
 ) -> UInt8[np.ndarray, "out_height out_width 3"]:
     """Draw wireframes and their legend on a copy of the image, enlarged if it is narrow.
 
@@ -89,11 +88,8 @@ def overlay(
 
 
 def draw_wireframe(
-    image: UInt8[np.ndarray, "height width 3"],
-    keypoints: Float[np.ndarray, "9 2"],
-    colour: Colour = YELLOW,
-    thickness: int = 1,
-) -> UInt8[np.ndarray, "height width 3"]:
+    image: Picture, keypoints: Float[np.ndarray, "9 2"], colour: Colour = YELLOW, thickness: int = 1
+) -> Picture:
     """Draw one cuboid, anti-aliased, on a copy of the image.
 
     Edges with a keypoint that is not finite are left out; those that leave the image are cut.
@@ -120,9 +116,7 @@ def draw_wireframe(
     return canvas
 
 
-def enlarge(
-    image: UInt8[np.ndarray, "height width 3"], factor: int
-) -> UInt8[np.ndarray, "out_height out_width 3"]:
+def enlarge(image: Picture, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
     """Enlarge a copy of the image by a whole factor; ``resize_points`` moves keypoints along.
 
     Raises:
@@ -137,7 +131,7 @@ def enlarge(
 
 
 def draw_line(
-    canvas: UInt8[np.ndarray, "height width 3"],
+    canvas: Picture,
     start: Float[np.ndarray, "2"],
     end: Float[np.ndarray, "2"],
     colour: tuple[int, ...],
@@ -179,11 +173,7 @@ def _clip(
 
 
 def draw_text(
-    image: UInt8[np.ndarray, "height width 3"],
-    text: str,
-    position: tuple[int, int],
-    size_px: int,
-    colour: tuple[int, int, int],
+    image: Picture, text: str, position: tuple[int, int], size_px: int, colour: tuple[int, int, int]
 ) -> None:
     """Write one line IN PLACE on a darkened box; what leaves the image is cut off.
 

@@ -9,11 +9,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from dopepp.drawing.curves import figure_with_axes
 from dopepp.drawing.overlay import Colour, draw_line, draw_text
+from dopepp.drawing.pictures import Picture
 
 _SMOOTHING: Final = 50
 """A line of more points than this is drawn as a moving average over 1/50 of them, above its own
@@ -105,9 +106,7 @@ def smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     return np.asarray(np.convolve(values, window, mode="same") / counted)
 
 
-def grid(
-    pictures: Sequence[UInt8[np.ndarray, "height width 3"]], columns: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     """Put pictures side by side, row by row, on white.
 
     Raises:
@@ -128,7 +127,7 @@ def grid(
     return np.concatenate(bands)
 
 
-def message_picture(width: int, height: int, text: str) -> UInt8[np.ndarray, "height width 3"]:
+def message_picture(width: int, height: int, text: str) -> Picture:
     """Return an empty picture that says why it is empty; lines beyond its height are cut."""
     picture = np.full((height, width, 3), _GREY, np.uint8)
     size = max(10, int(_TEXT_SHARE * width))
@@ -141,10 +140,7 @@ def message_picture(width: int, height: int, text: str) -> UInt8[np.ndarray, "he
     return picture
 
 
-def mask_panel(
-    image: UInt8[np.ndarray, "height width 3"],
-    masks: Sequence[Bool[np.ndarray, "height width"] | None],
-) -> UInt8[np.ndarray, "height width 3"]:
+def mask_panel(image: Picture, masks: Sequence[Bool[np.ndarray, "height width"] | None]) -> Picture:
     """Paint each instance's visible pixels in its colour on the darkened, grey image."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
     panel = _GROUND * grey.astype(np.float64)
@@ -157,7 +153,7 @@ def mask_panel(
 
 def depth_panel(
     depth: Float[np.ndarray, "height width"], shown: Bool[np.ndarray, "height width"]
-) -> tuple[UInt8[np.ndarray, "height width 3"], str]:
+) -> tuple[Picture, str]:
     """Colour depth from near (red) to far (blue); unknown depth is black.
 
     Args:
@@ -182,9 +178,7 @@ def depth_panel(
     return np.asarray(panel, np.uint8), f"depth: red {near:.3f} m to blue {far:.3f} m"
 
 
-def draw_axes(
-    image: UInt8[np.ndarray, "height width 3"], ends: Float[np.ndarray, "4 2"], thickness: int = 2
-) -> None:
+def draw_axes(image: Picture, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
     """Draw the object frame's axes IN PLACE.
 
     Args:

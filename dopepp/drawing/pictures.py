@@ -22,6 +22,9 @@ from PIL import Image, UnidentifiedImageError
 
 from dopepp.core.errors import UserError
 
+Picture = UInt8[np.ndarray, "height width 3"]
+"""RGB, first row on top."""
+
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
 """Formats that are nothing but pixels: PIL would hand EPS to another program."""
 
@@ -42,7 +45,7 @@ _JPEG: Final = b"\xff\xd8"
 _JPEG_END: Final = b"\xff\xd9"
 
 
-def read_picture(path: Path, longest_px: int | None = None) -> UInt8[np.ndarray, "height width 3"]:
+def read_picture(path: Path, longest_px: int | None = None) -> Picture:
     """Return a picture as RGB, first row on top.
 
     Args:
@@ -129,7 +132,7 @@ def read_image(path: Path) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def read_rgb(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+def read_rgb(path: Path) -> Picture:
     """Read an 8-bit frame as RGB; an alpha channel is dropped, grey becomes three channels.
 
     Raises:

@@ -8,10 +8,10 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from dopepp.drawing.overlay import text_coverage
 from dopepp.drawing.panels import grid
+from dopepp.drawing.pictures import Picture
 
 _GAP_PX: Final = 6
 _CAPTION_PX: Final = 18
@@ -28,13 +28,11 @@ class Tile:
         caption: One line below it; empty for none.
     """
 
-    image: UInt8[np.ndarray, "height width 3"]
+    image: Picture
     caption: str = ""
 
 
-def contact_sheet(
-    tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320
-) -> UInt8[np.ndarray, "height width 3"]:
+def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> Picture:
     """Lay tiles out row by row on white, each scaled to one width with its shape kept.
 
     Args:
@@ -57,7 +55,7 @@ def contact_sheet(
     return np.pad(grid(drawn, columns), ((0, gap), (0, gap), (0, 0)), constant_values=255)
 
 
-def _draw_tile(tile: Tile, width: int) -> UInt8[np.ndarray, "height width 3"]:
+def _draw_tile(tile: Tile, width: int) -> Picture:
     """Scale the picture and put its caption, shrunk to fit, below it."""
     scale = width / tile.image.shape[1]
     height = max(1, round(tile.image.shape[0] * scale))

@@ -10,8 +10,8 @@ import numpy as np
 from lightning.pytorch import seed_everything
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import figure_with_axes
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.config.run import RunConfig

@@ -9,32 +9,37 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.rotation import RotationMatrix, Vector
+
+Transform = Float[np.ndarray, "4 4"]
+"""``T_a_b``, rigid: it maps frame b into frame a, metres."""
+
+CameraMatrix = Float[np.ndarray, "3 3"]
+"""K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
 
 
 def transform(
-    T_a_b: Float[np.ndarray, "4 4"], points_b: Float[np.ndarray, "*batch 3"]
+    T_a_b: Transform, points_b: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
     """Map points from frame b into frame a with a rigid 4×4 transform."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
-def make_transform(
-    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def make_transform(rotation: RotationMatrix, translation: Vector) -> Transform:
     """Put a rotation and a translation into a 4×4 rigid transform (float64)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation
     return T
 
 
-def invert_transform(T_a_b: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def invert_transform(T_a_b: Transform) -> Transform:
     """Return T_b_a of a rigid transform T_a_b."""
     rotation = T_a_b[:3, :3].T
     return make_transform(rotation, -rotation @ T_a_b[:3, 3])
 
 
 def project(
-    points_cam: Float[np.ndarray, "*batch 3"], K: Float[np.ndarray, "3 3"]
+    points_cam: Float[np.ndarray, "*batch 3"], K: CameraMatrix
 ) -> Float[np.ndarray, "*batch 2"]:
     """Project camera-frame points (metres) to pixels; points at or behind the camera become NaN."""
     points_cam = np.asarray(points_cam, np.float64)
@@ -45,22 +50,18 @@ def project(
 
 
 def project_keypoints(
-    cuboid: Float[np.ndarray, "9 3"],
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    K: Float[np.ndarray, "3 3"],
+    cuboid: Float[np.ndarray, "9 3"], T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "9 2"]:
     """Project an object's nine keypoints to pixels (NaN where one is behind the camera)."""
     return project(transform(T_cam_obj, cuboid), K)
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> CameraMatrix:
     """Assemble K from focal lengths and principal point, all in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def resize_camera(
-    K: Float[np.ndarray, "3 3"], scale_x: float, scale_y: float
-) -> Float[np.ndarray, "3 3"]:
+def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatrix:
     """Follow an image resize: u becomes s·(u + ½) − ½ because pixel 0 is a pixel's centre."""
     resized = np.array(K, np.float64)
     resized[0] *= scale_x
@@ -116,7 +117,7 @@ class Letterbox:
         method = cv2.INTER_AREA if self.scale_x < 1 else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(image, (self.width, self.height), interpolation=method))
 
-    def camera(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    def camera(self, K: CameraMatrix) -> CameraMatrix:
         """Return K for the letterboxed image."""
         return resize_camera(K, self.scale_x, self.scale_y)
 
@@ -131,9 +132,7 @@ class Letterbox:
         return resize_points(points_px, 1 / self.scale_x, 1 / self.scale_y)
 
 
-def check_camera(
-    K: Float[np.ndarray, "3 3"], image_size: tuple[int, int], source: str
-) -> Float[np.ndarray, "3 3"]:
+def check_camera(K: CameraMatrix, image_size: tuple[int, int], source: str) -> CameraMatrix:
     """Return K as float64 after checking that it can belong to an image of (width, height).
 
     Raises:
@@ -163,7 +162,7 @@ def check_camera(
     return K
 
 
-def _is_pinhole(K: Float[np.ndarray, "3 3"]) -> bool:
+def _is_pinhole(K: CameraMatrix) -> bool:
     """Tell whether what must be 0 or 1 is so, within the digits of a calibration file."""
     fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])
     return bool(np.nanmax(np.abs(K - fixed)) <= 1e-6)

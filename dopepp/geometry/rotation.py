@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+Vector = Float[np.ndarray, "3"]
+RotationMatrix = Float[np.ndarray, "3 3"]
 
-def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+
+def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> RotationMatrix:
     """Turn a quaternion of any non-zero norm into a rotation matrix.
 
     Raises:
@@ -27,7 +30,7 @@ def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> Float[np.nd
     )
 
 
-def matrix_to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+def matrix_to_quaternion(rotation: RotationMatrix) -> Float[np.ndarray, "4"]:
     """Turn a rotation matrix into its unit quaternion (w, x, y, z) with w >= 0.
 
     The quaternion is the leading eigenvector of Bar-Itzhack's symmetric 4×4 matrix (J. Guidance
@@ -81,12 +84,12 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
     return np.asarray(np.arctan2(np.linalg.norm(axial, axis=-1), trace - 1.0))
 
 
-def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+def random_rotation(rng: np.random.Generator) -> RotationMatrix:
     """Draw a rotation uniformly over SO(3): a normalised 4-D Gaussian is a uniform quaternion."""
     return quaternion_to_matrix(rng.normal(size=4))
 
 
-def is_rotation(rotation: Float[np.ndarray, "3 3"], tolerance: float = 1e-3) -> bool:
+def is_rotation(rotation: RotationMatrix, tolerance: float = 1e-3) -> bool:
     """Tell whether a 3×3 matrix is finite, orthogonal within ``tolerance`` and right-handed."""
     rotation = np.asarray(rotation, np.float64)
     return bool(

@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import Letterbox, check_camera, project_keypoints
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Letterbox, check_camera, project_keypoints
 from dopepp.inference.refinement.depth import DepthRefiner
 from dopepp.inference.refinement.view import checked_depth, undistorted_depth
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
@@ -80,8 +81,8 @@ class PoseEstimator:
 
     def predict(
         self,
-        image: UInt8[np.ndarray, "height width 3"],
-        K: Float[np.ndarray, "3 3"],
+        image: Picture,
+        K: CameraMatrix,
         distortion: Float[np.ndarray, "coefficients"] | None = None,
         depth: Float[np.ndarray, "height width"] | None = None,
     ) -> list[Detection]:
@@ -119,9 +120,7 @@ class PoseEstimator:
             return detections
         return [_refined(self.refiner, one, cuboids[one.object], depth, K) for one in detections]
 
-    def explain(
-        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"]
-    ) -> list[str]:
+    def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
         """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
 
         Raises:
@@ -134,8 +133,8 @@ class PoseEstimator:
     def _decode(
         self,
         decoder: Callable[..., list[Decoded]],
-        image: UInt8[np.ndarray, "height width 3"],
-        K: Float[np.ndarray, "3 3"],
+        image: Picture,
+        K: CameraMatrix,
         letterbox: Letterbox,
     ) -> list[Decoded]:
         """Give an image's maps to :func:`recover` or :func:`explain`."""
@@ -144,7 +143,7 @@ class PoseEstimator:
         K, stride = letterbox.camera(K), self.network.stride
         return decoder(belief, field, self.cuboids, K, stride, names, **vars(self.recovery))
 
-    def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
+    def maps(self, image: Picture) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""
         pixels = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
         with torch.inference_mode():
@@ -170,7 +169,7 @@ def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
 
 
 def letterboxed(
-    image: UInt8[np.ndarray, "height width 3"], letterbox: Letterbox, multiple: int
+    image: Picture, letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
     image = letterbox.image(image)
@@ -178,9 +177,7 @@ def letterboxed(
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
 
 
-def _checked(
-    image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"]
-) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "3 3"]]:
+def _checked(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMatrix]:
     """Check that the arguments are an RGB image and its camera matrix."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
@@ -212,7 +209,7 @@ def _refined(
     detection: Detection,
     cuboid: Float[np.ndarray, "9 3"],
     depth: Float[np.ndarray, "height width"],
-    K: Float[np.ndarray, "3 3"],
+    K: CameraMatrix,
 ) -> Detection:
     """Refine a detection with depth, or keep it where depth is in doubt."""
     refined = refiner.refine(detection.object, detection.T_cam_obj, depth, K, detection.covariance)
@@ -228,10 +225,7 @@ def _refined(
 
 
 def _in_original(
-    detection: Detection,
-    cuboid: Float[np.ndarray, "9 3"],
-    letterbox: Letterbox,
-    K: Float[np.ndarray, "3 3"],
+    detection: Detection, cuboid: Float[np.ndarray, "9 3"], letterbox: Letterbox, K: CameraMatrix
 ) -> Detection:
     """Express a detection's pixels in the original image; the pose is the same in both."""
     return replace(

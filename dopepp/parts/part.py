@@ -13,14 +13,22 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
 from dopepp.geometry.cuboid import NUM_KEYPOINTS, cuboid_keypoints
 from dopepp.geometry.rotation import is_rotation
 from dopepp.geometry.symmetry import ContinuousSymmetry
 from dopepp.parts.mesh.decimate import MAX_FACES, decimate
-from dopepp.parts.mesh.measure import hash_triangles, largest_distance, sample_surface
+from dopepp.parts.mesh.measure import (
+    Faces,
+    Points,
+    Vertices,
+    hash_triangles,
+    largest_distance,
+    sample_surface,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -51,10 +59,10 @@ class Mesh:
         texture: RGB texture image, uint8, first row on top; None for an untextured part.
     """
 
-    vertices: Float[np.ndarray, "vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
+    vertices: Vertices
+    faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
-    texture: UInt8[np.ndarray, "height width 3"] | None = None
+    texture: Picture | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ class Part:
     name: str
     cuboid: Float[np.ndarray, "9 3"]
     diameter: float
-    points: Float[np.ndarray, "points 3"]
+    points: Points
     mesh: Mesh | None = None
     mesh_hash: str = ""
     symmetries_discrete: Float[np.ndarray, "symmetries 4 4"] | None = None
@@ -126,7 +134,7 @@ FIELDS: Final = tuple(field.name for field in fields(Part) if field.name != "mes
 def make_part(
     name: str,
     mesh: Mesh | None,
-    points: Float[np.ndarray, "points 3"] | None = None,
+    points: Points | None = None,
     *,
     symmetries_discrete: Float[np.ndarray, "symmetries 4 4"] | None = None,
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = (),

@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.rotation import RotationMatrix, Vector, rotation_angle
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
-from dopepp.parts.mesh.measure import SurfaceTree, largest_distance
+from dopepp.parts.mesh.measure import Points, SurfaceTree, largest_distance
 from dopepp.parts.part import Mesh
 from dopepp.parts.symmetry_candidates import Candidates, turn
 
@@ -94,7 +94,7 @@ class _Shape:
         self._few = self.surface.spread(500, seed=3)[0]
         self._many = np.concatenate([corners, centres, self.surface.spread(_NUM_PROBES, seed=4)[0]])
 
-    def fits(self, rotation: Float[np.ndarray, "3 3"]) -> bool:
+    def fits(self, rotation: RotationMatrix) -> bool:
         """Tell whether the turned surface lies on the surface."""
         for probes in (self._few, self._many):
             moved = probes @ rotation.T
@@ -108,13 +108,13 @@ class _Shape:
                     return False
         return True
 
-    def is_round(self, axis: Float[np.ndarray, "3"]) -> bool:
+    def is_round(self, axis: Vector) -> bool:
         """Tell whether every turn about an axis fits."""
         golden = (np.sqrt(5) - 1) / 2
         angles = 2 * np.pi * (golden * np.arange(1, _NUM_ANGLES + 1) % 1)
         return all(self.fits(turn(axis, float(angle))) for angle in angles)
 
-    def order(self, axis: Float[np.ndarray, "3"], prime: int) -> int:
+    def order(self, axis: Vector, prime: int) -> int:
         """Return the most equal turns about an axis that fit, a multiple of a prime."""
         orders = range(MAX_ORDER - MAX_ORDER % prime, prime, -prime)
         return next((n for n in orders if self.fits(turn(axis, 2 * np.pi / n))), prime)
@@ -127,18 +127,16 @@ class _Shape:
         pairs = zip(rotations, shifts, strict=True)
         return _clean(np.array([make_transform(*pair) for pair in pairs]).reshape(-1, 4, 4))
 
-    def axis(self, axis: Float[np.ndarray, "3"]) -> ContinuousSymmetry:
+    def axis(self, axis: Vector) -> ContinuousSymmetry:
         """Return an axis through the centre with the point on it that is nearest the origin."""
         offset = self.centre - (self.centre @ axis) * axis
         return tuple(_clean(axis).tolist()), tuple(_clean(offset).tolist())
 
 
-def _search(
-    shape: _Shape,
-) -> tuple[Float[np.ndarray, "3"] | None, list[Float[np.ndarray, "3 3"]]]:
+def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
     """Return the first axis of continuous symmetry, or None and rotations that fit."""
     candidates = Candidates(shape.surface)
-    generators: list[tuple[int, Float[np.ndarray, "3 3"]]] = []
+    generators: list[tuple[int, RotationMatrix]] = []
     group = np.eye(3)[None]
     for prime in _PRIMES:
         for axis in candidates.axes(prime):
@@ -157,7 +155,7 @@ def _search(
 
 
 def _largest_group(
-    shape: _Shape, generators: list[Float[np.ndarray, "3 3"]]
+    shape: _Shape, generators: list[RotationMatrix]
 ) -> Float[np.ndarray, "rotations 3 3"]:
     """Return a group of rotations that all fit, without the identity.
 
@@ -171,19 +169,19 @@ def _largest_group(
     return group[1:]
 
 
-def _across(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _across(axis: Vector) -> Vector:
     """Return a direction across an axis, a coordinate axis where one is."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))
 
 
-def _signed(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _signed(axis: Vector) -> Vector:
     """Point an axis so that its largest coordinate is positive."""
     return axis if axis[np.abs(axis).argmax()] > 0 else -axis
 
 
-def _some(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "some 3"]:
+def _some(points: Points) -> Float[np.ndarray, "some 3"]:
     """Return at most ``_NUM_PROBES`` of the points, evenly."""
     return points[:: -(-len(points) // _NUM_PROBES)]
 

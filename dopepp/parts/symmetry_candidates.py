@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.geometry.rotation import RotationMatrix, Vector, rotation_vector_to_matrix
 from dopepp.parts.mesh.measure import SurfaceTree, half_sphere
 
 _NUM_DIRECTIONS: Final = 1500
@@ -85,7 +85,7 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
     # The largest triangles suffice: flat areas that matter have some among them.
     largest = np.argsort(-surface.areas, kind="stable")[:3000]
     normals, areas = surface.normals[largest], surface.areas[largest].copy()
-    found: list[Float[np.ndarray, "3"]] = []
+    found: list[Vector] = []
     while len(found) < _NUM_CLUSTERS and areas.any():
         alike = np.abs(normals @ normals[areas.argmax()]) > np.cos(_CLUSTER_ANGLE)
         found.append(normals[areas.argmax()])
@@ -108,7 +108,7 @@ class Candidates:
         self._rough_probes = surface.spread(48, seed=1)[0]
         self._probes = surface.spread(400, seed=2)[0]
 
-    def axes(self, order: int) -> Iterator[Float[np.ndarray, "3"]]:
+    def axes(self, order: int) -> Iterator[Vector]:
         """Yield refined axes of a prime order, those with the smallest rough distance first."""
         turns = turn(self._axes, 2 * np.pi / order)
         change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
@@ -118,7 +118,7 @@ class Candidates:
         moved = self._rough_probes @ np.swapaxes(turns[index], 1, 2)
         rough = self._surface.distances(moved, neighbours=1).mean(axis=1)
         index, rough = index[rough < _ROUGH], rough[rough < _ROUGH]
-        taken: list[Float[np.ndarray, "3"]] = []
+        taken: list[Vector] = []
         for number in index[np.argsort(rough, kind="stable")]:
             axis = self._axes[number]
             if taken and np.abs(np.array(taken) @ axis).max() > np.cos(_NEIGHBOURHOOD):
@@ -128,9 +128,7 @@ class Candidates:
             if len(taken) == _MOST:
                 return
 
-    def _refined(
-        self, axis: Float[np.ndarray, "3"], order: int, special: bool
-    ) -> Float[np.ndarray, "3"]:
+    def _refined(self, axis: Vector, order: int, special: bool) -> Vector:
         """Aim an axis so that the turned surface lies on the surface as well as it can."""
         rotation = turn(axis, 2 * np.pi / order)
         for _ in range(_REFINEMENTS):
@@ -145,7 +143,7 @@ class Candidates:
             return axis
         return better
 
-    def _step(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    def _step(self, rotation: RotationMatrix) -> Vector:
         """Return the rotation vector that brings the turned points nearest to their planes."""
         moved = self._probes @ rotation.T
         closest, normals = self._surface.nearest(moved)
@@ -156,6 +154,6 @@ class Candidates:
         normal_matrix = (lever * weight[:, None]).T @ lever + 1e-4 * np.eye(3)
         return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
 
-    def _error(self, axis: Float[np.ndarray, "3"], order: int) -> float:
+    def _error(self, axis: Vector, order: int) -> float:
         moved = self._probes @ turn(axis, 2 * np.pi / order).T
         return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))

@@ -12,15 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from dopepp.drawing.overlay import (
-    BLUE,
-    GREEN,
-    YELLOW,
-    Wireframe,
-    draw_wireframe,
-    enlarge,
-    overlay,
-)
+from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, draw_wireframe, enlarge, overlay
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints, resize_points
 from dopepp.geometry.cuboid import CENTROID, EDGES, cuboid_keypoints
 from dopepp.geometry.rotation import random_rotation

@@ -79,9 +79,7 @@ def test_rotation_vectors_come_in_batches_down_to_zero() -> None:
 @given(
     AXES,
     st.one_of(
-        st.floats(0, np.pi),
-        st.floats(0, 1e-6),
-        st.floats(0, 1e-6).map(lambda small: np.pi - small),
+        st.floats(0, np.pi), st.floats(0, 1e-6), st.floats(0, 1e-6).map(lambda small: np.pi - small)
     ),
 )
 def test_rotation_angle_keeps_its_digits_near_0_and_pi(axis: list[float], angle: float) -> None:

@@ -164,29 +164,18 @@ def test_noise_on_a_peak_moves_it_little() -> None:
     assert 8 * np.sqrt((error**2).mean()) < 0.15
 
 
-def test_threshold() -> None:
-    belief = torch.maximum(gaussians((5.0, 5.0), height=0.3), gaussians((20.0, 20.0), height=0.6))
-    assert len(positions(find_peaks(belief, GEOMETRY, threshold=0.2))) == 2
-    assert positions(find_peaks(belief, GEOMETRY, threshold=0.4)) == pytest.approx(
-        np.array([[20.0, 20.0]]), abs=1e-3
-    )
-    assert len(positions(find_peaks(belief, GEOMETRY, threshold=0.6001))) == 0
-
-
-def test_max_peaks_keeps_the_strongest() -> None:
+def test_the_strongest_above_the_threshold_fill_the_slots() -> None:
     heights = [0.3, 0.9, 0.5, 0.7]
     maps = [gaussians((5.0 + 6 * k, 15.0), height=h) for k, h in enumerate(heights)]
-    peaks = find_peaks(torch.stack(maps).amax(0), GEOMETRY, max_peaks=3)
+    belief = torch.cat([torch.stack(maps).amax(0), gaussians((9.0, 9.0), height=0.6)], dim=1)
+    peaks = find_peaks(belief, GEOMETRY, max_peaks=3)
     assert peaks.score[0, 0].tolist() == pytest.approx([0.9, 0.7, 0.5])
     assert positions(peaks)[:, 0] == pytest.approx([11.0, 23.0, 17.0], abs=1e-3)
-
-
-def test_slots_without_a_peak_are_marked() -> None:
-    belief = torch.cat([gaussians((5.0, 5.0), (20.0, 20.0)), gaussians((9.0, 9.0))], dim=1)
-    peaks = find_peaks(belief, GEOMETRY, max_peaks=2)
-    assert peaks.found.tolist() == [[[True, True], [True, False]]]
-    assert np.isnan(peaks.position[0, 1, 1]).all()
-    assert peaks.score[0, 1, 1] == 0
+    assert peaks.found.tolist() == [[[True] * 3, [True, False, False]]]
+    assert np.isnan(peaks.position[0, 1, 1:]).all()
+    assert peaks.score[0, 1, 1:].tolist() == [0, 0]
+    for threshold, count in ((0.2, 4), (0.6, 2), (0.9001, 0)):
+        assert len(positions(find_peaks(belief, GEOMETRY, threshold=threshold))) == count
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])

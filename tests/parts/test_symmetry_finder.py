@@ -10,7 +10,6 @@ from trimesh.creation import box, cone, cylinder, icosphere
 from trimesh.transformations import translation_matrix
 
 from dopepp.core.errors import UserError
-from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh
 from dopepp.parts.symmetry import find_symmetries
 
@@ -115,12 +114,6 @@ def test_a_larger_tolerance_overlooks_a_smaller_hole() -> None:
     mesh = as_mesh(plate((30, 10, 4)))
     assert len(find_symmetries(mesh, 0.01)[0]) == 0
     assert len(find_symmetries(mesh, 0.05)[0]) == 3
-
-
-@pytest.mark.parametrize("part", [pivconnector, servoholder])
-def test_the_built_in_parts_have_none(part) -> None:
-    discrete, continuous = find_symmetries(part().mesh)
-    assert len(discrete) == len(continuous) == 0
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 0.5, float("nan")])

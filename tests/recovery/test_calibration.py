@@ -114,11 +114,7 @@ def test_corners_behind_the_camera_have_no_say() -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    belief=st.floats(0, 1),
-    error=st.floats(0, 1e6),
-    variance=st.floats(0, 1e12),
-)
+@given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
 def test_features_are_finite_whatever_the_detection(
     belief: float, error: float, variance: float
 ) -> None:

@@ -72,13 +72,6 @@ def test_two_objects_in_one_network(
             assert scene.error(["box", "plate"].index(one.object), one.T_cam_obj) < 0.1
 
 
-def test_an_object_that_is_absent_is_not_found(
-    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
-) -> None:
-    scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
-    assert [one.object for one in recover(*scene.maps(), scene.cuboids, scene.K)] == ["1"]
-
-
 @pytest.mark.parametrize("name", ["box", "plate"])
 def test_three_missing_corners_are_borne(
     name: str, request: pytest.FixtureRequest, make_scene: Make, pose: Make
@@ -139,8 +132,13 @@ def test_a_part_with_its_origin_elsewhere(make_scene: Make, pose: Make) -> None:
         assert scene.error(0, one.T_cam_obj) < 0.1
 
 
-def test_empty_maps_give_nothing(box: np.ndarray, K: np.ndarray) -> None:
-    assert recover(torch.zeros(9, 52, 52), torch.zeros(16, 52, 52), box[None], K) == []
+def test_what_is_absent_is_not_found(
+    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
+) -> None:
+    scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
+    belief, field = scene.maps()
+    assert [one.object for one in recover(belief, field, scene.cuboids, scene.K)] == ["1"]
+    assert recover(0 * belief, 0 * field, scene.cuboids, scene.K) == []
 
 
 @pytest.mark.parametrize("kind", ["uniform", "sparse", "constant", "nan", "inf", "field nan"])
@@ -210,27 +208,23 @@ def test_any_width_of_the_peaks(
 
 
 @pytest.mark.parametrize(
-    ("belief", "field"),
+    ("belief", "field", "names", "message"),
     [
-        ((8, 20, 20), (16, 20, 20)),
-        ((9, 20, 20), (8, 20, 20)),
-        ((18, 20, 20), (32, 20, 20)),
-        ((9, 20, 20), (16, 20, 21)),
+        ((8, 20, 20), (16, 20, 20), None, r"1 objects need \(9, 16\) belief and field channels"),
+        ((9, 20, 20), (8, 20, 20), None, r"1 objects need \(9, 16\)"),
+        ((18, 20, 20), (32, 20, 20), None, r"1 objects need \(9, 16\)"),
+        ((9, 20, 20), (16, 20, 21), None, r"1 objects need \(9, 16\)"),
+        ((9, 20, 20), (16, 20, 20), ["a", "b"], "1 objects need as many names"),
     ],
 )
-def test_channels_must_fit_the_objects(
-    belief: tuple[int, ...], field: tuple[int, ...], box: np.ndarray, K: np.ndarray
-) -> None:
-    with pytest.raises(ValueError, match=r"1 objects need \(9, 16\) belief and field channels"):
-        recover(torch.zeros(belief), torch.zeros(field), box[None], K)
-
-
-def test_cameras_and_names_must_fit(box: np.ndarray, K: np.ndarray) -> None:
-    maps = torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8)
+def test_maps_and_names_must_fit_the_objects(
+    belief: tuple[int, ...], field: tuple[int, ...], names: list[str] | None, message: str,
+    box: np.ndarray, K: np.ndarray,
+) -> None:  # fmt: skip
+    with pytest.raises(ValueError, match=message):
+        recover(torch.zeros(belief), torch.zeros(field), box[None], K, names=names)
     with pytest.raises(ValueError, match="2 images need as many camera matrices"):
-        recover_batch(*maps, box[None], K)
-    with pytest.raises(ValueError, match="1 objects need as many names"):
-        recover_batch(*maps, box[None], np.stack([K, K]), names=["a", "b"])
+        recover_batch(torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8), box[None], K)
 
 
 @pytest.mark.parametrize(

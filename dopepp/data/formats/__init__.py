@@ -6,7 +6,7 @@ assembled when all of them are there, from items that are staged in a hidden fol
 
 To add a format, write a folder beside these with a source (:mod:`dopepp.data.sample`) that reports
 to a :class:`~dopepp.data.formats.problems.Problems`, a check (:mod:`dopepp.data.check`), and, if it
-is to be rendered, a :class:`Writer` and one line in ``WRITERS`` of :mod:`dopepp.data.jobs.work`.
+is to be rendered, a :class:`Writer` and one line in ``WRITERS`` of :mod:`dopepp.data.jobs.job`.
 """
 
 from __future__ import annotations

@@ -17,8 +17,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.core.errors import UserError
-from dopepp.geometry.camera import invert_transform, make_transform, transform
+from dopepp.core.errors import require
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    invert_transform,
+    make_transform,
+    transform,
+)
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.fit import Fit, Prior, Terms, fit_of, make_prior, outline_terms
 from dopepp.inference.refinement.search import best_shift
@@ -82,7 +88,7 @@ class Refinement:
         fit: How well the refined pose fits the depth; None where there was nothing to fit.
     """
 
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     covariance: Float[np.ndarray, "6 6"] | None = None
     reason: str = ""
     fit: Fit | None = None
@@ -110,9 +116,9 @@ class DepthRefiner:
     def refine(
         self,
         name: str,
-        T_cam_obj: Float[np.ndarray, "4 4"],
+        T_cam_obj: Transform,
         depth: Float[np.ndarray, "height width"],
-        K: Float[np.ndarray, "3 3"],
+        K: CameraMatrix,
         covariance: Float[np.ndarray, "6 6"] | None = None,
     ) -> Refinement:
         """Refine one pose.
@@ -158,7 +164,7 @@ class DepthRefiner:
         diameter: float,
         prior: Prior,
         seen: Bool[np.ndarray, "points"],
-    ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None:
+    ) -> tuple[Transform, Float[np.ndarray, "6 6"]] | None:
         """Search and descend, coarse to fine; return the pose and the information behind it.
 
         ``seen`` are the visible points at the prior's pose.
@@ -197,16 +203,14 @@ class DepthRefiner:
 
     def _plane_terms(
         self, surface: SurfacePoints, seen: Bool[np.ndarray, "points"]
-    ) -> Callable[[DepthView, Overlay, Float[np.ndarray, "4 4"], float], Terms]:
+    ) -> Callable[[DepthView, Overlay, Transform, float], Terms]:
         """Return small_gicp's point-to-plane terms against a part's visible points."""
         gicp = self._gicp
         target = gicp.PointCloud(surface.points[seen])
         tree = gicp.KdTree(target)
         gicp.estimate_normals(target, tree, PLANE_NEIGHBOURS)
 
-        def terms(
-            view: DepthView, overlay: Overlay, pose: Float[np.ndarray, "4 4"], reach: float
-        ) -> Terms:
+        def terms(view: DepthView, overlay: Overlay, pose: Transform, reach: float) -> Terms:
             covered = overlay.covered & (np.abs(overlay.offset) <= reach)
             points = view.points(covered)
             points = points[:: -(-len(points) // MOST_PIXELS) or 1]
@@ -228,9 +232,7 @@ class DepthRefiner:
         return terms
 
 
-def _moved(
-    pose: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "4 4"]:
+def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
     """Turn a pose about the object's origin and shift it, both in camera axes."""
     return make_transform(
         rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
@@ -239,11 +241,5 @@ def _moved(
 
 def _small_gicp() -> ModuleType:
     """Import small_gicp when it is asked for."""
-    try:
-        return import_module("small_gicp")
-    except ImportError as error:
-        raise UserError(
-            "refine=depth without the package small_gicp",
-            "an installation with the extra: pip install 'dopepp[depth]'",
-            "install it, or leave refine out",
-        ) from error
+    require("small_gicp", "refine=depth", "depth")
+    return import_module("small_gicp")

@@ -19,6 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from dopepp.geometry.camera import Transform
+from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.view import COVERED, GATE, DepthView, Overlay, lay_over
 from dopepp.inference.refinement.visible import SurfacePoints
 
@@ -66,16 +68,16 @@ class Prior:
         information: Of (turn about the object's origin, shift), camera axes, radians and metres.
     """
 
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     information: Float[np.ndarray, "6 6"]
 
-    def offset(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
+    def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
         """Return the turn and the shift from a pose to the prior's."""
         # OpenCV's Rodrigues rounds turns below 1e-5 to none.
         turn = Rotation.from_matrix(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T).as_rotvec()
         return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
 
-    def doubt(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> str:
+    def doubt(self, T_cam_obj: Transform) -> str:
         """Say why a pose contradicts the image; empty where it does not."""
         offset = self.offset(T_cam_obj)
         distance = math.sqrt(max(0.0, float(offset @ self.information @ offset)))
@@ -85,9 +87,7 @@ class Prior:
 
 
 def make_prior(
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    diameter: float,
-    covariance: Float[np.ndarray, "6 6"] | None = None,
+    T_cam_obj: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None = None
 ) -> Prior:
     """Return the prior of a pose, with a broad covariance where none is given.
 
@@ -144,10 +144,7 @@ class Fit:
 
 
 def fit_of(
-    view: DepthView,
-    surface: SurfacePoints,
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    seen: Bool[np.ndarray, "points"],
+    view: DepthView, surface: SurfacePoints, T_cam_obj: Transform, seen: Bool[np.ndarray, "points"]
 ) -> Fit:
     """Measure the agreement of a pose, and of the points it shows, with a depth view."""
     overlay = lay_over(view, surface, seen, T_cam_obj)
@@ -187,11 +184,7 @@ Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
 
 
 def outline_terms(
-    view: DepthView,
-    overlay: Overlay,
-    origin: Float[np.ndarray, "3"],
-    spacing: float,
-    reach: float,
+    view: DepthView, overlay: Overlay, origin: Vector, spacing: float, reach: float
 ) -> Terms:
     """Return the pull of the outline.
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.fit import Prior
 from dopepp.inference.refinement.view import DepthView
 
@@ -41,10 +42,10 @@ def best_shift(
     view: DepthView,
     points: Float[np.ndarray, "points 3"],
     prior: Prior,
-    moved: Float[np.ndarray, "3"],
+    moved: Vector,
     step: float,
     tolerance: float,
-) -> Float[np.ndarray, "3"] | None:
+) -> Vector | None:
     """Return the shift in camera axes that most points agree on; None where too few have depth.
 
     Args:

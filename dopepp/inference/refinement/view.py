@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_image
+from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.visible import SurfacePoints, plane_depth
 
 FARTHEST: Final = 50.0
@@ -116,7 +117,7 @@ def read_depth(path: Path, scale: float) -> Float32[np.ndarray, "height width"]:
 
 def undistorted_depth(
     depth: Float32[np.ndarray, "height width"],
-    K: Float[np.ndarray, "3 3"],
+    K: CameraMatrix,
     distortion: Float[np.ndarray, "coefficients"],
 ) -> Float32[np.ndarray, "height width"]:
     """Undistort depth as the image is, with each pixel's nearest value: a mean is no surface."""
@@ -137,7 +138,7 @@ class DepthView:
     """
 
     depth: Float[np.ndarray, "height width"]
-    K: Float[np.ndarray, "3 3"]
+    K: CameraMatrix
     rays: Float[np.ndarray, "height width 3"]
     noise: float
 
@@ -148,7 +149,7 @@ class DepthView:
 
 def view_around(
     depth: Float[np.ndarray, "height width"],
-    K: Float[np.ndarray, "3 3"],
+    K: CameraMatrix,
     points_cam: Float[np.ndarray, "points 3"],
 ) -> DepthView | None:
     """Cut out what a part at some pose can have to do with; None outside the image."""
@@ -204,10 +205,7 @@ class Overlay:
 
 
 def lay_over(
-    view: DepthView,
-    surface: SurfacePoints,
-    seen: Bool[np.ndarray, "points"],
-    T_cam_obj: Float[np.ndarray, "4 4"],
+    view: DepthView, surface: SurfacePoints, seen: Bool[np.ndarray, "points"], T_cam_obj: Transform
 ) -> Overlay | None:
     """Relate every pixel of a view to a posed part's nearest visible point; None if none is in it.
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import Transform
 
 MOST_POINTS: Final = 3000
 """More do not make a refinement better, only slower."""
@@ -98,9 +99,7 @@ def _normals(offsets: Float[np.ndarray, "points near 3"]) -> Float[np.ndarray, "
     return normals
 
 
-def visible(
-    surface: SurfacePoints, T_cam_obj: Float[np.ndarray, "4 4"]
-) -> Bool[np.ndarray, "points"]:
+def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Bool[np.ndarray, "points"]:
     """Tell which points no other part of the surface hides.
 
     Args:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dopepp.parts.mesh.measure import face_areas
+from dopepp.parts.mesh.measure import Faces, Vertices, face_areas
 
 MAX_FACES: Final = 200_000
 """Triangles of a part's mesh: on a part that fills 640×480 pixels, over one for two pixels."""
@@ -33,8 +33,8 @@ a direction open, as on a flat side, it decides."""
 
 
 def decimate(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
+    vertices: Vertices,
+    faces: Faces,
     uv: Float[np.ndarray, "vertices 2"] | None,
     max_faces: int = MAX_FACES,
 ) -> tuple[
@@ -72,7 +72,7 @@ def decimate(
 
 
 def _cluster(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], max_faces: int
+    vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
     """Find the grid that leaves most triangles under the limit.
 
@@ -97,7 +97,7 @@ def _cluster(
     return best_cells, best_kept
 
 
-def _cells(vertices: Float[np.ndarray, "vertices 3"], side: float) -> Int[np.ndarray, " vertices"]:
+def _cells(vertices: Vertices, side: float) -> Int[np.ndarray, " vertices"]:
     """Return each vertex's cell in a grid; cells that hold a vertex are numbered from 0."""
     offsets = vertices - vertices.min(axis=0)
     # A million cells along the longest side keep the numbers of cells within an int64.
@@ -107,7 +107,7 @@ def _cells(vertices: Float[np.ndarray, "vertices 3"], side: float) -> Int[np.nda
     return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
 
 
-def _surviving(corners: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " kept"]:
+def _surviving(corners: Faces) -> Int[np.ndarray, " kept"]:
     """Return one triangle for every three cells and direction around them."""
     a, b, c = corners.T
     candidates = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -131,9 +131,7 @@ def _means(
 
 
 def _place(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    cells: Int[np.ndarray, " vertices"],
+    vertices: Vertices, faces: Faces, cells: Int[np.ndarray, " vertices"]
 ) -> Float[np.ndarray, "cells 3"]:
     """Return each cell's point nearest to the planes of the triangles in it, by squared area.
 
@@ -163,9 +161,7 @@ def _place(
     return np.asarray(np.clip(means + offsets, lower, upper))
 
 
-def _islands(
-    faces: Int[np.ndarray, "faces 3"], cells: Int[np.ndarray, " vertices"]
-) -> Int[np.ndarray, " vertices"]:
+def _islands(faces: Faces, cells: Int[np.ndarray, " vertices"]) -> Int[np.ndarray, " vertices"]:
     """Number the groups of vertices that edges within one cell connect."""
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     inside = cells[start] == cells[end]

@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import whole_picture
-from dopepp.parts.mesh.measure import RawMesh, weld
+from dopepp.drawing.pictures import Picture, whole_picture
+from dopepp.parts.mesh.measure import RawMesh, Vertices, weld
 
 MAX_UNPACKED_BYTES: Final = 50_000_000
 """Of the text in a 3MF file: trimesh takes 17 times as much memory."""
@@ -254,9 +254,7 @@ def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
     return int(header["textures"][info["index"]]["source"])
 
 
-def _texture(
-    header: dict[str, Any], binary: bytes, picture: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def _texture(header: dict[str, Any], binary: bytes, picture: int) -> Picture:
     view = header["bufferViews"][header["images"][picture]["bufferView"]]
     start = view.get("byteOffset", 0)
     try:
@@ -307,9 +305,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     return RawMesh(np.concatenate(vertices), np.concatenate(faces), uv, unit=unit), len(uvs)
 
 
-def _moved(
-    vertices: Float[np.ndarray, "vertices 3"], transform: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "vertices 3"]:
+def _moved(vertices: Vertices, transform: Float[np.ndarray, "4 4"]) -> Vertices:
     if (transform == np.eye(4)).all():
         return vertices  # as they are: a product would make NaN of an infinite one's neighbours
     # Not a product of matrices, whose last digits depend on the processor.

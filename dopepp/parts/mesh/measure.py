@@ -11,9 +11,16 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import cdist
+
+from dopepp.drawing.pictures import Picture
+
+Vertices = Float[np.ndarray, "vertices 3"]
+Faces = Int[np.ndarray, "faces 3"]
+Points = Float[np.ndarray, "points 3"]
+"""Positions of corners, triangles as indices of three of them, and positions of anything else."""
 
 NUM_SURFACE_POINTS: Final = 2000
 """ADD points of a CAD part, a fixed number so that the results of two runs compare."""
@@ -40,27 +47,22 @@ triangle along an edge."""
 class RawMesh(NamedTuple):
     """What a format's reader returns: a file's triangles, in the unit that it states, if any."""
 
-    vertices: Float[np.ndarray, "vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
+    vertices: Vertices
+    faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
-    texture: UInt8[np.ndarray, "height width 3"] | None = None
+    texture: Picture | None = None
     unit: str | None = None
 
 
-def face_areas(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, " faces"]:
+def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
     """Return the area of each triangle."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
 def sample_surface(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    num_points: int = NUM_SURFACE_POINTS,
-    seed: int = SURFACE_SEED,
-) -> Float[np.ndarray, "points 3"]:
+    vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
+) -> Points:
     """Draw points uniformly over the surface: by area, and the same ones for the same seed.
 
     Raises:
@@ -86,7 +88,7 @@ def _points_inside(
     return np.asarray((1 - root) * a + root * (1 - along) * b + root * along * c)
 
 
-def largest_distance(points: Float[np.ndarray, "points 3"]) -> float:
+def largest_distance(points: Points) -> float:
     """Return the largest distance between two points.
 
     The two farthest points are vertices of the convex hull. Flat and straight sets have no hull in
@@ -124,9 +126,7 @@ def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
     return 2 * len(ConvexHull(sample, qhull_options="QJ").vertices) > len(sample)
 
 
-def _farthest(
-    some: Float[np.ndarray, "some 3"], points: Float[np.ndarray, "points 3"]
-) -> tuple[float, int]:
+def _farthest(some: Float[np.ndarray, "some 3"], points: Points) -> tuple[float, int]:
     """Return the largest distance from one of ``some`` to one of ``points``, and the latter."""
     best, end = -1.0, 0
     # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
@@ -137,9 +137,7 @@ def _farthest(
     return best, end
 
 
-def _longest_of_directions(
-    points: Float[np.ndarray, "points 3"],
-) -> Iterator[tuple[float, int]]:
+def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
     """Yield the distance between the two extreme points along each direction, and one of them.
 
     Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
@@ -163,18 +161,14 @@ def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
-def hash_triangles(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> str:
+def hash_triangles(vertices: Vertices, faces: Faces) -> str:
     """Return the SHA-256 of vertices (float64) and faces (int32) as little-endian bytes, hex."""
     digest = hashlib.sha256(np.ascontiguousarray(vertices, "<f8").tobytes())
     digest.update(np.ascontiguousarray(faces, "<i4").tobytes())
     return digest.hexdigest()
 
 
-def weld(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> tuple[Float[np.ndarray, "welded 3"], Int[np.ndarray, "faces 3"]]:
+def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"], Faces]:
     """Merge vertices at the same position; faces that lose a corner by it remain, flat."""
     # Adding 0.0 turns −0.0 into 0.0, which sorting would keep apart.
     positions = vertices + 0.0
@@ -201,9 +195,7 @@ class SurfaceTree:
         ValueError: The triangles have no area.
     """
 
-    def __init__(
-        self, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-    ) -> None:
+    def __init__(self, vertices: Vertices, faces: Faces) -> None:
         areas = face_areas(vertices, faces)
         if not areas.sum() > 0:
             raise ValueError(f"{len(faces)} triangles with a total area of {areas.sum()}")
@@ -220,9 +212,7 @@ class SurfaceTree:
         )
         self._owners = np.concatenate([self._owners, own, own, own, own])
 
-    def spread(
-        self, num_points: int, seed: int
-    ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " points"]]:
+    def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
         """Spread points over the surface, more evenly than at random, and name their triangles.
 
         The places along the summed area are equally spaced, those within the triangle random.
@@ -233,9 +223,7 @@ class SurfaceTree:
         owners = np.searchsorted(cumulative[:-1], places, side="right")
         return _points_inside(self.triangles[owners], rng), owners
 
-    def nearest(
-        self, points: Float[np.ndarray, "points 3"]
-    ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 3"]]:
+    def nearest(self, points: Points) -> tuple[Points, Points]:
         """Return the surface point nearest to each point, roughly, and the normal there."""
         owners = self._owners[self._tree.query(points)[1]]
         return _closest_on_triangles(points, self.triangles[owners]), self.normals[owners]

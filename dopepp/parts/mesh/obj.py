@@ -17,10 +17,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 import numpy as np
-from jaxtyping import UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import FORMATS, MAX_SIDE, read_picture
+from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
 from dopepp.parts.mesh.measure import RawMesh
 from dopepp.parts.mesh.polygons import FoldedPolygonError, fans
 
@@ -142,7 +141,7 @@ def read_obj(path: Path) -> RawMesh:
     return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
 
 
-def _texture(obj: ObjFile, path: Path) -> UInt8[np.ndarray, "height width 3"] | None:
+def _texture(obj: ObjFile, path: Path) -> Picture | None:
     """Read the one texture that the used materials name, or return None if they name none."""
     if not obj.libraries:
         return None
@@ -230,7 +229,7 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     return path
 
 
-def read_texture(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+def read_texture(path: Path) -> Picture:
     """Return an image as RGB, first row on top.
 
     Raises:

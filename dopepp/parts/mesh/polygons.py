@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
-from dopepp.parts.mesh.measure import RawMesh
+from dopepp.parts.mesh.measure import Faces, RawMesh, Vertices
 
 MAX_BYTES: Final = 50_000_000
 """Of an OFF file: its words take fifteen times as much memory."""
@@ -57,9 +57,7 @@ def read_off(path: Path) -> RawMesh:
 
 
 def fans(
-    vertices: Float[np.ndarray, "vertices 3"],
-    corners: Int[np.ndarray, " corners"],
-    counts: Int[np.ndarray, " polygons"],
+    vertices: Vertices, corners: Int[np.ndarray, " corners"], counts: Int[np.ndarray, " polygons"]
 ) -> Int[np.ndarray, "triangles 3"]:
     """Cut polygons into fans of triangles around their first corners.
 
@@ -91,9 +89,7 @@ def fans(
 
 
 def _folded(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    polygons: Int[np.ndarray, " faces"],
+    vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
 ) -> Bool[np.ndarray, " faces"]:
     """Tell triangles that face against their polygon, or whose polygon cancels out."""
     a, b, c = vertices[faces].swapaxes(0, 1)

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from dopepp.core.errors import UserError
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
-from dopepp.parts.mesh.measure import RawMesh, face_areas
+from dopepp.parts.mesh.measure import Faces, Points, RawMesh, Vertices, face_areas
 from dopepp.parts.mesh.obj import read_obj
 from dopepp.parts.mesh.ply import read_ply
 from dopepp.parts.mesh.polygons import read_off
@@ -132,7 +131,7 @@ def ycb_part(root: str | Path, name: str) -> Part:
     return make_part(name, mesh, _read_points(points_path), unit="m")
 
 
-def _read_points(path: Path) -> Float[np.ndarray, "points 3"]:
+def _read_points(path: Path) -> Points:
     allowed = "lines of three finite numbers"
     try:
         if path.stat().st_size > MAX_POINTS_BYTES:
@@ -175,9 +174,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     )
 
 
-def _outward(
-    path: Path, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Int[np.ndarray, "faces 3"]:
+def _outward(path: Path, vertices: Vertices, faces: Faces) -> Faces:
     """Make neighbouring triangles face the same way, and say what is unusual about their edges."""
     topology = find_topology(vertices, faces)
     if not topology.is_closed:

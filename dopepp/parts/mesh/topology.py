@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from dopepp.parts.mesh.measure import face_areas, weld
+from dopepp.parts.mesh.measure import Faces, Vertices, face_areas, weld
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,7 @@ class Topology:
         return self.num_open == self.num_crowded == 0
 
 
-def find_topology(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Topology:
+def find_topology(vertices: Vertices, faces: Faces) -> Topology:
     """Find the edges of triangles that all have an area."""
     positions, corners = weld(vertices, faces)
     start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
@@ -61,9 +59,7 @@ def find_topology(
 
 
 def opposed_faces(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    topology: Topology,
+    vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
     """Find triangles to turn over so that all of a connected surface face the same way.
 
@@ -85,9 +81,7 @@ def opposed_faces(
     return turned
 
 
-def turn_over(
-    faces: Int[np.ndarray, "faces 3"], turned: Bool[np.ndarray, " faces"]
-) -> Int[np.ndarray, "faces 3"]:
+def turn_over(faces: Faces, turned: Bool[np.ndarray, " faces"]) -> Faces:
     """Reverse the corners of the marked triangles."""
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
@@ -113,9 +107,7 @@ def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np
 
 
 def _inverted_bodies(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    topology: Topology,
+    vertices: Vertices, faces: Faces, topology: Topology
 ) -> Bool[np.ndarray, " faces"]:
     """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
     one, other = topology.neighbours.T
@@ -133,9 +125,7 @@ def _inverted_bodies(
     return np.asarray(inverted[bodies])
 
 
-def _signed_volumes(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, " faces"]:
+def _signed_volumes(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
     """Return the volume between each triangle and the middle, negative where it faces that."""
     a, b, c = (vertices - vertices.mean(axis=0))[faces].swapaxes(0, 1)
     return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from dopepp.models.registry import check_number
+from dopepp.core.checks import check_number
 
 TRAINED: Final = "trained_state"
 """Checkpoint entry of the weights that training goes on with; ``state_dict`` are the averaged."""

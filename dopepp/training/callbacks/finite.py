@@ -20,13 +20,13 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 from torch.optim import Optimizer
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import RunError
 from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
 from dopepp.drawing.overlay import GREEN, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.models.checkpoint.storage import write_atomic
-from dopepp.models.registry import check_integer
 
 _log = logging.getLogger(__name__)
 

@@ -27,9 +27,9 @@ import torch
 from jaxtyping import Float, UInt8
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from dopepp.core.files import figure_image, write_png
+from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
-from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
