@@ -25,7 +25,7 @@ from dopepp.data.transforms.resize import pad_sample, resize_sample
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry
-from dopepp.training.system import draw_maps
+from dopepp.training.targets import draw_maps
 
 BELIEF_NOISE: Final = 0.005
 FIELD_NOISE: Final = 0.05
