@@ -9,7 +9,7 @@ from dopepp.experiment.command_line import entry, run_job
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(config: DictConfig) -> float | None:
     """Run one job and return what a search maximises."""
-    from dopepp.experiment.jobs import do_job
+    from dopepp.experiment.train import do_job
 
     return run_job(config, do_job)
 

@@ -14,8 +14,7 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.model_writer import model_info
-from dopepp.data.formats.bop.models import ModelInfo, parse_models
+from dopepp.data.formats.bop.models import ModelInfo, model_info, parse_models
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 from dopepp.parts.symmetry import TOLERANCE, find_symmetries

@@ -1,9 +1,7 @@
-"""Curves: share of poses below a threshold.
+"""Curves: the share of poses below a threshold, and rates over what makes a task harder.
 
 Figures are objects (:class:`matplotlib.figure.Figure`), never pyplot's global state, so threads
 and tests cannot see each other's. ``figure_image`` turns one into pixels.
-
-Rates with their confidence intervals, over a quantity that makes a task harder.
 """
 
 from __future__ import annotations
@@ -27,6 +25,8 @@ MAX_THRESHOLD: Final = 0.1
 
 _NUM_STEPS: Final = 200
 """Steps of a curve: 0.5 mm each up to 0.1 m."""
+
+_PANEL_INCHES: Final = (5.2, 4.0)
 
 
 def accuracy_curve(
@@ -111,9 +111,6 @@ def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:
         return 0.0
     # fmin passes NaN over, which makes it the miss it is.
     return float(np.mean(1 - np.fmin(errors, max_threshold) / max_threshold))
-
-
-_PANEL_INCHES: Final = (5.2, 4.0)
 
 
 @dataclass(frozen=True)

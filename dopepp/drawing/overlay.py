@@ -1,9 +1,8 @@
-"""Wireframes of objects' cuboids on the image, so that a person can judge a pose.
+"""Wireframes of objects' cuboids, lines and text on an image, so that a person can judge a pose.
 
-The +z face is drawn bright and thick with an arrow head on it that points to +y; so, unless that
-face is seen edge-on, every orientation looks different, even of a cube.
-
-Text on images, in any script matplotlib's own font has (cv2's fonts know ASCII only).
+A cuboid's +z face is drawn bright and thick with an arrow head on it that points to +y; so, unless
+that face is seen edge-on, every orientation looks different, even of a cube. Text is in any script
+that matplotlib's own font has, where cv2's fonts know ASCII only.
 """
 
 from __future__ import annotations
@@ -25,60 +24,15 @@ from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 _POINTS_PER_PX = 72 / 100
 """At 100 dots per inch a pixel is 0.72 typographic points."""
 
-
-def draw_text(
-    image: UInt8[np.ndarray, "height width 3"],
-    text: str,
-    position: tuple[int, int],
-    size_px: int,
-    colour: tuple[int, int, int],
-) -> None:
-    """Write one line IN PLACE on a darkened box; what leaves the image is cut off.
-
-    Args:
-        image: RGB.
-        text: The line.
-        position: Column and row of its top left corner, pixels, not negative.
-        size_px: Height of the line, pixels.
-        colour: RGB.
-    """
-    column, row = position
-    place = image[row : row + size_px, column:]
-    coverage = text_coverage(text, size_px)[: place.shape[0], : place.shape[1], None]
-    place = place[:, : coverage.shape[1]]
-    # Half-dark ground keeps any colour readable on any picture.
-    place[:] = np.rint(0.5 * place * (1 - coverage) + np.array(colour) * coverage)
-
-
-@lru_cache(maxsize=256)
-def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
-    """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
-    # Wide enough for any glyph (an em each), cut to the measured width afterwards.
-    width = size_px * (len(text) + 1)
-    figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    # 0.72 of the line is the em, so that ascenders and descenders stay inside.
-    label = figure.text(
-        size_px / 4 / width,
-        0.28,
-        text,
-        fontsize=0.72 * size_px * _POINTS_PER_PX,
-        va="baseline",
-        parse_math=False,
-    )
-    canvas.draw()  # type: ignore[no-untyped-call]
-    used = int(np.ceil(label.get_window_extent().x1 + size_px / 4))
-    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    return 1.0 - pixels[:, :used, 0] / 255.0
-
-
 Colour = tuple[int, int, int]
 """RGB, 0..255."""
 
 YELLOW: Final[Colour] = (255, 221, 0)
 """Predicted; DOPE++ where two networks are compared (paper Fig. 14)."""
+
 GREEN: Final[Colour] = (40, 220, 60)
 """Ground truth."""
+
 BLUE: Final[Colour] = (70, 165, 255)
 """The DOPE baseline (paper Fig. 14)."""
 
@@ -87,8 +41,10 @@ MIN_WIDTH_PX: Final = 640
 
 _FRACTION_BITS: Final = 4
 """cv2 takes sub-pixel coordinates as integers, here in 1/16 pixel."""
+
 _BACK_SHADE: Final = 0.8
 """Brightness of the edges off the +z face."""
+
 _FRONT: Final = frozenset(np.flatnonzero(CORNER_SIGNS[:, 2] > 0).tolist())
 _FRONT_BOTTOM: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [-1, 1]).all(axis=1)).tolist())
 _FRONT_TOP: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [1, 1]).all(axis=1)).tolist())
@@ -154,13 +110,13 @@ def draw_wireframe(
     front = [edge for edge in EDGES if _FRONT.issuperset(edge)]
     for a, b in EDGES:
         if (a, b) not in front:
-            _line(canvas, points[a], points[b], shade, thickness)
+            draw_line(canvas, points[a], points[b], shade, thickness)
     tip = points[list(_FRONT_TOP)].mean(axis=0)
     for a in _FRONT_BOTTOM:
-        _line(canvas, points[a], tip, colour, thickness)
+        draw_line(canvas, points[a], tip, colour, thickness)
     for a, b in front:
-        _line(canvas, points[a], points[b], colour, thickness + 1)
-    _line(canvas, points[CENTROID], points[CENTROID], colour, thickness + 3)
+        draw_line(canvas, points[a], points[b], colour, thickness + 1)
+    draw_line(canvas, points[CENTROID], points[CENTROID], colour, thickness + 3)
     return canvas
 
 
@@ -180,14 +136,17 @@ def enlarge(
     return np.asarray(resized, np.uint8)
 
 
-def _line(
+def draw_line(
     canvas: UInt8[np.ndarray, "height width 3"],
     start: Float[np.ndarray, "2"],
     end: Float[np.ndarray, "2"],
     colour: tuple[int, ...],
     thickness: int,
 ) -> None:
-    """Draw a segment in place; equal ends make a dot, ends that are not finite nothing."""
+    """Draw a segment IN PLACE, anti-aliased, between positions in pixels.
+
+    Equal ends make a dot, ends that are not finite nothing.
+    """
     clipped = _clip(start, end, canvas.shape[1], canvas.shape[0], margin=2 * thickness)
     if clipped is None:
         return
@@ -217,3 +176,49 @@ def _clip(
     if first > last:
         return None
     return start + first * direction, start + last * direction
+
+
+def draw_text(
+    image: UInt8[np.ndarray, "height width 3"],
+    text: str,
+    position: tuple[int, int],
+    size_px: int,
+    colour: tuple[int, int, int],
+) -> None:
+    """Write one line IN PLACE on a darkened box; what leaves the image is cut off.
+
+    Args:
+        image: RGB.
+        text: The line.
+        position: Column and row of its top left corner, pixels, not negative.
+        size_px: Height of the line, pixels.
+        colour: RGB.
+    """
+    column, row = position
+    place = image[row : row + size_px, column:]
+    coverage = text_coverage(text, size_px)[: place.shape[0], : place.shape[1], None]
+    place = place[:, : coverage.shape[1]]
+    # Half-dark ground keeps any colour readable on any picture.
+    place[:] = np.rint(0.5 * place * (1 - coverage) + np.array(colour) * coverage)
+
+
+@lru_cache(maxsize=256)
+def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
+    """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
+    # Wide enough for any glyph (an em each), cut to the measured width afterwards.
+    width = size_px * (len(text) + 1)
+    figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    # 0.72 of the line is the em, so that ascenders and descenders stay inside.
+    label = figure.text(
+        size_px / 4 / width,
+        0.28,
+        text,
+        fontsize=0.72 * size_px * _POINTS_PER_PX,
+        va="baseline",
+        parse_math=False,
+    )
+    canvas.draw()  # type: ignore[no-untyped-call]
+    used = int(np.ceil(label.get_window_extent().x1 + size_px / 4))
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    return 1.0 - pixels[:, :used, 0] / 255.0

@@ -1,7 +1,4 @@
-"""Lines of several methods in one figure, and figures beside each other as one picture.
-
-Panels that show a labelled image: instance masks in colours, depth as colour, object axes.
-"""
+"""Panels of a sheet: lines of several methods, an image's masks, depth and axes, a message."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from matplotlib.figure import Figure
 
 from dopepp.drawing.curves import figure_with_axes
-from dopepp.drawing.overlay import Colour, draw_text
+from dopepp.drawing.overlay import Colour, draw_line, draw_text
 
 _SMOOTHING: Final = 50
 """A line of more points than this is drawn as a moving average over 1/50 of them, above its own
@@ -26,8 +23,27 @@ _WHITE: Final = 255
 _GREY: Final = 225
 _TEXT_SHARE: Final = 0.05
 """Height of a line of a message, as a share of the picture's width."""
+
 _CHARACTER_SHARE: Final = 0.52
 """Mean width of a character, as a share of the line's height."""
+
+COLOURS: Final[tuple[Colour, ...]] = (
+    (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
+    (145, 30, 180), (70, 240, 240), (240, 50, 230), (210, 245, 60), (250, 190, 212),
+)  # fmt: skip
+"""Of the first, second, … instance; easy to tell apart, also with most colour blindness."""
+
+AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
+"""x red, y green, z blue, as everywhere."""
+
+_GROUND: Final = 0.35
+"""Brightness of the image below the masks."""
+
+_COVER: Final = 0.65
+"""Opacity of a mask."""
+
+_MARGIN: Final = 0.1
+"""The colour scale is wider than the objects' depths by this share of their range at both ends."""
 
 
 @dataclass(frozen=True)
@@ -125,28 +141,6 @@ def message_picture(width: int, height: int, text: str) -> UInt8[np.ndarray, "he
     return picture
 
 
-COLOURS: Final[tuple[Colour, ...]] = (
-    (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
-    (145, 30, 180), (70, 240, 240), (240, 50, 230), (210, 245, 60), (250, 190, 212),
-)  # fmt: skip
-"""Of the first, second, … instance; easy to tell apart, also with most colour blindness."""
-
-AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
-"""x red, y green, z blue, as everywhere."""
-
-_GROUND: Final = 0.35
-"""Brightness of the image below the masks."""
-
-_COVER: Final = 0.65
-"""Opacity of a mask."""
-
-_MARGIN: Final = 0.1
-"""The colour scale is wider than the objects' depths by this share of their range at both ends."""
-
-_FRACTION_BITS: Final = 4
-"""cv2 takes sub-pixel coordinates as integers, here in 1/16 pixel."""
-
-
 def mask_panel(
     image: UInt8[np.ndarray, "height width 3"],
     masks: Sequence[Bool[np.ndarray, "height width"] | None],
@@ -199,11 +193,8 @@ def draw_axes(
             finite or far outside is left out.
         thickness: Pixels.
     """
-    # cv2 overflows far outside of the image.
+    # A tip that far outside of the image belongs to an object beside the camera.
     bound = 10 * max(image.shape)
-    visible = np.isfinite(ends).all(axis=1) & (np.abs(np.nan_to_num(ends)) < bound).all(axis=1)
-    points = np.rint(np.where(visible[:, None], ends, 0) * (1 << _FRACTION_BITS)).astype(int)
-    for tip, colour in zip((1, 2, 3), AXIS_COLOURS, strict=True):
-        if visible[0] and visible[tip]:
-            start, end = points[0].tolist(), points[tip].tolist()
-            cv2.line(image, start, end, colour, thickness, cv2.LINE_AA, _FRACTION_BITS)
+    for tip, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
+        if (np.abs([ends[0], tip]) < bound).all():
+            draw_line(image, ends[0], tip, colour, thickness)

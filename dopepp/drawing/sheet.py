@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.drawing.overlay import text_coverage
+from dopepp.drawing.panels import grid
 
 _GAP_PX: Final = 6
 _CAPTION_PX: Final = 18
@@ -48,20 +49,12 @@ def contact_sheet(
         raise ValueError(
             f"a sheet needs tiles, columns and a width, got {len(tiles)}, {columns}, {tile_width}"
         )
-    columns = min(columns, len(tiles))
-    drawn = [_draw_tile(tile, tile_width) for tile in tiles]
-    rows = [drawn[i : i + columns] for i in range(0, len(drawn), columns)]
-    heights = [max(picture.shape[0] for picture in row) for row in rows]
-    height = sum(heights) + _GAP_PX * (len(rows) + 1)
-    width = columns * tile_width + _GAP_PX * (columns + 1)
-    sheet = np.full((height, width, 3), 255, np.uint8)
-    top = _GAP_PX
-    for row, row_height in zip(rows, heights, strict=True):
-        for column, picture in enumerate(row):
-            left = _GAP_PX + column * (tile_width + _GAP_PX)
-            sheet[top : top + picture.shape[0], left : left + tile_width] = picture
-        top += row_height + _GAP_PX
-    return sheet
+    gap = _GAP_PX
+    drawn = [
+        np.pad(_draw_tile(tile, tile_width), ((gap, 0), (gap, 0), (0, 0)), constant_values=255)
+        for tile in tiles
+    ]
+    return np.pad(grid(drawn, columns), ((0, gap), (0, gap), (0, 0)), constant_values=255)
 
 
 def _draw_tile(tile: Tile, width: int) -> UInt8[np.ndarray, "height width 3"]:

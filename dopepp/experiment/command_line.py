@@ -86,7 +86,6 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)
-        _refuse_parallel_multirun(plain)
         if remote.goes_on(plain, run_dir):
             plain["resume"] = str(run_dir)
         result = job(plain, run_dir)
@@ -94,7 +93,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     except KeyboardInterrupt:
         if not remote.is_remote(str(HydraConfig.get().launcher._target_)):
             # What is finished: Hydra ends without its hook.
-            compare_jobs(Path(HydraConfig.get().sweep.dir), _plain(config))
+            compare_jobs(Path(HydraConfig.get().sweep.dir), config)
         raise
     except PrunedError as end:
         display.console.print(f"pruned {end}")
@@ -122,20 +121,6 @@ def _plain(config: DictConfig) -> dict[str, Any]:
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
-
-
-def _refuse_parallel_multirun(config: dict[str, Any]) -> None:
-    """Refuse jobs of several processes, of which each would start as the first one did."""
-    from dopepp.experiment.build.hardware import num_processes
-
-    options = config.get("trainer", {})
-    if num_processes(options) > 1:
-        asked = {key: options[key] for key in ("devices", "num_nodes") if key in options}
-        raise UserError(
-            " ".join(f"trainer.{key}={value}" for key, value in asked.items()) + " in a multirun",
-            "one process per job: each further process would run the whole sweep again",
-            "set trainer.devices=1 and start one process, or run the jobs one by one",
-        )
 
 
 def entry(

@@ -1,8 +1,11 @@
 """``job=cost``: what a network costs in parameters, operations and time (paper Tables 4 and 8).
 
-Nothing is trained. A frame's time is that of the whole way from a picture of the configured data's
-test set, at its own resolution, to poses (:mod:`dopepp.experiment.timing` says how an untrained
-network can go it), with the network's share beside it.
+Nothing is trained. A frame goes the whole way of
+:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a picture of the configured data's
+test set at its own resolution to poses. An untrained network finds nothing, and nothing would take
+no time. So the network's own maps are made, timed and put aside, and poses are recovered from what
+a trained network would answer: the true maps of the picture's objects, with noise
+(:data:`BELIEF_NOISE`).
 """
 
 from __future__ import annotations
@@ -12,26 +15,33 @@ import platform
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import cycle, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import nn
 
 from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.data.batch import collate
 from dopepp.data.sample import Sample
+from dopepp.data.transforms.resize import pad_sample, resize_sample
 from dopepp.drawing.panels import PlotLine, lines_figure
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_test_source, held_out_seed
+from dopepp.experiment.build.sources import build_parts, build_test_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
+from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.tables import Row, csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
-from dopepp.experiment.timing import WARM_UP, FrameTimes, RehearsedEstimator, time_frames
+from dopepp.geometry.camera import Letterbox
+from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
+from dopepp.maps.encode import MapGeometry
 from dopepp.models.network import PoseNetwork, network_cost
-from dopepp.models.registry import check_integer
 from dopepp.parts.part import Part
+from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"
@@ -42,9 +52,18 @@ NOTE: Final = (
 )
 """What a reader of the times must know."""
 
+BELIEF_NOISE: Final = 0.005
+FIELD_NOISE: Final = 0.05
+"""Standard deviations, cell by cell, of what is added to true maps. Recovery then takes as long as
+on the maps of the three released networks, within about a tenth: 7 to 8 peaks an image, there 9
+(``benchmarks/decode.py``). The 0.02 of the crowds in ``benchmarks/recovery.py`` is no trained
+network's: it fills every channel with peaks, 144 an image, and takes nearly twice as long."""
+
+WARM_UP: Final = 3
+"""Passes that allocate memory, choose kernels and compile; they are not timed."""
+
 _NUM_PICTURES: Final = 8
 _BATCHES: Final = 3
-_MAX: Final = 10**6
 
 
 @dataclass(frozen=True)
@@ -100,30 +119,57 @@ class NetworkCost:
         }
 
 
-def measure_cost(config: Mapping[str, Any], run_dir: Path) -> NetworkCost:
-    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times.
+@dataclass(frozen=True)
+class FrameTimes:
+    """Seconds that frames took, in their order.
 
-    Args:
-        config: The composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
-
-    Raises:
-        UserError: A choice or an option is wrong.
+    Attributes:
+        seconds: From picture to poses.
+        network_seconds: Of the network in them: from the resized picture to maps.
+        recovery_seconds: From maps to poses in them; the rest resizes and pads.
     """
-    num_frames = check_integer("cost.num_frames", config["cost"]["num_frames"], 1, _MAX)
-    batch_size = check_integer("cost.batch_size", config["cost"]["batch_size"], 1, _MAX)
-    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
-    torch.manual_seed(seed)
-    has_gpu = torch.cuda.is_available() and config["trainer"]["accelerator"] != "cpu"
-    parts = build_parts(config["data"])
+
+    seconds: Float[np.ndarray, "frames"]
+    network_seconds: Float[np.ndarray, "frames"]
+    recovery_seconds: Float[np.ndarray, "frames"]
+
+
+class RehearsedEstimator(PoseEstimator):
+    """An estimator that runs its network and then goes on with maps that it was given.
+
+    Attributes:
+        answer: Maps that the next prediction recovers poses from, on the estimator's device.
+        network_began: When the network was last given a picture, seconds of ``perf_counter``.
+        network_ended: When its maps were there.
+    """
+
+    answer: Maps
+    network_began: float
+    network_ended: float
+
+    def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
+        """Run the network on the image and return the answer in place of its maps."""
+        self.network_began = time.perf_counter()
+        super().maps(image)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # else the network would still be at work
+        self.network_ended = time.perf_counter()
+        return self.answer
+
+
+def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
+    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times."""
+    torch.manual_seed(config.seed)
+    has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
+    parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
-    samples = _pictures(config["data"], parts)
+    samples = _pictures(config.data, parts)
     estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
-    geometry = map_geometry(config["maps"], network.stride)
-    frames = time_frames(estimator, samples, geometry, num_frames, seed)
+    geometry = map_geometry(config.maps, network.stride)
+    frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
     cost = NetworkCost(
-        name=str(config["model"]["name"]),
+        name=config.model.name,
         backbone_weights=_num_weights(network.backbone),
         parameters=parameters,
         gmacs=gmacs,
@@ -134,12 +180,12 @@ def measure_cost(config: Mapping[str, Any], run_dir: Path) -> NetworkCost:
         ms_per_frame=1000 * float(np.median(frames.seconds)),
         network_ms=1000 * float(np.median(frames.network_seconds)),
         recovery_ms=1000 * float(np.median(frames.recovery_seconds)),
-        batch_size=batch_size,
-        frames_per_s=batch_size / _seconds_of_batch(network, batch_size, description.input_size),
+        batch_size=config.cost.batch_size,
+        frames_per_s=_frames_per_s(network, config.cost.batch_size, description.input_size),
     )
-    record.write_config(run_dir, config)
+    record.write_config(run_dir, config.plain)
     record.write_json(run_dir / COST_FILE, asdict(cost))
-    record.write_json(run_dir / record.VERSIONS_FILE, record.environment(seed, ""))
+    record.write_json(run_dir / record.VERSIONS_FILE, record.environment(config.seed, ""))
     write_whole(run_dir / FRAMES_FILE, csv_text(_frame_rows(frames)).encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
     write_job_readme(run_dir, f"Cost of {cost.name}")
@@ -149,6 +195,59 @@ def measure_cost(config: Mapping[str, Any], run_dir: Path) -> NetworkCost:
     )
     display.console.print(NOTE)
     return cost
+
+
+def time_frames(
+    estimator: RehearsedEstimator,
+    samples: Sequence[Sample],
+    geometry: MapGeometry,
+    num_frames: int,
+    seed: int,
+) -> FrameTimes:
+    """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
+
+    Args:
+        estimator: With any weights.
+        samples: Pictures with their truth, taken in turn.
+        geometry: Of the maps that a trained network would answer.
+        num_frames: How many are timed.
+        seed: Of the maps' noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    rehearsed = [
+        (one, likely_maps(one, estimator, geometry, generator=generator)) for one in samples
+    ]
+    rows = []
+    for sample, estimator.answer in islice(cycle(rehearsed), WARM_UP + num_frames):
+        began = time.perf_counter()
+        estimator.predict(sample.image, sample.K)
+        ended = time.perf_counter()
+        network = estimator.network_ended - estimator.network_began
+        rows.append((ended - began, network, ended - estimator.network_ended))
+    return FrameTimes(*np.array(rows[WARM_UP:]).T)
+
+
+def likely_maps(
+    sample: Sample,
+    estimator: PoseEstimator,
+    geometry: MapGeometry,
+    generator: torch.Generator,
+) -> Maps:
+    """Return the maps that a trained network would answer to a picture: the true ones, with noise.
+
+    They are those of the estimator's input, and on its device.
+    """
+    size = estimator.checkpoint.input_size
+    letterbox = Letterbox.fit(sample.size, size)
+    rows, columns, _ = letterboxed(sample.image, letterbox, estimator.network.size_multiple).shape
+    seen = pad_sample(resize_sample(sample, size), (columns, rows))
+    batch = collate([seen], {part.name: number for number, part in enumerate(estimator.parts)})
+    true = draw_maps(batch, batch.keypoints, len(estimator.parts), geometry)
+    belief, field = (
+        (one[0] + noise * torch.randn(one[0].shape, generator=generator)).to(estimator.device)
+        for one, noise in zip(true, (BELIEF_NOISE, FIELD_NOISE), strict=True)
+    )
+    return belief, field
 
 
 def read_frames(path: Path) -> FrameTimes:
@@ -162,13 +261,9 @@ def read_frames(path: Path) -> FrameTimes:
 
 
 def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
-    """Draw frames a second over time, two curves per network (paper Fig. 13).
+    """Draw frames a second over time into a PNG, two curves per network (paper Fig. 13).
 
-    From picture to poses, and dashed what the network alone would reach.
-
-    Args:
-        path: The PNG.
-        frames: Times of each frame, by name.
+    One is from picture to poses, the dashed one what the network alone would reach.
     """
     lines = [
         PlotLine(
@@ -183,9 +278,9 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
 
 
-def _pictures(data: Mapping[str, Any], parts: Sequence[Part]) -> list[Sample]:
+def _pictures(data: DataConfig, parts: Sequence[Part]) -> list[Sample]:
     """Render or read the first test pictures, so that no frame's time has that in it."""
-    source = build_test_source(data, parts, held_out_seed(data))
+    source = build_test_source(data, parts)
     return [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
 
 
@@ -203,8 +298,8 @@ def _num_weights(module: nn.Module) -> int:
 
 
 @torch.inference_mode()
-def _seconds_of_batch(network: PoseNetwork, batch_size: int, size: tuple[int, int]) -> float:
-    """Return the seconds of the fastest of some passes over random images."""
+def _frames_per_s(network: PoseNetwork, batch_size: int, size: tuple[int, int]) -> float:
+    """Return what the network alone reaches in the fastest of some passes over random images."""
     device = next(network.parameters()).device
     shape = (batch_size, 3, size[1], size[0])
     images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
@@ -216,4 +311,4 @@ def _seconds_of_batch(network: PoseNetwork, batch_size: int, size: tuple[int, in
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - start)
-    return min(times[WARM_UP:])
+    return batch_size / min(times[WARM_UP:])

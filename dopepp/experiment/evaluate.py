@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,23 @@ from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.build.objects import build_parts, check_data
 from dopepp.experiment.build.sources import (
+    build_parts,
     build_scaled_test_source,
     build_test_source,
-    held_out_seed,
 )
-from dopepp.experiment.config.chosen_data import chosen_data, trained_on
+from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports.breakdown import record_breakdown
-from dopepp.experiment.reports.compare.compare import compare_reports
-from dopepp.experiment.reports.condition import record_condition
+from dopepp.experiment.reports.compare import compare_reports
+from dopepp.experiment.reports.conditions import (
+    SCALE,
+    SHADING,
+    check_masks,
+    measure_scales,
+    measure_shading,
+    record_condition,
+)
 from dopepp.experiment.reports.evaluators import (
     EstimatorMethod,
     FileMethod,
@@ -33,23 +40,19 @@ from dopepp.experiment.reports.evaluators import (
 )
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.reports.report import Report, measure
-from dopepp.experiment.reports.scale import SCALE, measure_scales
-from dopepp.experiment.reports.shading import SHADING, check_masks, measure_shading
 from dopepp.experiment.reports.tables import reported_rates
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.images import warn_of_other_images
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.registry import check_flag
 from dopepp.parts.part import Part
 
 
 def measure_and_record(
     estimators: Mapping[str, PoseEstimator],
     parts: Sequence[Part],
-    data: Mapping[str, Any],
-    seed: int,
+    data: DataConfig,
     run_dir: Path,
     num_pictures: int,
     details: Mapping[str, Any] | None = None,
@@ -64,8 +67,7 @@ def measure_and_record(
     Args:
         estimators: By name, the baseline first where there is one.
         parts: The objects that are scored, as the test data have them.
-        data: The data config.
-        seed: Of the test images, where they are renders, and of the shading's patches.
+        data: Where the test images are from.
         run_dir: Folder that everything is written to.
         num_pictures: How many of the first images are drawn.
         details: Further plain facts of the last report.
@@ -81,7 +83,7 @@ def measure_and_record(
         UserError: The data or a file are wrong.
     """
     protocols = protocols or Protocols()
-    source = build_test_source(data, parts, seed)
+    source = build_test_source(data, parts)
     numbers = object_numbers(data, parts)
     files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
     methods: dict[str, Method] = {
@@ -93,7 +95,7 @@ def measure_and_record(
         check_masks(source)
     if protocols.scales:
         SCALE.check_methods(methods)
-    scaled = {one: build_scaled_test_source(data, parts, seed, one) for one in protocols.scales}
+    scaled = {one: build_scaled_test_source(data, parts, one) for one in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
     measured = measure(methods, samples, num_pictures)
     for file in files.values():
@@ -119,7 +121,9 @@ def measure_and_record(
     for quantity in protocols.by:
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
     if protocols.shading:
-        shaded = measure_shading(methods, source, protocols.shading, seed, reports, num_pictures)
+        shaded = measure_shading(
+            methods, source, protocols.shading, data.eval_seed, reports, num_pictures
+        )
         record_condition(run_dir, SHADING, *shaded, rates)
     if scaled:
         levels = measure_scales(methods, scaled, measured, num_pictures)
@@ -132,29 +136,16 @@ def tune_and_record(
     estimator: PoseEstimator,
     path: Path,
     parts: Sequence[Part],
-    data: Mapping[str, Any],
-    seed: int,
+    data: DataConfig,
     run_dir: Path,
-    silence: FalsePositiveTarget,
+    target: FalsePositiveTarget,
 ) -> Path:
-    """Tune a checkpoint, write the tuned one beside it and say what came of it.
-
-    Args:
-        estimator: Of the checkpoint.
-        path: The checkpoint.
-        parts: The objects as the data have them.
-        data: The data config.
-        seed: Of renders.
-        run_dir: Folder that ``tuning.json`` is written to.
-        silence: Demanded where no object is.
-
-    Returns:
-        The tuned checkpoint.
+    """Tune a checkpoint, write the tuned one beside it, say what came of it; returns its path.
 
     Raises:
         UserError: Validation images teach nothing, see :func:`~dopepp.experiment.tuning.tune`.
     """
-    tuning = tune(estimator, data, parts, seed, silence)
+    tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     record.write_json(run_dir / "tuning.json", asdict(tuning))
     display.show_tuning(tuning, tuned)
@@ -164,13 +155,13 @@ def tune_and_record(
 def _write_results(
     run_dir: Path,
     poses: Mapping[str, Sequence[MeasuredPose]],
-    data: Mapping[str, Any],
+    data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:
     """Write every method's poses as a BOP challenge CSV."""
-    has_folder = data["root"] is not None and data["test"]["renderer"] is None
-    dataset = Path(data["root"]).resolve().name if has_folder else str(data["name"])
-    split = str(data["image_sets"]["test"]) if has_folder else "test"
+    dataset, split = data.name, "test"
+    if data.root is not None and not data.is_rendered("test"):
+        dataset, split = data.root.resolve().name, data.image_sets["test"]
     for method, found in poses.items():
         rows = [
             PoseResult(
@@ -185,13 +176,13 @@ def _write_results(
         write_results(run_dir / results_name(method, dataset, split), rows)
 
 
-def parts_of(estimators: Sequence[PoseEstimator], data: Mapping[str, Any]) -> list[Part]:
+def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
     """Return the last estimator's parts as the test data have them; without one, all of these."""
     if not estimators:
         return build_parts(data)
     names = [part.name for part in estimators[-1].parts]
-    if data["root"] is not None and data["objects"] is None:
-        data = {**data, "objects": names}
+    if data.root is not None and data.objects is None:
+        data = replace(data, objects=tuple(names))
     available = {part.name: part for part in build_parts(data)}
     missing = [name for name in names if name not in available]
     if missing:
@@ -203,73 +194,75 @@ def parts_of(estimators: Sequence[PoseEstimator], data: Mapping[str, Any]) -> li
     return [available[name] for name in names]
 
 
-def evaluate(config: dict[str, Any], run_dir: Path) -> list[Report]:
-    """Measure a checkpoint, a file of another method's poses, or both, on a test set.
+def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
+    """Parse ``evaluate.py``'s composed config and measure what it names on a test set.
 
-    The test set is the checkpoint's own one or another one.
-
-    Args:
-        config: The composed and resolved evaluation config, plain values.
-        run_dir: Folder that everything is written to.
+    That is a checkpoint, a file of another method's poses, or both; the test set is the
+    checkpoint's own one or another one.
 
     Raises:
         UserError: A checkpoint, an option, a file or the data are wrong.
     """
-    protocols = Protocols.of(config)
-    device = config["device"]
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    paths = [path for path in (config["baseline"], config["ckpt_path"]) if path is not None]
-    file = config["results"]
-    if config["ckpt_path"] is None and file is None:
+    asked = EvaluationConfig.of(config)
+    if asked.ckpt_path is None and asked.results is None:
         allowed = "ckpt_path=… or results=… on the command line"
         raise UserError("no ckpt_path", allowed, "add what is to be measured")
-    loaded = [PoseEstimator.load(path, device, config["refine"]) for path in paths]
+    device = asked.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
+    loaded = [PoseEstimator.load(path, device, asked.refine) for path in paths]
     own = loaded[-1].checkpoint if loaded else None
-    stored = own.data if own is not None else {}
-    measured = str(file if own is None else paths[-1])
-    data = chosen_data(config, trained_on(stored), measured)
-    check_data(data, measured)
-    record.write_config(run_dir, config)
-    fingerprint = "" if own is None else own.data_fingerprint
-    seed = held_out_seed(data)
-    record.write_environment(run_dir, seed, fingerprint)
+    measured = str(asked.results if own is None else paths[-1])
+    stored = None if own is None else trained_on(own.data)
+    data = chosen_data(asked.data, asked.virtual, stored, measured)
+    record.write_config(run_dir, asked.plain)
+    record.write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
     parts = parts_of(loaded, data)
-    if loaded:
-        warn_of_other_images(loaded[-1].checkpoint, data, parts, seed)
-    if check_flag("tune", config["tune"]):
-        if protocols:
-            raise UserError(
-                "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
-            )
-        if config["ckpt_path"] is None or len(loaded) > 1:
-            allowed = "one ckpt_path, and no baseline"
-            raise UserError("tune=true", allowed, "tune one checkpoint at a time")
-        path, silence = Path(config["ckpt_path"]), FalsePositiveTarget.of(config)
-        tune_and_record(loaded[0], path, parts, data, seed, run_dir, silence)
-        display.show_files(run_dir)
+    if own is not None:
+        warn_of_other_images(own, data, parts)
+    if asked.tune:
+        _tune_only(asked, loaded, parts, data, run_dir)
         return []
-    names = _names(loaded, [] if file is None else [_method_name(config)])
+    file = None if asked.results is None else Path(asked.results)
+    names = _names(loaded, [] if file is None else [_method_name(asked.method, file)])
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         parts,
         data,
-        seed,
         run_dir,
-        config["num_pictures"],
-        results={} if file is None else {names[-1]: Path(file)},
-        bop_csv=check_flag("bop_csv", config["bop_csv"]),
-        all_measures=check_flag("all_measures", config["all_measures"]),
-        protocols=protocols,
+        asked.num_pictures,
+        results={} if file is None else {names[-1]: file},
+        bop_csv=asked.bop_csv,
+        all_measures=asked.all_measures,
+        protocols=asked.protocols,
     )
     write_job_readme(run_dir, f"Evaluation of {measured}", reports[-1])
     return reports
 
 
-def _method_name(config: Mapping[str, Any]) -> str:
+def _tune_only(
+    asked: EvaluationConfig,
+    loaded: Sequence[PoseEstimator],
+    parts: Sequence[Part],
+    data: DataConfig,
+    run_dir: Path,
+) -> None:
+    """Tune the one checkpoint and measure nothing else."""
+    if asked.protocols:
+        raise UserError(
+            "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
+        )
+    if asked.ckpt_path is None or len(loaded) > 1:
+        allowed = "one ckpt_path, and no baseline"
+        raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+    tune_and_record(loaded[0], Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
+    display.show_files(run_dir)
+
+
+def _method_name(given: object, results: Path) -> str:
     """Return what made the results: as given, else what BOP's file names begin with."""
-    given = config["method"]
-    return str(given) if given is not None else Path(config["results"]).stem.partition("_")[0]
+    return str(given) if given is not None else results.stem.partition("_")[0]
 
 
 def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:

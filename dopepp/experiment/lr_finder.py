@@ -9,10 +9,9 @@ so it is always near the sweep's beginning, and its running mean lags by up to f
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -24,23 +23,20 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_with_axes
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
-from dopepp.models.registry import check_integer, check_number
 from dopepp.training.system import PoseSystem
 
 TABLE_FILE: Final = "lr_finder.csv"
 PICTURE_FILE: Final = "lr_finder.png"
 
-_LOWEST: Final = 1e-12
-_HIGHEST: Final = 1e3
 _MIN_STEPS: Final = 10
 _MOST: Final = 10**6
-"""Steps; and epochs, since the steps end the sweep."""
+"""Epochs, since the steps end the sweep."""
 
 _SMOOTHING: Final = 0.05
 """Standard deviation of the smoothing, as a share of the sweep: noise of single batches goes, the
@@ -65,69 +61,57 @@ class Suggestion:
     lowest: float
 
 
-def find_learning_rate(config: dict[str, Any], run_dir: Path) -> Suggestion | None:
+def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """Train with a rate that grows from step to step; print, write and return what it suggests.
 
     The chosen optimiser with its other settings; no schedule, no validation, no checkpoint.
 
-    Args:
-        config: The composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
-
     Raises:
-        UserError: A choice or an option is wrong.
+        UserError: A choice is wrong.
         RunError: The loss is not finite from the start.
     """
-    first, last, num_steps = _range(config["lr_finder"])
-    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
-    if config["resume"] is not None:
+    first, last = config.lr_finder.min_lr, config.lr_finder.max_lr
+    if config.resume is not None:
         raise UserError(
-            f"resume={config['resume']} with job=lr_finder", "init_from=…, or neither", "leave it"
+            f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "leave it"
         )
-    seed_everything(seed, verbose=False)
-    parts = build_parts(config["data"])
-    datamodule = build_datamodule(config["data"], parts, seed)
+    seed_everything(config.seed, verbose=False)
+    parts = build_parts(config.data)
+    datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
-    system = build_system({**config, "scheduler": {}}, parts, "")
-    trainer = build_trainer(_sweep_config(config), run_dir)
-    record.write_config(run_dir, config)
-    record.write_environment(run_dir, seed, "")
-    rates, losses = _sweep(trainer, system, datamodule, first, last, num_steps)
+    short = _short_training(config)
+    system = build_system(short, parts, "")
+    trainer = build_trainer(short, run_dir)
+    record.write_config(run_dir, config.plain)
+    record.write_environment(run_dir, config.seed, "")
+    rates, losses = _sweep(trainer, system, datamodule, first, last, config.lr_finder.num_steps)
     if len(rates) < _MIN_STEPS:
         raise RunError(
             f"the loss diverged after {len(rates)} steps at a learning rate of {first:g}; "
             "set a smaller lr_finder.min_lr"
         )
     found = _report(rates, losses, run_dir)
-    write_job_readme(run_dir, f"Learning rate of {config['model']['name']}")
+    write_job_readme(run_dir, f"Learning rate of {config.model.name}")
     return found
 
 
-def _range(options: Mapping[str, Any]) -> tuple[float, float, int]:
-    first = check_number("lr_finder.min_lr", options["min_lr"], _LOWEST, _HIGHEST)
-    last = check_number("lr_finder.max_lr", options["max_lr"], _LOWEST, _HIGHEST)
-    if last <= first:
-        raise UserError(
-            f"lr_finder.max_lr={last:g}", f"above lr_finder.min_lr={first:g}", "widen the range"
-        )
-    name = "lr_finder.num_steps"
-    return first, last, check_integer(name, options["num_steps"], _MIN_STEPS, _MOST)
-
-
-def _sweep_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the config of the short training."""
-    trainer = {
-        **config["trainer"],
-        "max_steps": -1,
-        "max_epochs": _MOST,
-        "check_val_every_n_epoch": _MOST,
-        "val_check_interval": None,
-        "enable_checkpointing": False,
-        "devices": 1,
-        "num_nodes": 1,
-        "strategy": "auto",
-    }
-    return {**config, "trainer": trainer, "callbacks": {}, "ema": None}
+def _short_training(config: RunConfig) -> RunConfig:
+    """Return the config without all that the sweep does not need, validations among it."""
+    trainer = replace(
+        config.trainer,
+        max_steps=-1,
+        max_epochs=_MOST,
+        devices=1,
+        num_nodes=1,
+        strategy="auto",
+        lightning={
+            **config.trainer.lightning,
+            "check_val_every_n_epoch": _MOST,
+            "val_check_interval": None,
+            "enable_checkpointing": False,
+        },
+    )
+    return replace(config, trainer=trainer, scheduler={}, callbacks={}, ema=None)
 
 
 def _sweep(

@@ -1,14 +1,20 @@
-"""One training run, from a plain config to a run folder with a measured checkpoint."""
+"""What ``train.py`` does: a training, from its config to a run folder with a measured checkpoint.
+
+To add another ``job=``, write a function of config and run folder, give it a line in :data:`JOBS`
+and its name to :class:`~dopepp.experiment.config.run.RunConfig`.
+"""
 
 from __future__ import annotations
 
 import logging
 import shutil
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
@@ -17,20 +23,20 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment.build.hardware import estimate_training_s, keep_freed_memory
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_datamodule, held_out_seed
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.config.run import RunConfig, TrainerConfig
+from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.evaluate import measure_and_record, tune_and_record
-from dopepp.experiment.reports.protocols import Protocols
+from dopepp.experiment.lr_finder import find_learning_rate
+from dopepp.experiment.reports.conditions import check_masks
+from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.reports.shading import check_masks
 from dopepp.experiment.runs import display, readme, record
 from dopepp.experiment.runs.images import describe_images
 from dopepp.experiment.runs.resume import ConfigDifference, check_resume, remember_overrides
 from dopepp.experiment.runs.tracking import log_report, tracked
-from dopepp.experiment.tuning import FalsePositiveTarget
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.registry import check_flag, check_integer
 from dopepp.parts.part import Part
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import FOLDER as PROFILE
@@ -47,12 +53,34 @@ PAPER_INPUT_SIZE: Final = (416, 416)
 QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
 
 
-def train(config: dict[str, Any], run_dir: Path) -> Report:
-    """Train, then measure the best checkpoint on the test set.
+def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
+    """Parse ``train.py``'s composed config and do the job that it names.
 
-    Args:
-        config: The composed and resolved config, plain values.
-        run_dir: Folder that everything is written to.
+    Raises:
+        UserError: An option is wrong.
+    """
+    parsed = RunConfig.of(config)
+    if parsed.table is not None:
+        PaperTable.of(parsed.table)  # a mistake in it shows before the work, not after
+    _refuse_parallel_multirun(parsed.trainer)
+    return JOBS[parsed.job](parsed, run_dir)
+
+
+def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
+    """Refuse jobs of several processes, of which each would start as the first one did."""
+    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        return
+    if trainer.num_processes > 1:
+        nodes = "" if trainer.num_nodes == 1 else f" trainer.num_nodes={trainer.num_nodes}"
+        raise UserError(
+            f"trainer.devices={trainer.devices}{nodes} in a multirun",
+            "one process per job: each further process would run the whole sweep again",
+            "set trainer.devices=1 and start one process, or run the jobs one by one",
+        )
+
+
+def train(config: RunConfig, run_dir: Path) -> Report:
+    """Train, then measure the best checkpoint on the test set.
 
     Raises:
         UserError: A choice, a file or an option is wrong.
@@ -80,23 +108,24 @@ def train(config: dict[str, Any], run_dir: Path) -> Report:
 
 
 def _train(
-    config: dict[str, Any],
+    config: RunConfig,
     run_dir: Path,
     explanation: readme.RunReadme,
     trackers: Sequence[GuardedLogger],
 ) -> Report:
-    seed = check_integer("seed", config["seed"], 0, 2**32 - 1)
-    _check_kept(config)
-    check_flag("tune", config["tune"])
-    FalsePositiveTarget.of(config)  # refused before the work, not after
-    seed_everything(seed, verbose=False)
+    if not config.keep_checkpoints and config.resume is not None:
+        raise UserError(
+            f"resume={config.resume} with keep_checkpoints=false",
+            "a run whose checkpoints are kept",
+            "set keep_checkpoints=true, or start anew without resume",
+        )
+    seed_everything(config.seed, verbose=False)
     keep_freed_memory()
     display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
-    parts = build_parts(config["data"])
-    datamodule = build_datamodule(config["data"], parts, seed)
+    parts = build_parts(config.data)
+    datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
-    protocols = Protocols.of(config)
-    if protocols.shading:
+    if config.protocols.shading:
         check_masks(datamodule.test_source)
     fingerprint = datamodule.fingerprint()
     images = {
@@ -110,19 +139,40 @@ def _train(
     trainer = build_trainer(config, run_dir, trackers=trackers)
     weights = system.network.state_dict().values()
     check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
-    display.show_config(config)
+    display.show_config(config.plain)
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
     if not getattr(rank_zero_only, "rank", 0):
-        record.write_config(run_dir, config)
-        record.write_environment(run_dir, seed, fingerprint, [str(one) for one in changes])
-        if config["resume"] is not None:
+        record.write_config(run_dir, config.plain)
+        record.write_environment(run_dir, config.seed, fingerprint, [str(one) for one in changes])
+        if config.resume is not None:
             remember_overrides(run_dir)
         explanation.begin()
         for tracker in trackers:
-            tracker.log_hyperparams(dict(config))
+            tracker.log_hyperparams(dict(config.plain))
     display.show_sources(datamodule.summary())
-    _announce_duration(config, system, datamodule, trainer)
+    _announce_duration(config.trainer, system, datamodule, trainer)
+    _fit(trainer, system, datamodule, resume_from, run_dir)
+    raise_if_pruned(trainer)
+    if not trainer.is_global_zero:
+        raise SystemExit(0)  # the first process alone measures and reports
+    _say_how_it_ended(trainer, run_dir)
+    report = _measure_run(config, parts, run_dir, trainer)
+    log_report(trackers, report, run_dir)
+    if not config.keep_checkpoints:
+        shutil.rmtree(run_dir / FOLDER)
+        display.console.print("everything has run; the checkpoints are removed")
+    return report
+
+
+def _fit(
+    trainer: Trainer,
+    system: PoseSystem,
+    datamodule: PoseDataModule,
+    resume_from: Path | None,
+    run_dir: Path,
+) -> None:
+    """Train; what ends it early says how it can go on."""
     try:
         trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
     except SystemExit as end:
@@ -135,27 +185,6 @@ def _train(
         kept = (run_dir / record.LAST_CHECKPOINT).is_file()
         advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
-    raise_if_pruned(trainer)
-    if not trainer.is_global_zero:
-        raise SystemExit(0)  # the first process alone measures and reports
-    _say_how_it_ended(trainer, run_dir)
-    report = _measure_run(config, parts, run_dir, trainer, protocols)
-    log_report(trackers, report, run_dir)
-    if not config["keep_checkpoints"]:
-        shutil.rmtree(run_dir / FOLDER)
-        display.console.print("everything has run; the checkpoints are removed")
-    return report
-
-
-def _check_kept(config: Mapping[str, Any]) -> None:
-    """Refuse to remove the checkpoints of a run that was begun before."""
-    kept = check_flag("keep_checkpoints", config["keep_checkpoints"])
-    if not kept and config["resume"] is not None:
-        raise UserError(
-            f"resume={config['resume']} with keep_checkpoints=false",
-            "a run whose checkpoints are kept",
-            "set keep_checkpoints=true, or start anew without resume",
-        )
 
 
 def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
@@ -172,14 +201,12 @@ def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
 
 
 def _announce_duration(
-    config: Mapping[str, Any], system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
+    options: TrainerConfig, system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
 ) -> None:
     """Without an accelerator, say how long the run will take and what takes less."""
     if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
         return
-    seconds = estimate_training_s(
-        system.network, datamodule, config["trainer"], str(trainer.precision)
-    )
+    seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
     hours = seconds / 3600
     duration = f"{hours:,.1f} hours" if hours >= 1 else f"{max(1, round(seconds / 60))} min"
     advice = f"; for a first result in minutes: {QUICKSTART}" if hours >= 1 else ""
@@ -187,12 +214,12 @@ def _announce_duration(
 
 
 def _resume_path(
-    config: Mapping[str, Any], system: PoseSystem
+    config: RunConfig, system: PoseSystem
 ) -> tuple[Path | None, list[ConfigDifference]]:
     """Return the interrupted run's checkpoint, and what has changed since and may have."""
-    anyway, resume = check_flag("resume_anyway", config["resume_anyway"]), config["resume"]
+    resume = config.resume
     if resume is None:
-        if anyway:
+        if config.resume_anyway:
             raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
         return None, []
     run_dir = Path(resume)
@@ -218,11 +245,7 @@ def _advice(run_dir: Path) -> str:
 
 
 def _measure_run(
-    config: Mapping[str, Any],
-    parts: Sequence[Part],
-    run_dir: Path,
-    trainer: Trainer,
-    protocols: Protocols,
+    config: RunConfig, parts: Sequence[Part], run_dir: Path, trainer: Trainer
 ) -> Report:
     """Measure the best checkpoint of a finished run and write everything down."""
     checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
@@ -231,18 +254,11 @@ def _measure_run(
         path = run_dir / record.LAST_CHECKPOINT
         _log.warning("the run ended before its first validation: measuring %s", path.name)
     device = trainer.strategy.root_device
-    seed = held_out_seed(config["data"])
     estimator = PoseEstimator.load(path, device)
-    if config["tune"]:
+    if config.tune:
         try:
             path = tune_and_record(
-                estimator,
-                path,
-                parts,
-                config["data"],
-                seed,
-                run_dir,
-                FalsePositiveTarget.of(config),
+                estimator, path, parts, config.data, run_dir, config.false_positives
             )
         except UserError as error:  # a network that learned little is measured as it is
             display.console.print(f"not tuned: {error}")
@@ -252,16 +268,22 @@ def _measure_run(
     score = checkpoints[0].best_model_score if checkpoints else None
     if score is not None and score.isfinite():
         details[record.OBJECTIVE] = float(score)
-    if config["model"]["width"] != 1.0:
+    if config.model.width != 1.0:
         cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
         details[FULL_SIZE_COST] = vars(cost)
     return measure_and_record(
-        {str(config["model"]["name"]): estimator},
+        {config.model.name: estimator},
         parts,
-        config["data"],
-        seed,
+        config.data,
         run_dir,
         num_pictures=12,
         details=details,
-        protocols=protocols,
+        protocols=config.protocols,
     )[0]
+
+
+JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {
+    "train": train,
+    "cost": measure_cost,
+    "lr_finder": find_learning_rate,
+}

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +18,13 @@ from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
-from dopepp.data.sources.rendered import MAX_ITEMS
 from dopepp.experiment.build.sources import (
     build_source_without_objects,
     build_test_source,
     build_validation_source,
 )
+from dopepp.experiment.config.data import Count, DataConfig
+from dopepp.experiment.config.parse import Share
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.assignment import assign, match_by_centre, symmetries
@@ -32,7 +32,6 @@ from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.checkpoint.storage import write_atomic
-from dopepp.models.registry import check_integer, check_number
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import (
     FEATURES,
@@ -56,20 +55,8 @@ class FalsePositiveTarget:
             no threshold.
     """
 
-    num_empty: int = 500
-    false_positive_rate: float = 0.005
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> FalsePositiveTarget:
-        """Read the config's ``num_empty`` and ``false_positive_rate``.
-
-        Raises:
-            UserError: One of them is out of range.
-        """
-        return cls(
-            check_integer("num_empty", config["num_empty"], 1, MAX_ITEMS),
-            check_number("false_positive_rate", config["false_positive_rate"], 0, 1),
-        )
+    num_empty: Count = 500
+    false_positive_rate: Share = 0.005
 
 
 @dataclass(frozen=True)
@@ -133,30 +120,20 @@ class Tuning:
 
 def tune(
     estimator: PoseEstimator,
-    data: Mapping[str, Any],
+    data: DataConfig,
     parts: Sequence[Part],
-    seed: int,
-    silence: FalsePositiveTarget,
+    target: FalsePositiveTarget,
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
-
-    Args:
-        estimator: The trained network.
-        data: The data config.
-        parts: The objects as the data have them.
-        seed: Of renders.
-        silence: Demanded where no object is.
 
     Raises:
         UserError: The network finds nothing, or everything it finds is right or wrong.
     """
     old = estimator.recovery
-    validation = build_validation_source(data, parts, seed)
-    test = build_test_source(data, parts, seed)
-    empty, empty_test = (
-        build_source_without_objects(data, parts, seed, split, silence.num_empty)
-        for split in ("val", "test")
-    )
+    validation = build_validation_source(data, parts)
+    test = build_test_source(data, parts)
+    empty = build_source_without_objects(data, parts, "val", target.num_empty)
+    empty_test = build_source_without_objects(data, parts, "test", target.num_empty)
 
     def scored(options: RecoveryOptions, source: Source) -> Scored:
         # Every detection counts here, whatever its score.
@@ -168,13 +145,13 @@ def tune(
         estimator.recovery = replace(old, min_score=0.0, distance_factor=1.0)
         factor = fit_distance_factor(*matched_poses(estimator, parts, validation))
         new = replace(old, distance_factor=factor)
-        chosen = choose(scored(new, validation), scored(new, empty), silence.false_positive_rate)
+        chosen = choose(scored(new, validation), scored(new, empty), target.false_positive_rate)
         new = replace(new, **chosen)  # type: ignore[arg-type]
         after = _figures(scored(new, test), scored(new, empty_test), new.min_score)
     finally:
         estimator.recovery = old
     changed = {"distance_factor": factor} | chosen
-    return Tuning(changed, before, after, (len(test), silence.num_empty))
+    return Tuning(changed, before, after, (len(test), target.num_empty))
 
 
 def choose(

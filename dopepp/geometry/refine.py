@@ -80,11 +80,6 @@ class Correspondences:
     rays: Float[np.ndarray, "n 2"]
     whitening: Float[np.ndarray, "n 2 2"]
 
-    def __getitem__(self, chosen: NDArray[Any]) -> Correspondences:
-        return Correspondences(
-            self.object_points[chosen], self.rays[chosen], self.whitening[chosen]
-        )
-
     def residuals(self, poses: Poses) -> Float[np.ndarray, "s n 2"]:
         """Return reprojection errors in standard deviations; NaN behind the camera."""
         residuals = np.empty((len(poses), len(self.rays), 2))

@@ -15,7 +15,7 @@ from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 MAX_FINITE: Final = 60
 """Rotations of the icosahedron: the largest finite group that is no n-fold axis with its flips."""
 
-_SAME: Final = math.radians(10.0)
+SAME_TURN: Final = math.radians(10.0)
 """Rotations closer than this are one: those of a 12-fold axis are 30° apart, measured ones err."""
 
 _AVERAGINGS: Final = 5
@@ -126,7 +126,7 @@ def exact_group(
     for element in group:  # grows while it is gone through
         for generator in generators:
             product = generator @ element
-            if rotation_angle(product @ np.swapaxes(group, 1, 2)).min() > _SAME:
+            if rotation_angle(product @ np.swapaxes(group, 1, 2)).min() > SAME_TURN:
                 group.append(product)
         if len(group) > MAX_FINITE:
             return None

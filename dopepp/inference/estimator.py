@@ -52,7 +52,9 @@ class PoseEstimator:
         device: str | torch.device = "cpu",
         refine: str | None = None,
     ) -> None:
-        self.refiner = _refiner(refine, checkpoint.parts)
+        if refine not in (None, "depth"):
+            raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
+        self.refiner = None if refine is None else DepthRefiner(checkpoint.parts)
         self.device = torch.device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.checkpoint = checkpoint
@@ -171,12 +173,7 @@ def letterboxed(
     image: UInt8[np.ndarray, "height width 3"], letterbox: Letterbox, multiple: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
-    size = (letterbox.width, letterbox.height)
-    if size != (image.shape[1], image.shape[0]):
-        shrinks = letterbox.scale_x < 1
-        image = cv2.resize(
-            image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        )
+    image = letterbox.image(image)
     rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
 
@@ -208,15 +205,6 @@ def _checked_distortion(
             "pass the camera's calibration, or None for an undistorted image",
         )
     return coefficients
-
-
-def _refiner(refine: str | None, parts: Sequence[Part]) -> DepthRefiner | None:
-    """Make what refines poses, by its name."""
-    if refine is None:
-        return None
-    if refine != "depth":
-        raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
-    return DepthRefiner(parts)
 
 
 def _refined(

@@ -99,11 +99,14 @@ class Column:
     symmetric: bool = False
 
     def text(self, row: PoseRow) -> str:
-        """Return the cell, ``n/a`` where the measure does not exist."""
-        value = getattr(row, self.field)
+        """Return a row's cell."""
+        return self.shown(getattr(row, self.field))
+
+    def shown(self, value: float | None, *, signed: bool = False) -> str:
+        """Return a value in the shown unit, ``n/a`` where it does not exist."""
         if value is None:
             return NOT_AVAILABLE
-        return f"{value * self.scale:.{self.decimals}f}"
+        return f"{value * self.scale:{'+' if signed else ''}.{self.decimals}f}"
 
 
 COLUMNS: Final[tuple[Column, ...]] = (
@@ -126,6 +129,12 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("false_positives", "false pos.", group="detection"),
 )
 """The measures of a table, in order; ``object`` and ``method`` name its rows."""
+
+
+def shown_columns(row: PoseRow, all_measures: bool = False) -> list[Column]:
+    """Return what tells something of a row's object: symmetric measures where it has symmetries."""
+    return [one for one in COLUMNS if all_measures or row.num_symmetries > 1 or not one.symmetric]
+
 
 _TOTALS: Final = ("num_instances", "false_positives")
 

@@ -1,7 +1,6 @@
-"""A part by the text a user writes: a built-in part's name or the path of a mesh file.
+"""Parts by the text a user writes: the path of a mesh file, or a built-in part's name.
 
-The paper's two parts (§2.1) as CAD: Servoholder, 77×77×7 mm, and PivConnector, 105×52×7 mm.
-
+Built in are the paper's two parts (§2.1): Servoholder, 77×77×7 mm, and PivConnector, 105×52×7 mm.
 The paper gives their sizes only; the shapes are this project's. A 4 mm plate carries raised
 features on its front (+z) and recesses in its back (−z), placed so that no rotation maps a part
 onto itself and any side of it shows how the part is turned. All numbers here are millimetres; the
@@ -56,8 +55,9 @@ def servoholder() -> Part:
         holes += _disc(screw, 2.2)
     pockets = (_rectangle((-36, -36), (-3, -3), radius=3), _polygon((13, 29), (27, 23), (34, 2)))
     solid = _prism(plate, BACK, PLATE)
-    solid += _raised(frame, bush, *posts, *ribs) ^ _prism(plate, PLATE, FRONT)
-    solid -= _sunk(*pockets, _slot((-33, 34), (10, 34), 5)) - _prism(_disc((-19, -20), 10))
+    solid += _tapered(PLATE, FRONT, frame, bush, *posts, *ribs) ^ _prism(plate, PLATE, FRONT)
+    sunk = (*pockets, _slot((-33, 34), (10, 34), 5))
+    solid -= _tapered(BACK, BACK + RECESS, *sunk) - _prism(_disc((-19, -20), 10))
     solid -= _prism(holes) + _prism(window, PLATE, FRONT)
     return make_part("servoholder", _mesh(solid))
 
@@ -76,31 +76,58 @@ def pivconnector() -> Part:
     pockets = (_polygon((2, 24), (32, 24), (26, 8), (-4, 8)), _rectangle((16, -23), (34, -12), 2))
     groove = _disc((-26.5, 0), 22) ^ _rectangle((-60, -30), (-22, 4))
     solid = _prism(plate, BACK, PLATE)
-    solid += _raised(eye, pad, bridge, *ribs) ^ _prism(plate, PLATE, FRONT)
-    solid -= _sunk(*pockets, groove) - _prism(_disc((-26.5, 0), 15))
+    solid += _tapered(PLATE, FRONT, eye, pad, bridge, *ribs) ^ _prism(plate, PLATE, FRONT)
+    sunk = (*pockets, groove)
+    solid -= _tapered(BACK, BACK + RECESS, *sunk) - _prism(_disc((-26.5, 0), 15))
     solid -= _prism(holes)
     return make_part("pivconnector", _mesh(solid))
 
 
-def _raised(*sections: CrossSection) -> Manifold:
-    """Return convex features on the plate's front with sloping walls."""
-    return Manifold.batch_boolean([_tapered(s, PLATE, FRONT) for s in sections], OpType.Add)
+BUILTIN: Final[dict[str, Callable[[], Part]]] = {
+    "servoholder": servoholder,
+    "pivconnector": pivconnector,
+}
+"""Built-in parts by name."""
 
 
-def _sunk(*sections: CrossSection) -> Manifold:
-    """Return the hollows of convex recesses in the back with sloping walls."""
-    recesses = [_tapered(s, BACK, BACK + RECESS) for s in sections]
-    return Manifold.batch_boolean(recesses, OpType.Add)
+def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
+    """Return a built-in part, or the part in a mesh file, named after the file.
+
+    Args:
+        path_or_name: ``servoholder``, ``pivconnector``, or the path of a mesh file.
+        unit: The file's unit; None takes the one it has by its format, or millimetres, which the
+            log says. A built-in part has its size without it, so that one unit can go with a list
+            of files and built-in parts.
+
+    Raises:
+        UserError: There is no such part or file, or the file cannot be used (see
+            :func:`~dopepp.parts.mesh.read.read_mesh`).
+    """
+    text = str(path_or_name)
+    if text in BUILTIN:
+        return BUILTIN[text]()
+    path = Path(path_or_name)
+    if path.suffix.lower() not in READERS:
+        raise UserError(
+            f"unknown part {text!r}",
+            f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}",
+            "check the spelling",
+        )
+    mesh, taken = read_in_unit(path, unit)
+    return make_part(path.stem, mesh, unit=taken)
 
 
-def _tapered(section: CrossSection, foot: float, top: float) -> Manifold:
-    """Extrude a convex section along z while it shrinks by ``SLOPE`` all around.
+def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
+    """Extrude convex sections along z while they shrink by ``SLOPE`` all around.
 
     Walls of another direction than the plate's make the features visible from straight above.
     """
-    outlines = ((section, foot), (section.offset(-SLOPE, JoinType.Miter), top))
-    rings = [np.insert(s.to_polygons()[0], 2, z, axis=1) for s, z in outlines]
-    return Manifold.hull_points(np.vstack(rings))
+    solids = []
+    for section in sections:
+        outlines = ((section, foot), (section.offset(-SLOPE, JoinType.Miter), top))
+        rings = [np.insert(s.to_polygons()[0], 2, z, axis=1) for s, z in outlines]
+        solids.append(Manifold.hull_points(np.vstack(rings)))
+    return Manifold.batch_boolean(solids, OpType.Add)
 
 
 def _polygon(*corners: tuple[float, float]) -> CrossSection:
@@ -143,37 +170,3 @@ def _mesh(solid: Manifold) -> Mesh:
     a, b, c = faces.T
     proper = (a != b) & (b != c) & (c != a)
     return Mesh(vertices / 1000, faces[proper].astype(np.int32))
-
-
-BUILTIN: Final[dict[str, Callable[[], Part]]] = {
-    "servoholder": servoholder,
-    "pivconnector": pivconnector,
-}
-"""Built-in parts by name."""
-
-
-def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
-    """Return a built-in part, or the part in a mesh file, named after the file.
-
-    Args:
-        path_or_name: ``servoholder``, ``pivconnector``, or the path of a mesh file.
-        unit: The file's unit; None takes the one it has by its format, or millimetres, which the
-            log says. A built-in part has its size without it, so that one unit can go with a list
-            of files and built-in parts.
-
-    Raises:
-        UserError: There is no such part or file, or the file cannot be used (see
-            :func:`~dopepp.parts.mesh.read.read_mesh`).
-    """
-    text = str(path_or_name)
-    if text in BUILTIN:
-        return BUILTIN[text]()
-    path = Path(path_or_name)
-    if path.suffix.lower() not in READERS:
-        raise UserError(
-            f"unknown part {text!r}",
-            f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}",
-            "check the spelling",
-        )
-    mesh, taken = read_in_unit(path, unit)
-    return make_part(path.stem, mesh, unit=taken)

@@ -14,10 +14,11 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.symmetry import ContinuousSymmetry, exact_group
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
 from dopepp.parts.mesh.measure import SurfaceTree, largest_distance
 from dopepp.parts.part import Mesh
-from dopepp.parts.symmetry_candidates import Candidates, is_new, turn
+from dopepp.parts.symmetry_candidates import Candidates, turn
 
 TOLERANCE: Final = 0.01
 """Share of the diameter by which a symmetry may miss the surface."""
@@ -142,7 +143,8 @@ def _search(
     for prime in _PRIMES:
         for axis in candidates.axes(prime):
             rotation = turn(axis, 2 * np.pi / prime)
-            if not is_new(rotation, group) or not shape.fits(rotation):
+            away = rotation_angle(rotation @ np.swapaxes(group, 1, 2)).min()
+            if away <= SAME_TURN or not shape.fits(rotation):
                 continue
             if shape.is_round(axis):
                 return _signed(axis), []

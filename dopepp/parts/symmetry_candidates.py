@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.parts.mesh.measure import SurfaceTree
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.parts.mesh.measure import SurfaceTree, half_sphere
 
 _NUM_DIRECTIONS: Final = 1500
 """Axes over half a sphere: none is farther than 2.6° from one of them."""
@@ -49,11 +49,6 @@ an axis along an edge is exact."""
 def turn(axis: Float[np.ndarray, "*batch 3"], angle: float) -> Float[np.ndarray, "*batch 3 3"]:
     """Return the rotation by an angle (radians) about a unit axis."""
     return rotation_vector_to_matrix(angle * axis)
-
-
-def axis_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Return a rotation's unit axis; also a half turn's, whose skew part vanishes."""
-    return np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
 
 
 def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
@@ -98,14 +93,6 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
     return np.array(found)
 
 
-def _all_directions() -> Float[np.ndarray, "directions 3"]:
-    """Return a spiral of directions over half a sphere (by the golden angle)."""
-    number = np.arange(_NUM_DIRECTIONS) + 0.5
-    z, around = number / _NUM_DIRECTIONS, np.pi * (3 - np.sqrt(5)) * number
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(around), ring * np.sin(around), z], axis=1)
-
-
 class Candidates:
     """Axes about which a turn by 2π / order may be a symmetry.
 
@@ -117,7 +104,7 @@ class Candidates:
         self._surface = surface
         self._moments = second_moments(surface)
         self._special = special_axes(surface)
-        self._axes = np.concatenate([self._special, _all_directions()])
+        self._axes = np.concatenate([self._special, half_sphere(_NUM_DIRECTIONS)])
         self._rough_probes = surface.spread(48, seed=1)[0]
         self._probes = surface.spread(400, seed=2)[0]
 
@@ -151,7 +138,8 @@ class Candidates:
             rotation = turn(step, 1.0) @ rotation
             if np.linalg.norm(step) < 1e-6:  # a thousandth of any tolerance
                 break
-        better = axis_of(rotation)
+        # The axis as an eigenvector: a half turn's skew part, which others would give, vanishes.
+        better = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
         better = better if better @ axis > 0 else -better
         if special and self._error(better, order) > _BETTER * self._error(axis, order):
             return axis
@@ -171,8 +159,3 @@ class Candidates:
     def _error(self, axis: Float[np.ndarray, "3"], order: int) -> float:
         moved = self._probes @ turn(axis, 2 * np.pi / order).T
         return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))
-
-
-def is_new(rotation: Float[np.ndarray, "3 3"], known: Float[np.ndarray, "group 3 3"]) -> bool:
-    """Tell whether a rotation is none of a group's, by 10°: a third of a 12-fold axis' step."""
-    return bool(rotation_angle(rotation @ np.swapaxes(known, 1, 2)).min() > np.radians(10))

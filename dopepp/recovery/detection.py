@@ -1,9 +1,4 @@
-"""What comes out of recovery: one posed object, with all that a user can check it by.
-
-From one object's peaks to its instances: grouping and posing by turns.
-
-From one instance's keypoints to its pose.
-"""
+"""From one object's peaks to its detections: keypoints are grouped, groups posed, by turns."""
 
 from __future__ import annotations
 
@@ -20,6 +15,24 @@ from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
 from dopepp.recovery.options import RecoveryOptions
+
+SIGMA_FLOOR_PX: Final = 1.0
+"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
+trained network's maps 1 px did as well as 2 and better than 0.5."""
+
+WIDENINGS: Final = (1.0, 2.0, 4.0)
+"""Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
+
+ROUNDS: Final = 3
+"""Most turns of grouping and solving; in crowds one or two change anything."""
+
+BORDER: Final = 1.0
+"""Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
+
+BORDER_DEVIATION: Final = 0.75
+"""Error of such a peak, cells: half a network's belief lies where there are no cells, so the peak
+is pulled inward. Two trained networks' peaks were off by 0.3 to 0.5 cells on average there, by
+0.75 in the root mean square, and by nothing on average two cells further in."""
 
 
 @dataclass(frozen=True)
@@ -49,62 +62,6 @@ class Detection:
     peaks: Float[np.ndarray, "9 2"]
     reprojection_error_px: float
     covariance: Float[np.ndarray, "6 6"]
-
-
-SIGMA_FLOOR_PX: Final = 1.0
-"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
-trained network's maps 1 px did as well as 2 and better than 0.5."""
-
-WIDENINGS: Final = (1.0, 2.0, 4.0)
-"""Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
-
-
-def solve_group(
-    group: KeypointGroup, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
-) -> PnPResult:
-    """Solve PnP with each keypoint weighted by its own covariance.
-
-    A covariance is averaged over its directions. How wide a network's peak is tells how far it is
-    off; its shape does not tell whither: taken at their word, ellipses left ADD-0.1d of a trained
-    network at 76 %, circles gave 85 %. Where shapes are right, circles cost 2 points.
-
-    A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
-    agree on a pose, the deviations are widened and the pose solved again.
-
-    Args:
-        group: The instance's keypoints.
-        cuboid: The object's nine keypoints, metres.
-        K: Camera matrix of the network's input, pixels.
-    """
-    covariance = _averaged(group.covariance_px)
-    found = int(np.isfinite(group.position[:, 0]).sum())
-    best = None
-    for widening in WIDENINGS:
-        result = solve_pnp(cuboid, group.position, K, covariance_px=covariance * widening**2)
-        if best is None or result.inliers.sum() > best.inliers.sum():
-            best = result
-        if 3 * best.inliers.sum() >= 2 * found:
-            break
-    assert best is not None
-    return best
-
-
-def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 2"]:
-    """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
-    variance = covariance.trace(axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2
-    return np.asarray(variance[:, None, None] * np.eye(2))
-
-
-ROUNDS: Final = 3
-"""Most turns of grouping and solving; in crowds one or two change anything."""
-
-BORDER: Final = 1.0
-"""Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
-
-BORDER_DEVIATION: Final = 0.75
-"""Error of such a peak, cells: half a network's belief lies where there are no cells, so the peak
-is pulled inward. Two trained networks' peaks were off by 0.3 to 0.5 cells on average there, by
-0.75 in the root mean square, and by nothing on average two cells further in."""
 
 
 def peaks_of_object(
@@ -179,6 +136,42 @@ def pose_instances(
             for kept, result, group in zip(same, results, groups, strict=True)
         ]
     return list(zip(groups, results, strict=True))
+
+
+def solve_group(
+    group: KeypointGroup, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
+) -> PnPResult:
+    """Solve PnP with each keypoint weighted by its own covariance.
+
+    A covariance is averaged over its directions. How wide a network's peak is tells how far it is
+    off; its shape does not tell whither: taken at their word, ellipses left ADD-0.1d of a trained
+    network at 76 %, circles gave 85 %. Where shapes are right, circles cost 2 points.
+
+    A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
+    agree on a pose, the deviations are widened and the pose solved again.
+
+    Args:
+        group: The instance's keypoints.
+        cuboid: The object's nine keypoints, metres.
+        K: Camera matrix of the network's input, pixels.
+    """
+    covariance = _averaged(group.covariance_px)
+    found = int(np.isfinite(group.position[:, 0]).sum())
+    best = None
+    for widening in WIDENINGS:
+        result = solve_pnp(cuboid, group.position, K, covariance_px=covariance * widening**2)
+        if best is None or result.inliers.sum() > best.inliers.sum():
+            best = result
+        if 3 * best.inliers.sum() >= 2 * found:
+            break
+    assert best is not None
+    return best
+
+
+def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 2"]:
+    """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
+    variance = covariance.trace(axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2
+    return np.asarray(variance[:, None, None] * np.eye(2))
 
 
 def make_detection(

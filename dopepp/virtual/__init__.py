@@ -3,6 +3,9 @@
 from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
 from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.distractors import Distractors
+from dopepp.virtual.presets.lighting import Lighting
+from dopepp.virtual.presets.materials import Materials
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
@@ -10,16 +13,8 @@ from dopepp.virtual.presets.placement import (
     FreeTurning,
     OffsetPlacement,
 )
-from dopepp.virtual.presets.preset import (
-    PRESETS,
-    Distractors,
-    Lighting,
-    Materials,
-    Preset,
-    Sensors,
-    Table,
-    customised_preset,
-)
+from dopepp.virtual.presets.preset import PRESETS, Preset, customised_preset
+from dopepp.virtual.presets.table import Table
 from dopepp.virtual.renderers.raster.rasteriser import (
     Silhouette,
     render,
@@ -37,7 +32,7 @@ from dopepp.virtual.scene import (
     SceneObject,
     Sensor,
 )
-from dopepp.virtual.sensor import capture
+from dopepp.virtual.sensor import Sensors, capture
 from dopepp.virtual.surface import Surface, make_surface
 
 __all__ = [

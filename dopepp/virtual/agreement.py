@@ -16,14 +16,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import Part
-from dopepp.virtual.renderers.raster.projection import project_object
-from dopepp.virtual.renderers.raster.visibility import CENTRE_SAMPLE, rasterise
+from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
@@ -146,16 +145,12 @@ def _contour(
     box = seen.box(size)
     if box is None:
         return np.empty((0, 4)), 0.0
-    left, top, right, bottom = box
     # A frame of one empty pixel, so that the outline is inside the canvas.
-    inverse = np.zeros((bottom - top + 2, right - left + 2, 1), np.float32)
-    ids = np.full(inverse.shape, -1, np.int32)
-    surface = item.surface
-    origin = (left - 1, top - 1)
-    rasterise(seen.hom, surface.faces, surface.closed, NEAR, origin, CENTRE_SAMPLE, inverse, ids, 0)
-    edges = _edges(item, ids[..., 0], inverse[..., 0])
+    left, top, right, bottom = box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1
+    inverse_depth, ids = draw_alone(item, seen.hom, (left, top, right, bottom))
+    edges = _edges(item, np.where(inverse_depth > 0, ids, -1))
     rows, columns = np.nonzero(edges)
-    x, y = columns + origin[0], rows + origin[1]
+    x, y = columns + left, rows + top
     inside = (x > 0) & (y > 0) & (x < size[0] - 1) & (y < size[1] - 1)
     normals = _normals(edges)[rows, columns]
     points = np.column_stack([x, y, normals])[inside]
@@ -165,28 +160,24 @@ def _contour(
 
 
 def _edges(
-    item: SceneObject,
-    ids: np.ndarray,
-    inverse: np.ndarray,
+    item: SceneObject, ids: Int[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """Tell the pixels right before an outline, a step in depth or a crease."""
+    """Tell the pixels right before an outline, a step in depth or a crease.
+
+    Args:
+        item: The object.
+        ids: Its triangle at every pixel, −1 beside it.
+    """
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     drawn = normals[ids]
     drawn[ids < 0] = 0.0
     edges = np.zeros(ids.shape, bool)
-    for axis in (0, 1):
-        one = np.take(drawn, range(ids.shape[axis] - 1), axis)
-        other = np.take(drawn, range(1, ids.shape[axis]), axis)
-        crease = (one * other).sum(axis=-1) < WIDEST_CREASE
-        near = np.take(ids, range(ids.shape[axis] - 1), axis) >= 0
-        far = np.take(ids, range(1, ids.shape[axis]), axis) >= 0
-        crease &= near | far
-        if axis == 0:
-            edges[:-1] |= crease
-        else:
-            edges[:, :-1] |= crease
+    # Every pixel with the one below it, then with the one to the right.
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        crease = (drawn[first] * drawn[second]).sum(axis=-1) < WIDEST_CREASE
+        edges[first] |= crease & ((ids[first] >= 0) | (ids[second] >= 0))
     return edges
 
 
@@ -200,9 +191,7 @@ def _normals(edges: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "heig
 
 
 def _profiles(
-    image: UInt8[np.ndarray, "height width 3"],
-    contour: Float[np.ndarray, "points 4"],
-    reach: int,
+    image: UInt8[np.ndarray, "height width 3"], contour: Float[np.ndarray, "points 4"], reach: int
 ) -> Float[np.ndarray, "points offsets"]:
     """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
     soft = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)

@@ -1,7 +1,4 @@
-"""The factory: image ``(epoch, index)`` of an endless, reproducible supply.
-
-Which code renders: two versions of it may draw the same scene differently.
-"""
+"""The factory: image ``(epoch, index)`` of an endless, reproducible supply."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.part import Part
-from dopepp.virtual.arrange.body import make_body
 from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
+from dopepp.virtual.body import make_body
 from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Rendered, Scene
@@ -28,16 +25,6 @@ from dopepp.virtual.sensor import capture
 _PACKAGE: Final = Path(__file__).parents[1]
 _FOLDERS: Final = ("virtual", "parts", "geometry")
 """The packages that decide a render's pixels and labels."""
-
-
-@cache
-def code_hash() -> str:
-    """Return a SHA-256 of the rendering code; kept renders of other code are not reused."""
-    digest = hashlib.sha256()
-    for folder in _FOLDERS:
-        for path in sorted((_PACKAGE / folder).rglob("*.py")):
-            digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 class Factory:
@@ -104,6 +91,19 @@ class Factory:
         """
         rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
+
+
+@cache
+def code_hash() -> str:
+    """Return a SHA-256 of the rendering code: kept renders of other code are not reused.
+
+    Two versions of it may draw the same scene differently.
+    """
+    digest = hashlib.sha256()
+    for folder in _FOLDERS:
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:

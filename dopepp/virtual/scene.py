@@ -1,11 +1,10 @@
-"""A scene: what stands before the camera, under which light, on which background.
-
-How a surface reflects light: plastic, metal, 3D print, brushed metal.
-"""
+"""A scene: what stands before the camera, of what, under which light, on which background."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
@@ -14,6 +13,18 @@ from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.parts.part import Part
 from dopepp.virtual.surface import Surface
+
+NEAR: Final = 0.01
+"""Metres; nothing closer to the camera is drawn."""
+
+Triple = tuple[float, float, float]
+"""A vector or a colour, so that what holds one can be compared and shown."""
+
+
+def triple(values: Iterable[float]) -> Triple:
+    """Return three numbers as scenes hold them."""
+    first, second, third = (float(value) for value in values)
+    return first, second, third
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,7 @@ class Grooves:
         irregularity: 0 for even grooves (layer lines), 1 for random depths and widths (brushing).
     """
 
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    axis: Triple = (0.0, 0.0, 1.0)
     pitch: float = 0.0002
     slope: float = 0.3
     irregularity: float = 0.0
@@ -50,17 +61,13 @@ class Material:
         grooves: Layer lines or brushing, or None.
     """
 
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    colour: Triple = (0.6, 0.6, 0.6)
     roughness: float = 0.6
     specular: float = 0.04
     metallic: float = 0.0
     noise: float = 0.0
     noise_pitch: float = 0.005
     grooves: Grooves | None = None
-
-
-NEAR = 0.01
-"""Metres; nothing closer to the camera is drawn."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +80,8 @@ class Light:
         reach: Distance at which the intensity holds, metres; it falls off with the square.
     """
 
-    position: tuple[float, float, float]
-    intensity: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    position: Triple
+    intensity: Triple = (0.8, 0.8, 0.8)
     reach: float = 1.0
 
 
@@ -88,9 +95,9 @@ class Ambient:
         below: Linear RGB of the lower hemisphere.
     """
 
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    above: tuple[float, float, float] = (0.25, 0.25, 0.25)
-    below: tuple[float, float, float] = (0.12, 0.12, 0.12)
+    up: Triple = (0.0, -1.0, 0.0)
+    above: Triple = (0.25, 0.25, 0.25)
+    below: Triple = (0.12, 0.12, 0.12)
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,7 @@ class Plane:
             is above the plane.
     """
 
-    normal: tuple[float, float, float]
+    normal: Triple
     offset: float
 
 

@@ -1,10 +1,8 @@
-"""The sensor: what lens, chip and file make of an ideal picture.
+"""The sensor: what lens, chip and file make of an ideal picture, and how often they do.
 
 Every step is a pure function of its arguments. To add one, write a function like those below, give
-:class:`~dopepp.virtual.scene.Sensor` its parameter and call it in :func:`capture`, where the order
-is the order of a camera: exposure, lens, chip, file.
-
-Random sensors: how often and how strongly each of a camera's defects is there.
+:class:`~dopepp.virtual.scene.Sensor` its parameter, :class:`Sensors` its probability and range, and
+call it in :func:`capture`, where the order is the order of a camera: exposure, lens, chip, file.
 """
 
 from __future__ import annotations
@@ -23,6 +21,21 @@ from dopepp.core.checks import check_number, check_range
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.virtual.scene import Sensor
+from dopepp.virtual.tone import decode_srgb, encode_srgb
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+_NOISE_VALUES: Final = 65536
+"""Length of the table of normal values that noise is read from; a power of two."""
+
+_NOISE_RUN: Final = 1024
+"""So many values are read in a row; then the hash chooses another place of the table and a sign."""
+
+_MAX_MOTION_PX: Final = 200.0
+"""Longest motion blur; its kernel's cost grows with the length."""
+
+_SMALLEST_BLUR_PX: Final = 0.1
+"""A Gaussian this narrow leaves every 8-bit picture as it is."""
 
 
 @dataclass(frozen=True)
@@ -96,21 +109,6 @@ class Sensors:
         )
 
 
-Image = UInt8[np.ndarray, "height width 3"]
-
-_NOISE_VALUES: Final = 65536
-"""Length of the table of normal values that noise is read from; a power of two."""
-
-_NOISE_RUN: Final = 1024
-"""So many values are read in a row; then the hash chooses another place of the table and a sign."""
-
-_MAX_MOTION_PX: Final = 200.0
-"""Longest motion blur; its kernel's cost grows with the length."""
-
-_SMALLEST_BLUR_PX: Final = 0.1
-"""A Gaussian this narrow leaves every 8-bit picture as it is."""
-
-
 def capture(image: Image, sensor: Sensor) -> Image:
     """Return what a sensor makes of an ideal picture; the default sensor returns it unchanged.
 
@@ -177,11 +175,8 @@ def compress(image: Image, quality: int) -> Image:
 
 def _exposure_curve(exposure_ev: float) -> UInt8[np.ndarray, "256"]:
     """Return the sRGB codes after the light was multiplied by 2^EV; what is over white clips."""
-    code = np.arange(256) / 255
-    light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    light = np.clip(light * 2.0**exposure_ev, 0.0, 1.0)
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * code), np.uint8)
+    light = np.clip(decode_srgb(np.arange(256) / 255) * 2.0**exposure_ev, 0.0, 1.0)
+    return np.asarray(np.rint(255 * encode_srgb(light)), np.uint8)
 
 
 def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:

@@ -1,4 +1,4 @@
-"""Curves and PNG files: the numbers in them, and that a file is whole or absent."""
+"""Curves and the numbers in them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import figure_image
 from dopepp.drawing.curves import (
+    RateCurve,
     accuracy_curve,
     accuracy_figure,
+    rates_figure,
     save_accuracy_curves,
 )
 from dopepp.metrics.functional import auc
@@ -83,33 +85,40 @@ def test_no_global_state_of_pyplot_is_touched() -> None:
     assert plt.get_fignums() == []
 
 
-def test_a_png_keeps_its_pixels_in_rgb(tmp_path: Path) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-    write_png(tmp_path / "new" / "image.png", image)
-    back = cv2.imread(str(tmp_path / "new" / "image.png"))[..., ::-1]
-    assert np.array_equal(back, image)
+def curve(*rates: float) -> RateCurve:
+    rate = np.array(rates)
+    return RateCurve(np.arange(len(rates), dtype=float), rate, rate * 0.9, rate * 0.9 + 0.1)
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((2, 2, 3)), np.zeros((2, 2), np.uint8), np.zeros((0, 2, 3), np.uint8)]
-)
-def test_what_is_no_image_is_refused(image: np.ndarray, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"an image must be uint8 \(H, W, 3\), got"):
-        write_png(tmp_path / "image.png", image)
-    assert list(tmp_path.iterdir()) == []
+def test_every_panel_has_a_line_and_an_interval_for_every_method() -> None:
+    panels = {
+        "a": {"dope": curve(0.9, 0.5), "dopepp": curve(1.0, 0.8)},
+        "b": {"dope": curve(0.1)},
+        "c": {},
+    }
+    figure = rates_figure(panels, "distance (m)", 2, np.array([-0.5, 0.5]))
+    first, second, third, unused = figure.axes
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["a", "b", "c"]
+    assert [text.get_text() for text in first.get_legend().get_texts()] == ["dope", "dopepp"]
+    np.testing.assert_allclose(first.get_lines()[0].get_ydata(), [90, 50])
+    # A point on its own has a bar, because its band has no width.
+    (low, high) = second.collections[-1].get_segments()[0][:, 1]
+    assert (low, high) == pytest.approx((9, 19))
+    assert third.get_legend() is None
+    assert not unused.axison
+    assert figure_image(figure).std() > 0
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.csv"
-    write_whole(path, b"old")
+def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured() -> None:
+    rate = np.array([0.1, 0.9, 0.4])
+    lines = {"dopepp": RateCurve(np.array([0.5, 1.0, 2.0]), rate, rate, rate)}
+    (axes,) = rates_figure({"a": lines}, "scale", 1, ratio=True).axes
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["0.5", "1", "2"]
+    left, middle, right = axes.transData.transform([(x, 0) for x in (0.5, 1, 2)])[:, 0]
+    assert middle - left == pytest.approx(right - middle)
 
-    def full(*_: object) -> None:
-        raise OSError("No space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_whole(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
+@pytest.mark.parametrize(("panels", "columns"), [({}, 2), ({"a": {}}, 0)])
+def test_nothing_to_draw_is_refused(panels: dict[str, dict[str, RateCurve]], columns: int) -> None:
+    with pytest.raises(ValueError, match=f"got {len(panels)} and {columns}"):
+        rates_figure(panels, "x", columns)

@@ -89,10 +89,9 @@ def test_a_jpeg_may_go_on_behind_its_end(tmp_path: Path, image: np.ndarray) -> N
 
 def test_bombs_and_huge_files_are_not_decoded(tmp_path: Path) -> None:
     path = tmp_path / "image.png"
-    for side in (9000, 14_000):  # below and above Pillow's own limit
-        Image.new("1", (side, side)).save(path)
-        with pytest.raises(UserError, match=f"image.png of .*{side}|could be decompression bomb"):
-            read_image(path)
+    Image.new("1", (9000, 9000)).save(path)  # below Pillow's own limit
+    with pytest.raises(UserError, match=r"image\.png of .*9000"):
+        read_image(path)
     with path.open("wb") as file:
         file.truncate(10**10)
     with pytest.raises(UserError, match=r"more than 256 MB; allowed: at most 256 MB"):

@@ -12,6 +12,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from dopepp.experiment.config.run import RunConfig
+
 CONF = Path(__file__).parents[2] / "conf"
 TINY = (
     "data=virtual",
@@ -27,6 +29,7 @@ TINY = (
     "trainer.max_epochs=1",
 )
 Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 
 
 @pytest.fixture
@@ -45,9 +48,15 @@ def composed() -> Iterator[Composer]:
 
 
 @pytest.fixture
-def tiny(composed: Composer) -> Composer:
+def parsed(composed: Composer) -> Parser:
+    """The same as ``train.py`` parses it."""
+    return lambda *overrides: RunConfig.of(composed(*overrides))
+
+
+@pytest.fixture
+def tiny(parsed: Parser) -> Parser:
     """The same with a network and data that take no time."""
-    return lambda *overrides: composed(*TINY, *overrides)
+    return lambda *overrides: parsed(*TINY, *overrides)
 
 
 FAST_TRAINING = '''

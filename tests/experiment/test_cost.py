@@ -14,24 +14,31 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_test_source
+from dopepp.experiment.build.sources import build_parts, build_test_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
-from dopepp.experiment.cost import measure_cost, read_frames
-from dopepp.experiment.jobs import do_job
-from dopepp.experiment.timing import WARM_UP, RehearsedEstimator, likely_maps, time_frames
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.cost import (
+    WARM_UP,
+    RehearsedEstimator,
+    likely_maps,
+    measure_cost,
+    read_frames,
+    time_frames,
+)
+from dopepp.experiment.train import do_job
 from dopepp.geometry.camera import transform
 from dopepp.maps.encode import MapGeometry
 
 Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 
 SMALL = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=4", "cost.batch_size=2")
 
 
 def test_counts_are_the_papers_and_times_are_written(
-    composed: Composer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    parsed: Parser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = composed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
+    config = parsed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
     cost = measure_cost(config, tmp_path)
     assert cost.backbone_weights == 1_107_776
     assert cost.input_size == (32, 32)
@@ -54,8 +61,8 @@ def test_counts_are_the_papers_and_times_are_written(
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
 
 
-def test_the_original_backbone(composed: Composer, tmp_path: Path) -> None:
-    config = composed(*SMALL, "model/backbone=vgg19_original", "model.width=1", "job=cost")
+def test_the_original_backbone(parsed: Parser, tmp_path: Path) -> None:
+    config = parsed(*SMALL, "model/backbone=vgg19_original", "model.width=1", "job=cost")
     assert measure_cost(config, tmp_path).backbone_weights == 9_696_960
 
 
@@ -76,27 +83,22 @@ def test_impossible_jobs(composed: Composer, tmp_path: Path, override: str, mess
     assert not any(tmp_path.iterdir())
 
 
-def test_the_time_does_not_depend_on_torchs_mode(composed: Composer, tmp_path: Path) -> None:
-    measure_cost(composed(*SMALL, "job=cost"), tmp_path)
+def test_the_time_does_not_depend_on_torchs_mode(parsed: Parser, tmp_path: Path) -> None:
+    measure_cost(parsed(*SMALL, "job=cost"), tmp_path)
     assert torch.is_grad_enabled()
 
 
-def estimator_of(config: dict[str, Any]) -> tuple[RehearsedEstimator, MapGeometry, DescribedSource]:
-    data = config["data"]
-    parts = build_parts(data)
+def estimator_of(config: RunConfig) -> tuple[RehearsedEstimator, MapGeometry, DescribedSource]:
+    parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
-    estimator = RehearsedEstimator(network, description)
-    return (
-        estimator,
-        map_geometry(config["maps"], network.stride),
-        build_test_source(data, parts, 0),
-    )
+    geometry = map_geometry(config.maps, network.stride)
+    return RehearsedEstimator(network, description), geometry, build_test_source(config.data, parts)
 
 
-def test_an_untrained_networks_frames_end_in_the_pictures_poses(composed: Composer) -> None:
+def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed: Parser) -> None:
     """So recovery has as much to do as behind a trained network."""
     estimator, geometry, source = estimator_of(
-        composed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
+        parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
     )
     samples = [source.sample(index) for index in range(8)]
     passes = []
@@ -116,9 +118,9 @@ def test_an_untrained_networks_frames_end_in_the_pictures_poses(composed: Compos
 
 
 @pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
-def test_the_exchanged_maps_have_the_networks_own_shape(composed: Composer, size: str) -> None:
+def test_the_exchanged_maps_have_the_networks_own_shape(parsed: Parser, size: str) -> None:
     """Pictures are padded no further than the network needs, not to the whole input."""
-    config = composed(
+    config = parsed(
         "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
         "data.parts=[servoholder,pivconnector]",
     )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from dopepp.core.errors import RunError
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.lr_finder import find_learning_rate, smooth, suggest
 from dopepp.models.losses import SpatialCrossEntropy
 
@@ -51,7 +52,7 @@ def test_smoothing_keeps_constants_and_lies_between_the_extremes() -> None:
 
 
 def test_a_sweep_ends_where_the_loss_is_not_finite(
-    tiny: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number, forward = itertools.count(), SpatialCrossEntropy.forward
 
@@ -72,7 +73,7 @@ def test_a_sweep_ends_where_the_loss_is_not_finite(
 
 
 def test_a_loss_that_diverges_at_once_has_no_table(
-    tiny: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         SpatialCrossEntropy,

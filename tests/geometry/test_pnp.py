@@ -386,7 +386,7 @@ def test_known_covariances_do_as_well_as_a_start_at_the_truth(name: str) -> None
     """Against scipy's robust least squares, which is told the truth to start from."""
     rng = np.random.default_rng(11)
     cuboid, passed = CUBOIDS[name], np.zeros(2)
-    for _ in range(60):
+    for _ in range(30):
         truth, sigma = look_at(cuboid, rng), covariances(rng, 9)
         root = np.linalg.cholesky(sigma)
         pixels = project(transform(truth, cuboid), K) + (root @ rng.normal(size=(9, 2, 1)))[..., 0]
@@ -395,7 +395,7 @@ def test_known_covariances_do_as_well_as_a_start_at_the_truth(name: str) -> None
         result = solve_pnp(cuboid, pixels, K, covariance_px=sigma)
         best = refined_from(truth, cuboid, pixels, np.linalg.inv(root))
         passed += add(result.T_cam_obj, truth, cuboid) < 0.1, add(best, truth, cuboid) < 0.1
-    assert passed[0] >= passed[1] - 3
+    assert passed[0] >= passed[1] - 2
 
 
 def refined_from(

@@ -25,7 +25,7 @@ from dopepp.inference.refinement.view import (
 from dopepp.inference.refinement.visible import surface_points, visible
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual.arrange.body import make_body
+from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers.raster.rasteriser import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 

@@ -75,12 +75,6 @@ def test_peaks_on_the_border_are_exact(corner: tuple[float, float]) -> None:
     assert found == pytest.approx(np.array([corner]), abs=1e-3)
 
 
-def test_pixels_of_a_cell() -> None:
-    peaks = find_peaks(gaussians((5.0, 2.0)), GEOMETRY)
-    assert_allclose(peaks.position[0, 0, 0], [8 * 5 + 3.5, 8 * 2 + 3.5], atol=1e-3)
-    assert peaks.score[0, 0, 0] == 1
-
-
 @pytest.mark.parametrize(
     "centre", [(10.5, 10.0), (10.0, 10.5), (10.5, 10.5), (0.5, 0.0), (28.5, 28.5)]
 )
@@ -240,11 +234,6 @@ def test_a_batch_is_its_images() -> None:
         alone = find_peaks(belief[b : b + 1], GEOMETRY, max_peaks=7)
         for name, values in vars(alone).items():
             assert_array_equal(values, getattr(together, name)[b : b + 1])
-
-
-def test_maps_that_need_a_gradient_are_read() -> None:
-    belief = gaussians((5.0, 5.0)).requires_grad_()
-    assert find_peaks(belief, GEOMETRY).found.sum() == 1
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])

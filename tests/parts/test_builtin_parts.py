@@ -34,7 +34,7 @@ def to_solid(part: Part, centre: np.ndarray) -> Manifold:
 def share_moved(solid: Manifold, rotation: np.ndarray) -> float:
     """Volume of the symmetric difference with the rotated solid, over the solid's own."""
     rotated = solid.transform(np.column_stack([rotation, np.zeros(3)]))
-    return float(((solid - rotated).volume() + (rotated - solid).volume()) / solid.volume())
+    return float(2 * (1 - (solid ^ rotated).volume() / solid.volume()))
 
 
 @PARTS

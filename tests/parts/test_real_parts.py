@@ -57,15 +57,13 @@ def test_a_textured_model_agrees_with_trimesh(ycb_root: Path, name: str) -> None
     np.testing.assert_allclose(_sorted(ours), _sorted(theirs[area]), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["stl", *TEXTURED])
+@pytest.mark.parametrize("name", ["stl", "006_mustard_bottle"])
 def test_a_decimated_part_keeps_its_shape(shared_data: Path, name: str) -> None:
     if name == "stl":
-        meshes = [
-            load_part(path, "mm").mesh for path in sorted(shared_data.rglob("*.[sS][tT][lL]"))
-        ]
+        parts = [load_part(path, "mm") for path in sorted(shared_data.rglob("*.[sS][tT][lL]"))[:3]]
     else:
-        meshes = [ycb_part(shared_data / "ycb_video_mini", name).mesh]
-    for mesh in meshes:
+        parts = [ycb_part(shared_data / "ycb_video_mini", name)]
+    for mesh in (part.mesh for part in parts):
         assert mesh is not None
         whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         # The edges of the files' long triangles are halved more often than those of the models.

@@ -45,7 +45,7 @@ SHAPES = {
     "one hole on an axis": (plate((30, 0, 4)), 1, 0),
 }
 
-SLOW = ("cube", "sphere", "triangular prism", "square prism")
+SLOW = ("cube", "sphere", "triangular prism", "square prism", "hexagonal prism")
 """Shapes with many axes, which take long: only as the finder has it hardest, moved and recut."""
 
 

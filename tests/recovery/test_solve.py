@@ -52,12 +52,3 @@ def test_maps_narrower_than_their_errors_still_give_poses(
         good += error(result.T_cam_obj, truth, box) < 0.0141  # a tenth of the diameter
         assert result.T_cam_obj is None or result.inliers.sum() >= 4
     assert good >= 38
-
-
-def test_too_few_keypoints_have_a_reason(box: np.ndarray, K: np.ndarray) -> None:
-    pixels = np.full((9, 2), np.nan)
-    pixels[:3] = [[0, 0], [50, 0], [0, 50]]
-    covariance = np.tile(np.eye(2), (9, 1, 1))
-    result = solve_group(KeypointGroup(pixels, np.zeros(9), covariance), box, K)
-    assert result.T_cam_obj is None
-    assert "only 3 usable points" in result.reason

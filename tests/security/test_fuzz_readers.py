@@ -51,7 +51,7 @@ from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.geometry.camera import camera_matrix, project_keypoints
-from dopepp.models.checkpoint import released as safetensors_file
+from dopepp.models.checkpoint.released import read_safetensors, write_safetensors
 from dopepp.models.checkpoint.schema import load_network
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Mesh, make_part
@@ -221,8 +221,8 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
         add(name, image.save, None)
     add("a.ckpt", lambda path: torch.save(content, path), load_network)
     tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
-    add("a.safetensors", lambda path: safetensors_file.write(path, tensors, {"spec": "{}"}),
-        safetensors_file.read)  # fmt: skip
+    add("a.safetensors", lambda path: write_safetensors(path, tensors, {"spec": "{}"}),
+        read_safetensors)  # fmt: skip
     add("a.yaml", lambda path: path.write_text("a: {b: [1, 2.5, null]}\nc: 'x'\n"), read_yaml)
     add("overrides.yaml", lambda path: path.write_text("- model=dopepp\n- 'data.parts=[a]'\n"),
         read_yaml)  # fmt: skip

@@ -14,7 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dopepp.models.checkpoint.released import DTYPES, MAX_HEADER_BYTES, read, write
+from dopepp.models.checkpoint.released import (
+    MAX_HEADER_BYTES,
+    read_safetensors,
+    write_safetensors,
+)
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -83,25 +87,25 @@ def test_a_header_that_lies(name: str, tmp_path: Path, refused: Refused) -> None
     path = tmp_path / "a.safetensors"
     path.write_bytes(FILES[name])
     with refused(r"a\.safetensors: .*allowed: a whole safetensors file"):
-        read(path)
+        read_safetensors(path)
 
 
 def test_a_header_of_megabytes_is_not_parsed(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "a.safetensors"
     path.write_bytes(packed(b'{"a":"' + b" " * (MAX_HEADER_BYTES + 1) + b'"}', b""))
     with refused("a header of 8000009 bytes, over 8000000"):
-        read(path)
+        read_safetensors(path)
 
 
 def test_a_huge_file_and_what_is_no_file(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "a.safetensors"
     for place in (path, tmp_path):
         with refused(r"No such file|Is a directory"):
-            read(place)
+            read_safetensors(place)
     with path.open("wb") as file:
         file.truncate(2**40)
     with refused("1099511627776 bytes"):
-        read(path)
+        read_safetensors(path)
 
 
 @settings(max_examples=40, deadline=None)
@@ -117,8 +121,8 @@ def test_what_is_written_is_read_by_us_and_by_the_library(
 ) -> None:
     path = tmp_path_factory.mktemp("any") / "a.safetensors"
     tensors = {"a": torch.from_numpy(array.copy()), "b.c": torch.ones(2, 3)}
-    write(path, tensors, {"text": text})
-    loaded, metadata = read(path)
+    write_safetensors(path, tensors, {"text": text})
+    loaded, metadata = read_safetensors(path)
     library = safetensors.torch.load_file(path)
     assert metadata == {"text": text}
     for name, tensor in tensors.items():
@@ -131,22 +135,17 @@ def test_what_is_written_is_read_by_us_and_by_the_library(
 def test_views_and_shared_tensors_are_written_as_they_look(tmp_path: Path) -> None:
     base = torch.arange(12.0).view(3, 4)
     tensors = {"t": base.T, "again": base, "row": base[1], "repeated": torch.ones(1).expand(5)}
-    write(tmp_path / "a.safetensors", tensors, {})
-    loaded, metadata = read(tmp_path / "a.safetensors")
+    write_safetensors(tmp_path / "a.safetensors", tensors, {})
+    loaded, metadata = read_safetensors(tmp_path / "a.safetensors")
     assert metadata == {}
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
-    assert set(DTYPES.values()) >= {tensor.dtype for tensor in loaded.values()}
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_a_header_too_long_to_be_read_is_not_written(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
-    write(path, {"a": torch.ones(2)}, {"x": "y"})
+    write_safetensors(path, {"a": torch.ones(2)}, {"x": "y"})
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="none of BOOL"):
-        write(path, {"a": torch.ones(2, dtype=torch.float8_e4m3fn)}, {})
-    with pytest.raises(ValueError, match="of a shape that is none"):
-        write(path, {"a": torch.ones([1] * 9)}, {})
     with pytest.raises(ValueError, match="header of"):
-        write(path, {}, {"x": "y" * MAX_HEADER_BYTES})
+        write_safetensors(path, {}, {"x": "y" * MAX_HEADER_BYTES})
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -20,7 +20,7 @@ from dopepp.virtual.presets.preset import PRESETS
 
 
 def test_falls_with_the_error_of_the_pose() -> None:
-    factory = Factory([servoholder()], PRESETS["table"], 3)
+    factory = Factory([servoholder()], PRESETS["table"].resized(320, 240), 3)
     errors, values, right = [], [], []
     for index in range(4):
         rendered = factory.render(0, index)

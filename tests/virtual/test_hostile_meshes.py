@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Mesh
@@ -24,6 +22,7 @@ from dopepp.virtual import (
     Rendered,
     Scene,
     SceneObject,
+    Surface,
     make_surface,
     render,
     silhouette,
@@ -31,6 +30,7 @@ from dopepp.virtual import (
 )  # fmt: skip
 
 MakeScene = Callable[..., Scene]
+MakeSurface = Callable[[trimesh.Trimesh], Surface]
 FLOOR = Plane((0.0, -1.0, 0.0), -0.3)
 
 
@@ -75,20 +75,18 @@ def test_vertices_on_the_camera_plane_and_at_the_camera(scene_of: MakeScene) -> 
     check(scene_of(SceneObject(make_surface(Mesh(corners, faces)), np.eye(4))))
 
 
-def test_a_mesh_around_camera_and_lights(scene_of: MakeScene) -> None:
+def test_a_mesh_around_camera_and_lights(scene_of: MakeScene, surface_of: MakeSurface) -> None:
     room = trimesh.creation.box((0.5, 0.4, 1.0))
-    vertices, faces = np.asarray(room.vertices), np.asarray(room.faces, np.int32)
-    lights = (Light((0, 0, 0)), Light(tuple(vertices[0])), Light((0.1, 0.1, 0.2)))
-    for winding in (1, -1):
-        surface = make_surface(Mesh(vertices, faces[:, ::winding]))
-        rendered = check(scene_of(SceneObject(surface, np.eye(4)), lights=lights))
-        assert rendered.visible_fractions[0] == 0 or winding == -1
+    lights = (Light((0, 0, 0)), Light(tuple(room.vertices[0])), Light((0.1, 0.1, 0.2)))
+    for inside_out in (False, True):
+        rendered = check(scene_of(SceneObject(surface_of(room), np.eye(4)), lights=lights))
+        assert rendered.visible_fractions[0] == 0 or inside_out
+        room.invert()
 
 
-def test_extreme_sizes(scene_of: MakeScene) -> None:
-    ball = trimesh.creation.icosphere(2, 1.0)
+def test_extreme_sizes(scene_of: MakeScene, surface_of: MakeSurface) -> None:
     for size, depth in ((1e-7, 0.1), (1e4, 3e4), (1e-3, 1e6), (0.1, 0.1001)):
-        surface = make_surface(Mesh(np.asarray(ball.vertices) * size, np.asarray(ball.faces)))
+        surface = surface_of(trimesh.creation.icosphere(2, size))
         pose = make_transform(np.eye(3), np.array([0.0, 0.0, depth]))
         check(scene_of(SceneObject(surface, pose, Material(grooves=Grooves(), noise=0.1))))
 
@@ -103,22 +101,9 @@ def test_nothing_but_faces_without_area(scene_of: MakeScene) -> None:
         assert check(scene_of(SceneObject(surface, pose))).visible_fractions[0] == 0
 
 
-@pytest.mark.parametrize("index", [-1, 3, 2**31 - 1])
-def test_faces_of_missing_vertices_are_refused(index: int) -> None:
-    with pytest.raises(UserError, match="vertices 0 to 2"):
-        make_surface(Mesh(np.eye(3), np.array([(0, 1, index)], np.int32)))
-
-
-def test_texture_coordinates_must_be_finite() -> None:
-    uv = np.array([(0, 0), (np.nan, 0), (0, 1)], np.float32)
-    mesh = Mesh(np.eye(3), np.array([(0, 1, 2)], np.int32), uv, np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(UserError, match="texture coordinate"):
-        make_surface(mesh)
-
-
 def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of: MakeScene) -> None:
-    # All pairs of these faces would take minutes.
-    count = 150_000
+    # All pairs of these faces would take a minute.
+    count = 60_000
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
     around = np.arange(1, count + 1)

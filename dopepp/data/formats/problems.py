@@ -1,6 +1,9 @@
-"""Read what a damaged file still holds: every field by itself, every problem a defect.
+"""Where the problems of a data set's files go, and what every reader of them reads.
 
-What a check found: defects, each with file and field, and notes that are no defects.
+A reader is handed a :class:`Problems`: it reports what is wrong with a field and goes on with a
+neutral value (NaN, None, an empty list). A source hands it :data:`STRICT`, which raises the first
+problem; a check hands it a :class:`CheckReport`, which keeps them all. So both parse alike, and
+what a check passes, a source reads. To add a layout, see :mod:`dopepp.data.check`.
 """
 
 from __future__ import annotations
@@ -9,19 +12,19 @@ import io
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn, Protocol, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.core.json import MAX_BYTES, parse_json
-from dopepp.data.formats.bop.images import FORMATS
-from dopepp.drawing.pictures import MAX_PIXELS, read_content, whole_picture
+from dopepp.core.json import MAX_BYTES, parse_json, read_json
+from dopepp.drawing.pictures import MAX_PIXELS, read_content, read_image, whole_picture
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +33,47 @@ MAX_KEPT: Final = 10_000
 
 _LOG_EVERY: Final = 1000
 """Images between two lines of the log."""
+
+FORMATS: Final = ("PNG", "JPEG", "TIFF")
+"""Of BOP's images."""
+
+FARTHEST: Final = 1e9
+"""No number of a label is larger in any unit, and squares of such numbers stay exact enough."""
+
+T = TypeVar("T")
+
+
+class Problems(Protocol):
+    """Takes what a reader finds wrong."""
+
+    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
+        """Take a problem.
+
+        Args:
+            path: The file; a tar's member as ``TAR/MEMBER``.
+            where: What in it, e.g. ``3[0].cam_R_m2c`` or ``size``.
+            got: What was found.
+            allowed: What is allowed; empty where ``got`` says it.
+        """
+
+    def take(self, path: Path | str, where: str, error: UserError) -> None:
+        """Take a problem that a reader below has raised."""
+
+
+class Strict:
+    """Raises the first problem: what a source does."""
+
+    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> NoReturn:
+        """Raise a :class:`~dopepp.core.errors.UserError`."""
+        fix = "correct the file or get it again; `dopepp check` lists all problems of a data set"
+        raise UserError(": ".join(filter(None, (str(path), where.lstrip("."), got))), allowed, fix)
+
+    def take(self, path: Path | str, where: str, error: UserError) -> NoReturn:
+        """Raise the error as it is."""
+        raise error
+
+
+STRICT: Final = Strict()
 
 
 @dataclass(frozen=True)
@@ -53,7 +97,7 @@ class Defect:
 
 @dataclass
 class CheckReport:
-    """The result of a check.
+    """Keeps all problems, as defects: what a check does.
 
     Attributes:
         root: The folder.
@@ -78,13 +122,20 @@ class CheckReport:
         """Whether nothing is wrong."""
         return self.num_defects == 0
 
-    def add(self, path: Path | str, where: str, message: str) -> None:
-        """Add a defect."""
+    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
+        """Keep a defect."""
         where = where.lstrip(".") or "top level"
         self.num_defects += 1
         self.counts[where.rpartition(".")[2]] += 1
         if len(self.defects) < MAX_KEPT:
+            message = f"{got}; allowed: {allowed}" if allowed else got
             self.defects.append(Defect(self._relative(path), where, message))
+
+    def take(self, path: Path | str, where: str, error: UserError) -> None:
+        """Keep an error as a defect; it need not name the file again."""
+        got = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
+        got = "missing" if where == "file" else got
+        self.report(path, where, got, error.allowed)
 
     def note(self, text: str) -> None:
         """Add what is worth knowing and no defect, once."""
@@ -114,146 +165,186 @@ class CheckReport:
         return [*(f"note: {note}" for note in self.notes), *shown, summary]
 
 
-def load_json(report: CheckReport, path: Path, max_bytes: int = MAX_BYTES) -> Any:
-    """Read a JSON file, None where nothing can be read.
-
-    A number that is not finite, or a key twice, is a defect that does not hide the rest.
-    """
-    if not path.is_file():
-        report.add(path, "file", "missing")
-        return None
-    size = path.stat().st_size
-    if size > max_bytes:
-        report.add(path, "file", f"{size:,} bytes; allowed: at most {max_bytes:,}")
-        return None
-    return decode_json(report, path, path.read_bytes())
-
-
-def decode_json(report: CheckReport, path: Path | str, content: bytes) -> Any:
-    """Parse JSON, None where that is impossible."""
+def attempt(problems: Problems, path: Path | str, where: str, read: Callable[[], T]) -> T | None:
+    """Return what a reader returns; what it raises is a problem, and None the answer."""
     try:
-        return parse_json(content, str(path))
+        return read()
     except UserError as error:
-        report.add(path, "JSON", error.got.removeprefix(f"{path}: "))
+        problems.take(path, where, error)
+        return None
+
+
+def attempt_file(problems: Problems, path: Path, where: str, read: Callable[[], T]) -> T | None:
+    """Attempt to read a file; one that is missing is a problem of the ``file``."""
+    return attempt(problems, path, where if path.is_file() else "file", read)
+
+
+def load_object(
+    problems: Problems, path: Path, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
+) -> dict[str, Any] | None:
+    """Read a JSON file whose top level is an object, None where that is impossible.
+
+    A number that is not finite, or a key twice, is a problem that does not hide the rest.
+    """
+    found = attempt_file(problems, path, "JSON", lambda: [read_json(path, max_bytes)])
+    if found is None:
+        readable = path.is_file() and path.stat().st_size <= max_bytes
+        content = _leniently(path.read_bytes()) if readable else None
+        return content if isinstance(content, dict) else None
+    if isinstance(found[0], dict):
+        return found[0]
+    problems.report(path, "top level", f"{found[0]!r:.60}", allowed)
+    return None
+
+
+def decode_json(problems: Problems, path: Path | str, content: bytes) -> Any:
+    """Parse JSON as :func:`load_object` does, whatever it holds."""
+    found = attempt(problems, path, "JSON", lambda: [parse_json(content, str(path))])
+    return _leniently(content) if found is None else found[0]
+
+
+def _leniently(content: bytes) -> Any:
     try:
         return json.loads(content)
     except (ValueError, RecursionError):
         return None
 
 
-def load_image(
-    report: CheckReport, path: Path, size: tuple[int, int] | None
-) -> NDArray[Any] | None:
-    """Read a map of numbers from an image file as :func:`decode_map` does."""
-    content = _content(report, path)
-    return None if content is None else decode_map(report, path, content, size)
-
-
-def load_size(report: CheckReport, path: Path) -> tuple[int, int] | None:
-    """Return a picture's (width, height) as :func:`decode_size` does."""
-    content = _content(report, path)
-    return None if content is None else decode_size(report, path, content)
-
-
-def is_colour(path: Path) -> bool:
-    """Tell whether an image file states several channels; False where it states nothing."""
-    try:
-        with Image.open(path, formats=FORMATS) as image:
-            return len(image.getbands()) > 1
-    except (OSError, ValueError):
-        return False
-
-
-def _content(report: CheckReport, path: Path) -> bytes | None:
-    try:
-        return read_content(path)
-    except UserError as error:
-        report.add(path, "file", error.got if path.exists() else "missing")
-        return None
-
-
-def decode_size(report: CheckReport, path: Path | str, content: bytes) -> tuple[int, int] | None:
-    """Return a picture's (width, height) after reading all of it.
-
-    A truncated file still states its size, so that other images can be held against it; None where
-    it does not.
-    """
-    _decode(report, path, content)
-    try:
-        width, height = Image.open(io.BytesIO(content), formats=FORMATS).size
-    except Exception:  # said above
-        return None
-    return (width, height) if 0 < width * height <= MAX_PIXELS else None
-
-
-_ONE_CHANNEL: Final = 2
-"""Axes of an image with one channel."""
-
-
-def decode_map(
-    report: CheckReport, path: Path | str, content: bytes, size: tuple[int, int] | None
-) -> NDArray[Any] | None:
-    """Read a map of numbers (depth, mask, labels), None where that is impossible.
+def numbers(
+    problems: Problems, path: Path | str, where: str, value: object, *shape: int
+) -> Float[np.ndarray, "..."]:
+    """Return a field's numbers in a shape.
 
     Args:
-        report: Takes the defects.
-        path: The file's name.
-        content: Its bytes.
-        size: The (width, height) it must have; None for any.
+        problems: Takes what is wrong.
+        path: The file.
+        where: The field.
+        value: A number, or (nested) lists of as many as the shape has; None where it is missing.
+        shape: What they are returned in; NaNs where they are anything else, or not finite.
     """
-    image = _decode(report, path, content)
-    if image is None:
-        return None
-    if image.ndim != _ONE_CHANNEL:
-        report.add(path, "channels", f"{image.shape[2]}; allowed: one")
-        return None
-    if size is not None and (image.shape[1], image.shape[0]) != size:
-        got = f"{image.shape[1]}×{image.shape[0]}"
-        report.add(path, "size", f"{got}; the colour image has {size[0]}×{size[1]}")
-        return None
-    return image
-
-
-def _decode(report: CheckReport, path: Path | str, content: bytes) -> NDArray[Any] | None:
-    """Read a whole PNG, JPEG or TIFF within bounds."""
-    try:
-        return np.asarray(whole_picture(content, FORMATS))
-    except ValueError as error:
-        report.add(path, "image", f"unreadable or truncated, {len(content):,} bytes ({error})")
-        return None
-
-
-def numbers(
-    report: CheckReport, path: Path | str, where: str, value: object, *shape: int
-) -> NDArray[np.float64] | None:
-    """Return a field's numbers in a shape, None (and a defect) where they are not that."""
     try:
         array = np.array(value)
-        if array.dtype.kind not in "iuf":
-            raise ValueError
-        array = array.astype(np.float64).reshape(shape)
-    except (ValueError, OverflowError, TypeError):
-        length = int(np.prod(shape))
-        got = "missing" if value is None else f"{value!r:.60}"
-        report.add(path, where, f"{got}; allowed: {length} numbers")
-        return None
-    if not np.isfinite(array).all():
-        report.add(path, where, f"not finite (NaN or infinite): {value!r:.60}")
-        return None
-    return array
+        fits = array.size == np.prod(shape) and array.dtype.kind in "iuf"
+    except (ValueError, OverflowError):
+        fits = False
+    if fits and (np.abs(array.astype(np.float64)) <= FARTHEST).all():
+        return array.astype(np.float64).reshape(shape)
+    got = "missing" if value is None else f"{value!r:.60}"
+    if fits and not np.isfinite(array).all():
+        got = f"not finite (NaN or infinite): {got}"
+    noun = "number" if shape == (1,) else "numbers"
+    allowed = f"{'×'.join(map(str, shape))} finite {noun} up to {FARTHEST:.0e}"
+    problems.report(path, where, got, allowed)
+    return np.full(shape, np.nan)
 
 
-def entries(report: CheckReport, path: Path | str, where: str, value: object) -> list[Any]:
-    """Return a list's entries, none (and a defect) where it is no list of JSON objects."""
+def scalar(problems: Problems, path: Path | str, where: str, value: object) -> float:
+    """Return a field's number, NaN where it holds anything else."""
+    return float(numbers(problems, path, where, value, 1)[0])
+
+
+def entries(problems: Problems, path: Path | str, where: str, value: object) -> list[Any]:
+    """Return a list's entries; empty ones in place of those that are no JSON objects."""
     if not isinstance(value, list):
-        report.add(path, where, f"{'missing' if value is None else repr(value)[:60]}; a list")
+        problems.report(path, where, "missing" if value is None else f"{value!r:.60}", "a list")
         return []
-    for number, entry in enumerate(value):
+    for place, entry in enumerate(value):
         if not isinstance(entry, dict):
-            report.add(path, f"{where}[{number}]", f"{entry!r:.60}; allowed: a JSON object")
+            problems.report(path, f"{where}[{place}]", f"{entry!r:.60}", "a JSON object")
     return [entry if isinstance(entry, dict) else {} for entry in value]
 
 
 def mapping(value: object) -> Mapping[str, Any]:
     """Return a JSON object, an empty one for anything else."""
     return value if isinstance(value, dict) else {}
+
+
+def picture(
+    problems: Problems, path: Path | str, content: bytes | None = None
+) -> Image.Image | None:
+    """Decode a BOP image, None where it is missing, damaged, too large or of another format.
+
+    Args:
+        problems: Takes what is wrong.
+        path: The file.
+        content: Its bytes, where they do not lie on the disk by themselves.
+    """
+    if content is None:
+        content = attempt_file(problems, Path(path), "image", lambda: read_content(Path(path)))
+    if content is None:
+        return None
+    try:
+        return whole_picture(content, FORMATS)
+    except ValueError as error:
+        got = f"unreadable or truncated, {len(content):,} bytes ({error})"
+        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
+        problems.report(path, "image", got, allowed)
+        return None
+
+
+def picture_shape(
+    problems: Problems, path: Path | str, content: bytes | None = None
+) -> tuple[int, int] | None:
+    """Return a picture's (height, width) after reading all of it.
+
+    A truncated file still states its size, so that other images can be held against it; None where
+    it does not.
+    """
+    picture(problems, path, content)
+    try:
+        stated = Image.open(Path(path) if content is None else io.BytesIO(content), formats=FORMATS)
+    except Exception:  # said above
+        return None
+    return (stated.height, stated.width) if 0 < stated.width * stated.height <= MAX_PIXELS else None
+
+
+def read_map(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
+    """Read a frame's map of numbers (depth, labels), of the colour image's (height, width).
+
+    Raises:
+        UserError: It is missing, damaged, has several channels or another size.
+    """
+    image = check_map(STRICT, path, shape)
+    assert image is not None
+    return image
+
+
+def check_map(
+    problems: Problems, path: Path, shape: tuple[int, int] | None, colour: bool = False
+) -> NDArray[Any] | None:
+    """Read a map of YCB-Video, NDDS or FAT, None where that is impossible.
+
+    Args:
+        problems: Takes what is wrong.
+        path: The file.
+        shape: The colour image's (height, width); None for any.
+        colour: Whether it may have several channels, whose meaning no file states: then None.
+    """
+    image = attempt_file(problems, path, "image", lambda: read_image(path))
+    if image is not None and image.ndim > 2 and colour:
+        one_channel(problems, path, image[..., 0], shape)
+        return None
+    return one_channel(problems, path, image, shape)
+
+
+def one_channel(
+    problems: Problems, path: Path | str, image: NDArray[Any] | None, shape: tuple[int, ...] | None
+) -> NDArray[Any] | None:
+    """Return a map of numbers (depth, mask, labels), None where it cannot be the image's.
+
+    Args:
+        problems: Takes what is wrong.
+        path: The file's name.
+        image: What it holds, None where that could not be read.
+        shape: The colour image's (height, width); None for any.
+    """
+    if image is None:
+        return None
+    if image.ndim != 2:
+        problems.report(path, "channels", f"an image of {image.shape[2]}", "one channel")
+        return None
+    if shape is not None and image.shape != tuple(shape[:2]):
+        got = f"{image.shape[1]}×{image.shape[0]} pixels"
+        problems.report(path, "size", got, f"{shape[1]}×{shape[0]}, the colour image's size")
+        return None
+    return image

@@ -55,12 +55,12 @@ class Box:
 
     @classmethod
     def of_bop(cls, box: Float[np.ndarray, "4"]) -> Box | None:
-        """Return the box of BOP's (x, y, width, height), None where there is none (−1).
+        """Return the box of BOP's (x, y, width, height), None where there is none (−1, NaN).
 
         Width and height are the differences of the outermost pixels' coordinates.
         """
         x, y, width, height = map(float, box)
-        return None if width < 0 or height < 0 else cls(x, y, x + width, y + height)
+        return cls(x, y, x + width, y + height) if width >= 0 and height >= 0 else None
 
     def distance(self, other: Box) -> float:
         """Return the largest distance of two boxes' sides, pixels."""
@@ -80,9 +80,9 @@ class Box:
             and other.bottom <= self.bottom + slack
         )
 
-    def is_inside(self, size: tuple[int, int]) -> bool:
-        """Tell whether all of it is in an image of (width, height)."""
-        width, height = size
+    def is_inside(self, shape: tuple[int, int]) -> bool:
+        """Tell whether all of it is in an image of (height, width)."""
+        height, width = shape
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
 
     def __str__(self) -> str:
@@ -91,8 +91,8 @@ class Box:
 
 
 def rotation_problem(rotation: Float[np.ndarray, "3 3"]) -> str | None:
-    """Say why a matrix is no rotation, None where it is one."""
-    if is_rotation(rotation):
+    """Say why a matrix is no rotation, None where it is one or not known (NaN)."""
+    if is_rotation(rotation) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     determinant = np.linalg.det(rotation)
@@ -111,7 +111,7 @@ def translation_problem(
     depth = float(translation[2])
     if depth <= 0:
         return "z", f"behind the camera (z = {depth:.4g})"
-    if diameter is None or not diameter > 0:
+    if diameter is None or not diameter > 0 or not np.isfinite(translation).all():
         return None
     distance = float(np.linalg.norm(translation)) / diameter
     least, most = DIAMETERS_AWAY
@@ -123,10 +123,10 @@ def translation_problem(
     )
 
 
-def camera_problem(K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> str | None:
-    """Say why K cannot belong to an image of (width, height), None where it can."""
+def camera_problem(K: Float[np.ndarray, "3 3"], shape: tuple[int, int]) -> str | None:
+    """Say why K cannot belong to an image of (height, width), None where it can."""
     try:
-        check_camera(K, size, "this image")
+        check_camera(K, shape[::-1], "this image")
     except UserError as error:
         return f"{error.got}; allowed: {error.allowed}"
     ratio = float(K[0, 0] / K[1, 1])
@@ -140,7 +140,7 @@ def box_problem(
     K: Float[np.ndarray, "3 3"],
     seen: Box | None,
     visible_fraction: float | None = None,
-    image_size: tuple[int, int] | None = None,
+    shape: tuple[int, int] | None = None,
 ) -> str | None:
     """Hold what is seen of an object against where its pose puts it; None where they agree.
 
@@ -149,7 +149,8 @@ def box_problem(
         K: Camera matrix, pixels.
         seen: Box of the visible pixels; None where nothing is seen.
         visible_fraction: Visible share of the silhouette, None where it is not known.
-        image_size: (width, height) where that share does not count what the border cuts off.
+        shape: The image's (height, width), where that share does not count what the border cuts
+            off.
     """
     predicted = Box.of_points(project(points_cam, K))
     if predicted is None or seen is None:
@@ -169,7 +170,7 @@ def box_problem(
         )
     if visible_fraction is None or visible_fraction < FULLY_VISIBLE:
         return None
-    if image_size is not None and not predicted.is_inside(image_size):
+    if shape is not None and not predicted.is_inside(shape):
         return None
     cover = max(
         (seen.right - seen.left + 1) / (width + 1), (seen.bottom - seen.top + 1) / (height + 1)

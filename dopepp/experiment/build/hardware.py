@@ -1,61 +1,18 @@
-"""What this machine is good at: the precision to train in, and how long a run will take.
-
-How many processes the trainer's options ask for.
-"""
+"""What this machine is good at: the precision to train in, and how long a run will take."""
 
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import torch
 
-from dopepp.core.errors import UserError
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.experiment.config.run import TrainerConfig
 from dopepp.models.network import PoseNetwork
-
-
-def num_processes(options: Mapping[str, Any]) -> int:
-    """Return the number of training processes, over all machines.
-
-    Args:
-        options: The ``trainer`` config.
-
-    Raises:
-        UserError: ``devices`` or ``num_nodes`` means nothing.
-    """
-    # Where torchrun has started this process, the others exist already.
-    world_size = os.environ.get("WORLD_SIZE", "")
-    outside = int(world_size) if world_size.isdecimal() else 1
-    nodes = options.get("num_nodes", 1)
-    if type(nodes) is not int or nodes < 1:
-        raise UserError(f"trainer.num_nodes={nodes}", "a positive integer", "correct it")
-    return max(outside, nodes * _num_devices(options.get("devices", 1), options))
-
-
-def _num_devices(devices: object, options: Mapping[str, Any]) -> int:
-    if isinstance(devices, str) and "," in devices:
-        devices = [piece for piece in devices.split(",") if piece.strip()]
-    if isinstance(devices, str) and devices.lstrip("-").isdecimal():
-        devices = int(devices)
-    if isinstance(devices, list) and devices:
-        return len(devices)
-    if devices == "auto" or (devices == -1 and type(devices) is int):
-        on_cpu = options.get("accelerator") == "cpu" or not torch.cuda.is_available()
-        return 1 if on_cpu else torch.cuda.device_count()
-    if type(devices) is int and devices > 0:
-        return devices
-    raise UserError(
-        f"trainer.devices={devices}",
-        "a positive number, a list of devices, auto or -1",
-        "correct it",
-    )
-
 
 # From glibc's malloc.h.
 _M_TRIM_THRESHOLD: Final = -1
@@ -109,7 +66,7 @@ def _cpu_flags() -> set[str]:
 
 
 def estimate_training_s(
-    network: PoseNetwork, datamodule: PoseDataModule, trainer_config: dict[str, Any], precision: str
+    network: PoseNetwork, datamodule: PoseDataModule, trainer: TrainerConfig, precision: str
 ) -> float:
     """Estimate a CPU run's duration, seconds, from a few steps and a few items.
 
@@ -117,9 +74,9 @@ def estimate_training_s(
     is loaded twice: a cache makes the second time, and so all later epochs, cheaper.
     """
     per_epoch = len(datamodule.train_source)
-    num_images: int = per_epoch * trainer_config["max_epochs"]
-    if trainer_config["max_steps"] > 0:
-        num_images = min(num_images, trainer_config["max_steps"] * datamodule.batch_size)
+    num_images = per_epoch * trainer.max_epochs
+    if trainer.max_steps > 0:
+        num_images = min(num_images, trainer.max_steps * datamodule.batch_size)
     threads = max(1, torch.get_num_threads())
     first, again = (_loading_s(datamodule) / threads for _ in range(2))
     num_first = min(num_images, per_epoch)

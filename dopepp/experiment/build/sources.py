@@ -1,14 +1,19 @@
-"""From the ``data`` config to the DataModule: which images go into which split."""
+"""From the ``data`` config to the objects to learn, and to the DataModule: what a split shows."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import Split
@@ -21,35 +26,83 @@ from dopepp.experiment.build.splits import (
     synthetic_companions,
     training_renders,
 )
-from dopepp.experiment.config.chosen_data import are_renders
-from dopepp.models.registry import check_integer
+from dopepp.experiment.config.data import DataConfig
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
 _log = logging.getLogger(__name__)
 
+PAPER_OBJECTS: Final = (
+    "003_cracker_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+)
+"""The YCB objects of the paper's tables."""
 
-def build_datamodule(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> PoseDataModule:
+
+def build_parts(data: DataConfig) -> list[Part]:
+    """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
+
+    They have the symmetries that ``data.symmetries`` says.
+
+    Raises:
+        UserError: The root, an object or a part is wrong, or real frames are asked for without a
+            root.
+    """
+    return choose_symmetries(_read_parts(data), data.symmetries)
+
+
+def _read_parts(data: DataConfig) -> list[Part]:
+    if data.root is None:
+        for option, value in (("objects", data.objects), ("frames", data.frames)):
+            if value is not None:
+                raise UserError(
+                    f"data.{option}={list(value)} without data.root",
+                    f"data.{option} names {option} of a data set; data.parts names meshes",
+                    "set data.root, or use data.parts",
+                )
+    elif data.format == "ycb_video":
+        return _ycb_parts(data.root, data.objects)
+    elif data.format in ("bop", "webdataset"):
+        return bop_parts(data.root, data.objects)
+    return [load_part(name, data.unit) for name in data.parts]
+
+
+def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
+    classes = read_classes(root)
+    names = PAPER_OBJECTS if objects is None else objects
+    unknown = [name for name in names if name not in classes]
+    if unknown:
+        raise UserError(
+            f"data.objects with {unknown[0]!r}", ", ".join(classes), "choose from this list"
+        )
+    return [ycb_part(root, name) for name in names]
+
+
+def build_datamodule(data: DataConfig, parts: Sequence[Part], seed: int) -> PoseDataModule:
     """Build training, validation and test data and say in one line where real frames are missing.
+
+    The seed is that of the training images; the others have ``data.eval_seed``.
 
     Raises:
         UserError: An option or a file is wrong.
     """
     backgrounds = choose_backgrounds(data)
-    input_size = (data["input_size"][0], data["input_size"][1])
-    workers = data["num_workers"]
-
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
-        val=_held_out_source(data, parts, held_out_seed(data), "val"),
-        test=_held_out_source(data, parts, held_out_seed(data), "test"),
+        val=build_validation_source(data, parts),
+        test=build_test_source(data, parts),
         object_names=[part.name for part in parts],
-        input_size=input_size,
-        batch_size=data["batch_size"],
-        num_workers=_num_cores() if workers is None else workers,
+        input_size=data.input_size,
+        batch_size=data.batch_size,
+        num_workers=_num_cores() if data.num_workers is None else data.num_workers,
         seed=seed,
-        masking=build_optional(MASKINGS, data["masking"]),
-        augment=build_optional(AUGMENTATIONS, data["augment"]),
+        masking=build_optional(MASKINGS, data.masking),
+        augment=build_optional(AUGMENTATIONS, data.augment),
         backgrounds=backgrounds,
     )
 
@@ -61,72 +114,62 @@ def _num_cores() -> int:
     return os.cpu_count() or 1
 
 
-def held_out_seed(data: Mapping[str, Any]) -> int:
-    """Return the seed of validation and test images, which is not that of the training.
-
-    Raises:
-        UserError: It is no seed.
-    """
-    return check_integer("data.eval_seed", data["eval_seed"], 0, 2**32 - 1)
-
-
-def build_test_source(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> DescribedSource:
+def build_test_source(data: DataConfig, parts: Sequence[Part]) -> DescribedSource:
     """Build the test images alone, at their native resolution."""
-    return _held_out_source(data, parts, seed, "test")
+    return _held_out_source(data, parts, "test")
+
+
+def build_validation_source(data: DataConfig, parts: Sequence[Part]) -> DescribedSource:
+    """Build the validation images alone, at their native resolution."""
+    return _held_out_source(data, parts, "val")
 
 
 def build_scaled_test_source(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, scale: float
+    data: DataConfig, parts: Sequence[Part], scale: float
 ) -> DescribedSource:
     """Build the scenes of the test images with a camera so many times as near.
 
     Raises:
         UserError: They are no renders.
     """
-    if not are_renders(data):
+    if not data.is_rendered("test"):
         raise UserError(
-            f"scale={scale:g} on the images in data.root={data['root']}",
+            f"scale={scale:g} on the images in data.root={data.root}",
             "renders, whose camera can be moved",
             "leave out scale, or test on renders of these objects with data.test.renderer=raster",
         )
-    return held_out_renders(data, parts, seed, "test", scale)
-
-
-def build_validation_source(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int
-) -> DescribedSource:
-    """Build the validation images alone, at their native resolution."""
-    return _held_out_source(data, parts, seed, "val")
+    return held_out_renders(data, parts, "test", scale)
 
 
 def build_source_without_objects(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split, num_images: int
+    data: DataConfig, parts: Sequence[Part], split: Split, num_images: int
 ) -> DescribedSource:
     """Render what the network must be silent on: backgrounds, distractors and look-alike parts.
 
     They are the scenes of the validation or the test range, without the objects.
     """
-    scene = {**(data["virtual"]["scene"] or {}), "targets_per_image": [0, 0]}
-    empty = {**data, "virtual": {**data["virtual"], "scene": scene}, f"num_{split}": num_images}
-    return held_out_renders(empty, parts, seed, split)
+    scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
+    empty = replace(
+        data,
+        virtual=replace(data.virtual, scene=scene),
+        num_val=num_images,
+        num_test=num_images,
+    )
+    return held_out_renders(empty, parts, split)
 
 
 def _train_source(
-    data: Mapping[str, Any],
-    parts: Sequence[Part],
-    seed: int,
-    backgrounds: Backgrounds,
+    data: DataConfig, parts: Sequence[Part], seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
-    if data["root"] is not None and data["real_fraction"] > 0:
-        size = (data["input_size"][0], data["input_size"][1])
-        real = kept(labelled_images(data, parts, seed, "train"), data, data["cache"], size)
-    elif data["real_fraction"] > 0:
-        if data["real_fraction"] == 1:
+    if data.root is not None and data.real_fraction > 0:
+        real = kept(labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size)
+    elif data.real_fraction > 0:
+        if data.real_fraction == 1:
             raise UserError(
-                f"data={data['name']} without data.root",
-                f"a folder of {data['format']}: only labelled images were asked for",
+                f"data={data.name} without data.root",
+                f"a folder of {data.format}: only labelled images were asked for",
                 "set data.root, or train on renders with data=virtual",
             )
         _log.warning(
@@ -134,29 +177,23 @@ def _train_source(
             "training on renders of %s",
             ", ".join(part.name for part in parts),
         )
-    if data["root"] is not None and data["synthetic_fraction"] > 0 and data["real_fraction"] < 1:
+    if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
         synthetic = synthetic_companions(data, parts, seed, backgrounds)
-    virtual = None if data["real_fraction"] == 1 else training_renders(data, parts, seed)
+    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed)
     return HybridSource(
         real,
         virtual,
-        data["real_fraction"] if real is not None else 0.0,
-        data["samples_per_epoch"],
+        data.real_fraction if real is not None else 0.0,
+        data.samples_per_epoch,
         seed,
         synthetic,
-        data["synthetic_fraction"],
-        name=data["name"],
+        data.synthetic_fraction,
+        name=data.name,
     )
 
 
-def _held_out_source(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
-) -> DescribedSource:
-    """Open labelled images where there is a root, else a range of renders that no other uses.
-
-    Another renderer for the test means renders, of the same objects, also with a root.
-    """
-    asked_for_renders = split == "test" and data["test"]["renderer"] is not None
-    if data["root"] is not None and not asked_for_renders:
-        return labelled_images(data, parts, seed, split)
-    return held_out_renders(data, parts, seed, split)
+def _held_out_source(data: DataConfig, parts: Sequence[Part], split: Split) -> DescribedSource:
+    """Open labelled images where there is a root, else a range of renders that no other uses."""
+    if data.is_rendered(split):
+        return held_out_renders(data, parts, split)
+    return labelled_images(data, parts, data.eval_seed, split)

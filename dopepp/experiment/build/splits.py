@@ -1,6 +1,4 @@
-"""From the ``data`` and ``virtual`` configs to sources of rendered images.
-
-From the ``data`` config to sources of labelled images in the formats of the field.
+"""What a split's images are: labelled ones in a format of the field, or renders.
 
 To add a format, write a source and one function in :data:`FORMATS`.
 """
@@ -10,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.source import BopSource
@@ -21,6 +19,7 @@ from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.cache import CachedSource
 from dopepp.data.sources.rendered import RenderedSource, Split
+from dopepp.experiment.config.data import Cache, DataConfig
 from dopepp.geometry.camera import Letterbox
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
@@ -33,32 +32,34 @@ _TRAINING_SHARE: Final = 0.8
 
 
 def labelled_images(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, parts: Sequence[Part], seed: int, split: Split
 ) -> DescribedSource:
-    """Open a split's labelled images.
+    """Open a split's labelled images, which are in ``data.root``.
 
     Raises:
         UserError: The format is unknown, or the folder does not hold it.
     """
-    if data["format"] not in FORMATS:
+    assert data.root is not None
+    if data.format not in FORMATS:
         raise UserError(
-            f"data.format={data['format']}", ", ".join(FORMATS), "choose the images' format"
+            f"data.format={data.format}", ", ".join(FORMATS), "choose the images' format"
         )
-    return FORMATS[data["format"]](data, parts, seed, split)
+    return FORMATS[data.format](data, data.root, parts, seed, split)
 
 
 def synthetic_companions(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, backgrounds: Backgrounds
+    data: DataConfig, parts: Sequence[Part], seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
     """Open YCB-Video's own synthetic frames where its training list names any."""
-    if data["format"] != "ycb_video":
+    if data.root is None or data.format != "ycb_video":
         return None
-    root, image_set = Path(data["root"]), data["image_sets"]["train"]
-    if not read_image_set(root, image_set, "synthetic"):
+    image_set = data.image_sets["train"]
+    if not read_image_set(data.root, image_set, "synthetic"):
         return None
     return YcbVideoSource(
-        root, parts, image_set, "synthetic", backgrounds=backgrounds, seed=seed, read_depth=False
-    )
+        data.root, parts, image_set, "synthetic",
+        backgrounds=backgrounds, seed=seed, read_depth=False,
+    )  # fmt: skip
 
 
 def share_of(image_sets: Mapping[str, str], split: Split) -> tuple[float, float]:
@@ -77,47 +78,39 @@ def share_of(image_sets: Mapping[str, str], split: Split) -> tuple[float, float]
 
 
 def _ycb_video(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
 ) -> DescribedSource:
     """Open an image set of real frames, or the listed frames, the same for every split."""
-    chosen = (
-        {"image_set": data["image_sets"][split]}
-        if data["frames"] is None
-        else {"frames": data["frames"]}
-    )
     return YcbVideoSource(
-        Path(data["root"]), parts, seed=seed, read_depth=split == "test", **chosen
-    )
+        root, parts, data.image_sets[split] if data.frames is None else None,
+        frames=data.frames, seed=seed, read_depth=split == "test",
+    )  # fmt: skip
 
 
 def _bop(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
 ) -> DescribedSource:
-    sets = data["image_sets"]
     return BopSource(
-        Path(data["root"]), parts, sets[split], part_of=share_of(sets, split),
-        targets=data.get("targets") if split == "test" else None, read_depth=split == "test",
+        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        targets=data.targets if split == "test" else None, read_depth=split == "test",
     )  # fmt: skip
 
 
 def _webdataset(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
 ) -> DescribedSource:
-    sets = data["image_sets"]
     return WebdatasetSource(
-        Path(data["root"]), parts, sets[split], part_of=share_of(sets, split),
-        download_dir=data.get("download_dir"), read_depth=split == "test",
+        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        download_dir=data.download_dir, read_depth=split == "test",
     )  # fmt: skip
 
 
 def _ndds(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
 ) -> DescribedSource:
-    sets = data["image_sets"]
     return NddsSource(
-        Path(data["root"]) / sets[split], parts, part_of=share_of(sets, split),
-        classes=data.get("classes"),
-        read_depth=split == "test",
+        root / data.image_sets[split], parts, part_of=share_of(data.image_sets, split),
+        classes=data.classes, read_depth=split == "test",
     )  # fmt: skip
 
 
@@ -130,78 +123,65 @@ FORMATS: Final[dict[str, Callable[..., DescribedSource]]] = {
 """How the images of each format are opened."""
 
 
-CACHES: Final = ("none", "memory", "disk")
-
-
-def training_renders(data: Mapping[str, Any], parts: Sequence[Part], seed: int) -> DescribedSource:
+def training_renders(data: DataConfig, parts: Sequence[Part], seed: int) -> DescribedSource:
     """Render at the size the network sees, which costs a fraction of the native one."""
     preset = choose_preset(data)
-    input_size = (data["input_size"][0], data["input_size"][1])
-    box = Letterbox.fit((preset.width, preset.height), input_size)
-    factory = _factory(data, parts, preset.resized(box.width, box.height), seed)
-    source = RenderedSource(factory, data["samples_per_epoch"])
-    return kept(source, data, data["cache"], input_size)
+    box = Letterbox.fit((preset.width, preset.height), data.input_size)
+    factory = _factory(
+        data, parts, preset.resized(box.width, box.height), seed, data.virtual.renderer
+    )
+    source = RenderedSource(factory, data.samples_per_epoch)
+    return kept(source, data, data.cache, data.input_size)
 
 
 def held_out_renders(
-    data: Mapping[str, Any], parts: Sequence[Part], seed: int, split: Split, scale: float = 1.0
+    data: DataConfig, parts: Sequence[Part], split: Split, scale: float = 1.0
 ) -> DescribedSource:
     """Render a range that no other split uses, at its native size, with parts of any scale."""
-    renderer, cache = data["virtual"]["renderer"], "none"
+    renderer, count = data.virtual.renderer, data.num_val
+    cache: Cache = "none"
     if split == "test":
-        renderer, cache = data["test"]["renderer"] or renderer, data["test"]["cache"]
-    factory = _factory(data, parts, choose_preset(data), seed, renderer)
+        renderer, count, cache = data.test.renderer or renderer, data.num_test, data.test.cache
+    factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
     name = "virtual" if renderer == "raster" else renderer
-    source = RenderedSource(factory, data[f"num_{split}"], split, name, scale)
-    return kept(source, data, cache, None)
+    return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
 
 
 def kept(
-    source: DescribedSource,
-    data: Mapping[str, Any],
-    cache: str,
-    input_size: tuple[int, int] | None,
+    source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
     """Put the chosen cache around a source.
 
     Raises:
-        UserError: The choice is unknown, or there is no room.
+        UserError: There is no room.
     """
-    if cache not in CACHES:
-        raise UserError(f"data.cache={cache}", ", ".join(CACHES), "choose one of them")
     if cache == "none":
         return source
-    folder = None if cache == "memory" else _cache_folder(data["cache_dir"])
+    folder = None if cache == "memory" else _cache_folder(data.cache_dir)
     return CachedSource(source, input_size, folder, identity=code_hash())
 
 
-def choose_preset(data: Mapping[str, Any]) -> Preset:
+def choose_preset(data: DataConfig) -> Preset:
     """Return the preset with the config's changes."""
-    virtual = data["virtual"]
-    name = virtual["preset"] or ("paper" if data["root"] is None else "ycb")
-    return customised_preset(name, virtual["scene"])
+    name = data.virtual.preset or ("paper" if data.root is None else "ycb")
+    return customised_preset(name, data.virtual.scene or {})
 
 
-def choose_backgrounds(data: Mapping[str, Any]) -> Backgrounds:
+def choose_backgrounds(data: DataConfig) -> Backgrounds:
     """Return the config's backgrounds."""
-    return find_backgrounds(data["virtual"]["backgrounds"])
+    return find_backgrounds(data.virtual.backgrounds)
 
 
 def _factory(
-    data: Mapping[str, Any],
-    parts: Sequence[Part],
-    preset: Preset,
-    seed: int,
-    renderer: str | None = None,
+    data: DataConfig, parts: Sequence[Part], preset: Preset, seed: int, renderer: str
 ) -> Factory:
-    virtual = data["virtual"]
     return Factory(
         parts,
         preset,
         seed,
         choose_backgrounds(data),
-        renderer=renderer or virtual["renderer"],
-        negatives=[load_part(name, data["unit"]) for name in virtual["negatives"]],
+        renderer=renderer,
+        negatives=[load_part(name, data.unit) for name in data.virtual.negatives],
     )
 
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.runs import display, record
+from dopepp.experiment.runs.resume import config_differences
 
 LOG_FILE: Final = "job.log"
 _OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -73,7 +74,7 @@ def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
     if not (run_dir / record.LAST_CHECKPOINT).is_file():
         return False
     before = read_yaml(stored)
-    return isinstance(before, dict) and {**before, "resume": None} == dict(config)
+    return isinstance(before, dict) and not config_differences(before, config)
 
 
 class AnnounceJobs(Callback):

@@ -1,6 +1,4 @@
-"""Rates per bin of a quantity: where does a method fail?
-
-What instances can be sorted by: distance, visibility, apparent size, view angle.
+"""Rates per bin of a quantity, such as the distance: where does a method fail?
 
 To add a quantity, write a function of the instances of one object and name it in
 :data:`QUANTITIES`; what the state lacks for it goes into
@@ -10,9 +8,10 @@ To add a quantity, write a function of the instances of one object and name it i
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -22,14 +21,23 @@ import torch
 from jaxtyping import Float, Int
 
 from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import RateCurve, rates_figure
-from dopepp.experiment.reports.tables import PassRate, csv_text
+from dopepp.drawing.curves import rates_figure
+from dopepp.experiment.reports.tables import (
+    Figure,
+    PassRate,
+    Row,
+    csv_text,
+    pivot,
+    rate_curve,
+    select,
+)
 from dopepp.experiment.runs import display
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.functional import wilson_interval
-from dopepp.metrics.pose import Gathered, PoseMetrics
+from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
 from dopepp.metrics.row import NOT_AVAILABLE, finite_median
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -97,9 +105,6 @@ QUANTITIES: Final[dict[str, Quantity]] = {
 """What rates can be broken down by."""
 
 
-_log = logging.getLogger(__name__)
-
-
 def bin_numbers(values: Float[np.ndarray, "n"], num_bins: int) -> Int[np.ndarray, "n"]:
     """Distribute values over bins of equal counts; equal values share a bin.
 
@@ -116,48 +121,23 @@ def bin_numbers(values: Float[np.ndarray, "n"], num_bins: int) -> Int[np.ndarray
 
 
 @dataclass(frozen=True)
-class BinnedRates:
-    """One method in one bin.
+class Bin:
+    """The instances between two values of a quantity, over the whole test set.
 
     Attributes:
-        method: The method's name.
-        low: Smallest value of the quantity in the bin, over the whole test set.
-        high: Largest value.
-        middle: Median value.
-        num_instances: The method's instances in it.
-        rates: Each rate with its 95 % interval: (rate, low, high), by field; None where there is
-            no instance.
-        median_rotation_deg: Over the matched ones, to the nearest symmetry, degrees; None where
-            there is none.
-        miss_rate: Share without a prediction; None where there is no instance.
+        low: The smallest value.
+        high: The largest.
+        middle: The median; no other bin has it.
     """
 
-    method: str
     low: float
     high: float
     middle: float
-    num_instances: int
-    rates: dict[str, tuple[float, float, float] | None]
-    median_rotation_deg: float | None
-    miss_rate: float | None
-
-    def to_record(self) -> dict[str, object]:
-        """Return a row of the CSV file."""
-        record: dict[str, object] = {
-            "method": self.method, "from": self.low, "to": self.high, "median": self.middle,
-            "num_instances": self.num_instances,
-        }  # fmt: skip
-        for field, rate in self.rates.items():
-            values = (None, None, None) if rate is None else rate
-            record |= dict(zip((field, f"{field}_low", f"{field}_high"), values, strict=True))
-        return {
-            **record, "median_rotation_deg": self.median_rotation_deg, "miss_rate": self.miss_rate
-        }  # fmt: skip
 
 
 def break_down(
     metrics: Mapping[str, PoseMetrics], quantity: str, num_bins: int, rates: Sequence[PassRate]
-) -> list[list[BinnedRates]]:
+) -> tuple[list[Bin], list[Figure]]:
     """Measure rates per bin, over the instances of all objects together.
 
     Args:
@@ -168,50 +148,47 @@ def break_down(
         rates: Which rates.
 
     Returns:
-        For each bin, in ascending order, an entry per method.
+        The bins, in ascending order, and bin by bin what each method reaches in them: how many
+        instances, the rates, the median rotation of those that were matched (degrees, to the
+        nearest symmetry) and the share that was missed. A figure's condition is its bin's middle.
     """
-    tables = {name: _table(one, quantity, rates) for name, one in metrics.items()}
-    values = next(reversed(tables.values())).values
-    numbers = bin_numbers(values, num_bins)
-    bins = [values[numbers == number] for number in range(int(numbers.max(initial=-1)) + 1)]
-    return [
-        [table.in_bin(name, inside, rates) for name, table in tables.items()] for inside in bins
+    gathered = {name: [one.instances(part) for part in one.parts] for name, one in metrics.items()}
+    values = {
+        name: np.concatenate([QUANTITIES[quantity].of(one) for one in own])
+        for name, own in gathered.items()
+    }
+    everything = next(reversed(values.values()))
+    numbers = bin_numbers(everything, num_bins)
+    groups = [everything[numbers == number] for number in range(int(numbers.max(initial=-1)) + 1)]
+    bins = [Bin(float(one.min()), float(one.max()), float(np.median(one))) for one in groups]
+    table = [
+        figure
+        for one in bins
+        for name, own in gathered.items()
+        for figure in _in_bin(one, name, values[name], own, rates)
     ]
+    return bins, table
 
 
-@dataclass(frozen=True)
-class _Table:
-    """A method's instances of all objects: the quantity, what passed, and errors."""
-
-    values: Float[np.ndarray, "n"]
-    passed: dict[str, torch.Tensor]
-    rotations: torch.Tensor
-
-    def in_bin(
-        self, method: str, inside: Float[np.ndarray, "m"], rates: Sequence[PassRate]
-    ) -> BinnedRates:
-        low, high = float(inside.min()), float(inside.max())
-        chosen = torch.from_numpy((self.values >= low) & (self.values <= high))
-        num = int(chosen.sum())
-        measured: dict[str, tuple[float, float, float] | None] = {}
-        for rate in rates:
-            passed = int(self.passed[rate.field][chosen].sum())
-            interval = wilson_interval(passed, num)
-            measured[rate.field] = (passed / num, *interval) if num else None
-        rotations = self.rotations[chosen]
-        return BinnedRates(
-            method, low, high, float(np.median(inside)), num, measured, finite_median(rotations),
-            float((~rotations.isfinite()).double().mean()) if num else None,
-        )  # fmt: skip
-
-
-def _table(metrics: PoseMetrics, quantity: str, rates: Sequence[PassRate]) -> _Table:
-    gathered = [metrics.instances(name) for name in metrics.parts]
-    return _Table(
-        np.concatenate([QUANTITIES[quantity].of(one) for one in gathered]),
-        {rate.field: torch.cat([rate.passed(one) for one in gathered]) for rate in rates},
-        torch.cat([one.errors.rotation_s_deg for one in gathered]),
-    )
+def _in_bin(
+    one: Bin,
+    method: str,
+    values: Float[np.ndarray, "n"],
+    gathered: Sequence[Gathered],
+    rates: Sequence[PassRate],
+) -> Iterator[Figure]:
+    """Measure one method in one bin; a rate of no instance does not exist."""
+    chosen = torch.from_numpy((values >= one.low) & (values <= one.high))
+    num = int(chosen.sum())
+    rotations = torch.cat([own.errors.rotation_s_deg for own in gathered])[chosen]
+    yield Figure(method, MEAN, "num_instances", num, one.middle)
+    for rate in rates:
+        passed = torch.cat([rate.passed(own) for own in gathered])[chosen]
+        value = int(passed.sum()) / num if num else None
+        yield Figure(method, MEAN, rate.field, value, one.middle, num_instances=num)
+    yield Figure(method, MEAN, "median_rotation_deg", finite_median(rotations), one.middle)
+    missed = float((~rotations.isfinite()).double().mean()) if num else None
+    yield Figure(method, MEAN, "miss_rate", missed, one.middle)
 
 
 def record_breakdown(
@@ -225,54 +202,52 @@ def record_breakdown(
 
     A test set without an instance that counts gives a warning instead.
     """
-    bins = break_down(metrics, quantity, num_bins, rates)
+    bins, table = break_down(metrics, quantity, num_bins, rates)
     if not bins:
         _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
         return
-    what = QUANTITIES[quantity]
-    rows = [_shown(one, what, rates) for one in bins]
+    what, fields = QUANTITIES[quantity], [rate.field for rate in rates]
+    by_middle = {one.middle: one for one in bins}
+
+    def shown(one: Figure) -> Row:
+        own = by_middle[one.condition]
+        ends = dict.fromkeys(f"{end:.{what.decimals}f}" for end in (own.low, own.high))
+        row = {what.heading: " … ".join(ends)}
+        if one.measure == "num_instances":
+            return {**row, one.heading: one.text}
+        if one.measure == "miss_rate":
+            return row
+        prefix = f"{one.method} " if len(metrics) > 1 else ""
+        text = _percent(one) if one.measure in fields else one.text
+        return {**row, f"{prefix}{one.heading}": text}
+
+    def record(one: Figure) -> dict[str, object]:
+        own = by_middle[one.condition]
+        row = {"method": one.method, "from": own.low, "to": own.high, "median": own.middle}
+        ends = (f"{one.measure}_low", f"{one.measure}_high")
+        return {**row, one.measure: one.value, **dict(zip(ends, one.interval or (), strict=False))}
+
+    rows = pivot(table, attrgetter("condition"), shown)
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
-    records = [one.to_record() for same in bins for one in same]
+    records = pivot(table, attrgetter("condition", "method"), record)
     path = run_dir / f"by_{quantity}"
     write_whole(path.with_suffix(".csv"), csv_text(records).encode())
     panels = {
-        rate.heading.removesuffix(" %"): {
-            one.method: _curve([same[number] for same in bins], rate.field)
-            for number, one in enumerate(bins[0])
+        rate.title: {
+            name: rate_curve(select(table, method=name, measure=rate.field)) for name in metrics
         }
         for rate in rates
     }
     # Between two bins lie no instances; the line stands in the middle of the gap.
-    ends = [(a[0].high + b[0].low) / 2 for a, b in pairwise(bins)]
-    edges = np.array([bins[0][0].low, *ends, bins[-1][0].high])
-    write_png(
-        path.with_suffix(".png"),
-        figure_image(rates_figure(panels, what.heading, len(rates), edges)),
-    )
+    gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]
+    edges = np.array([bins[0].low, *gaps, bins[-1].high])
+    figure = rates_figure(panels, what.heading, len(rates), edges)
+    write_png(path.with_suffix(".png"), figure_image(figure))
 
 
-def _shown(one: Sequence[BinnedRates], what: Quantity, rates: Sequence[PassRate]) -> dict[str, str]:
-    """Return a bin's row in the terminal: a column per method and measure."""
-    low, high = (f"{value:.{what.decimals}f}" for value in (one[0].low, one[0].high))
-    row = {what.heading: low if low == high else f"{low} … {high}"}
-    row["instances"] = str(one[-1].num_instances)
-    for method in one:
-        prefix = f"{method.method} " if len(one) > 1 else ""
-        for rate in rates:
-            row[f"{prefix}{rate.heading}"] = _percent(method.rates[rate.field])
-        angle = method.median_rotation_deg
-        row[f"{prefix}rotation °"] = NOT_AVAILABLE if angle is None else f"{angle:.1f}"
-    return row
-
-
-def _percent(rate: tuple[float, float, float] | None) -> str:
-    if rate is None:
+def _percent(rate: Figure) -> str:
+    """Return a rate with its interval, percent."""
+    if rate.interval is None:
         return NOT_AVAILABLE
-    value, low, high = (100 * one for one in rate)
-    return f"{value:.1f} [{low:.0f}, {high:.0f}]"
-
-
-def _curve(bins: Sequence[BinnedRates], field: str) -> RateCurve:
-    """Return one method's rates over the bins in which it has instances."""
-    known = [(one.middle, *rate) for one in bins if (rate := one.rates[field]) is not None]
-    return RateCurve(*np.array(known, np.float64).reshape(-1, 4).T)
+    low, high = (100 * end for end in rate.interval)
+    return f"{rate.text} [{low:.0f}, {high:.0f}]"

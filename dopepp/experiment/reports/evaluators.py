@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +22,10 @@ from dopepp.data.formats.bop.models import parts_by_id, read_models
 from dopepp.data.formats.bop.results import PoseResult, read_results
 from dopepp.data.formats.ycb_video.frame import read_classes
 from dopepp.data.sample import Sample
+from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.assignment import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.parts.part import Part
 
@@ -39,20 +41,8 @@ _BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
 _NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
-class Posed(Protocol):
+class Posed(PredictedPose, Protocol):
     """What a measurement reads of a detection."""
-
-    @property
-    def object(self) -> str:
-        """Name of the part."""
-
-    @property
-    def score(self) -> float:
-        """Confidence."""
-
-    @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
-        """Estimated pose, metres."""
 
     @property
     def keypoints(self) -> Float[np.ndarray, "9 2"]:
@@ -206,18 +196,18 @@ class FileMethod:
             )  # fmt: skip
 
 
-def object_numbers(data: Mapping[str, Any], parts: Sequence[Part]) -> dict[str, int]:
+def object_numbers(data: DataConfig, parts: Sequence[Part]) -> dict[str, int]:
     """Return BOP's number of each object, by name.
 
     In a BOP data set they are those of ``models_info.json``, all of them; in YCB-Video the lines of
     ``classes.txt``, which BOP's YCB-V has kept. Elsewhere parts are counted from 1.
     """
-    if data["root"] is not None and data["format"] in ("bop", "webdataset"):
-        root = Path(data["root"])
+    root = data.root
+    if root is not None and data.format in ("bop", "webdataset"):
         known = {info.name: number for number, info in read_models(root).items()}
         return known or {part.name: number for number, part in parts_by_id(root, parts).items()}
-    if data["root"] is not None and data["format"] == "ycb_video":
-        return {name: number for number, name in enumerate(read_classes(Path(data["root"])), 1)}
+    if root is not None and data.format == "ycb_video":
+        return {name: number for number, name in enumerate(read_classes(root), 1)}
     return {part.name: number for number, part in enumerate(parts, 1)}
 
 

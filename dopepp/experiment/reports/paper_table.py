@@ -1,29 +1,63 @@
 """The paper's tables: a sweep's runs in the paper's layout, beside what the paper printed.
 
-A config names its table under ``table`` (see ``conf/experiment/``). How its rows come about stands
-in :mod:`dopepp.experiment.reports.paper_rows`.
+A config names its table under ``table`` (see ``conf/experiment/``).
+
+To add a kind of table, write a function of layout, methods and folder that returns rows, and what
+must be said of them, and give it a line in :data:`KINDS`.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from scipy.stats import t
+
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import figure_image, write_png, write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment import cost
-from dopepp.experiment.reports.compare.entries import Entry
-from dopepp.experiment.reports.compare.table import lines, noise
-from dopepp.experiment.reports.paper_rows import KINDS, LABELS, Figures
-from dopepp.experiment.reports.tables import ADD_5CM, ADD_10CM, csv_text, markdown_text
-from dopepp.experiment.runs import display
+from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
+from dopepp.experiment.reports.conditions import SHADING
+from dopepp.experiment.reports.differences import figures, noise, row_figures, summary
+from dopepp.experiment.reports.entries import Entry
+from dopepp.experiment.reports.tables import (
+    ADD_5CM,
+    ADD_10CM,
+    DELTA,
+    Figure,
+    Row,
+    csv_text,
+    heading,
+    markdown_text,
+    rate_curve,
+    read_csv,
+    select,
+)
+from dopepp.experiment.runs import display, record
+from dopepp.metrics.pose import MEAN
+from dopepp.metrics.row import COLUMNS
 
 TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
+
+Printed = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Figures by label, object and measure."""
+
+_LABELS: Final = ("method", "object", "measure")
+"""Headings of what is no number."""
+
+_METHOD, _OBJECT, _MEASURE = _LABELS
+_STRICT: Final = "add_01d"
+_NETWORK: Final = "network"
+"""What stands for the object, where there is none."""
+_PAPER: Final = "the paper"
+_CONFIDENCE: Final = 0.95
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
 _MEASURED: Final = ("poses", "shading")
@@ -37,7 +71,7 @@ class PaperTable:
 
     Attributes:
         title: Its title, with the paper's number.
-        kind: A key of :data:`~dopepp.experiment.reports.paper_rows.KINDS`.
+        kind: A key of :data:`KINDS`.
         threshold: Of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
         labels: Override to what the paper calls it; a run that has several gets all of them.
         paper: What the paper prints: by label, object and measure, which is a field of ``PoseRow``
@@ -50,8 +84,8 @@ class PaperTable:
     kind: str = "poses"
     threshold: float = 0.05
     labels: Mapping[str, str] = field(default_factory=dict)
-    paper: Figures = field(default_factory=dict)
-    recomputed: Figures = field(default_factory=dict)
+    paper: Printed = field(default_factory=dict)
+    recomputed: Printed = field(default_factory=dict)
     notes: Sequence[str] = ()
 
     @classmethod
@@ -123,12 +157,11 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
     """
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     methods = table.methods(entries)
-    rows = KINDS[table.kind](table, methods, folder)
-    labels = sum(heading in LABELS for heading in rows[0])
+    rows, doubts = KINDS[table.kind](table, methods, folder)
+    labels = sum(name in _LABELS for name in rows[0])
     display.show_table(title, rows, num_labels=labels)
     write_whole(folder / TABLE_FILE, csv_text(rows).encode())
-    found = [*_notes(table, entries), *(_doubts(methods) if table.kind == "poses" else [])]
-    notes = [f"- {note}" for note in found]
+    notes = [f"- {note}" for note in (*_notes(table, entries), *doubts)]
     text = "\n".join([f"# {title}", "", markdown_text(rows), *notes])
     write_whole(folder / TEXT_FILE, f"{text}\n".encode())
 
@@ -141,7 +174,7 @@ def _recipe(entries: Sequence[Entry]) -> list[str]:
 
 
 def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
-    notes = [*table.notes, *([cost.NOTE] if table.kind == "time" else [])]
+    notes = [*table.notes, *([NOTE] if table.kind == "time" else [])]
     if table.kind in _MEASURED:
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
@@ -154,11 +187,6 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
     return notes
 
 
-def _doubts(methods: Mapping[str, Entry]) -> list[str]:
-    """Name the differences that may be chance, and how many seeds would tell."""
-    return noise(lines([replace(entry, name=label) for label, entry in methods.items()]))
-
-
 def _starts_untrained(config: Mapping[str, Any]) -> bool:
     """Tell whether a run's network has a VGG19 that nobody has trained before."""
     model = config.get("model")
@@ -166,3 +194,250 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     if not isinstance(backbone, dict) or config.get("init_from") is not None:
         return False
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
+
+
+Laid = tuple[list[Row], list[str]]
+"""Rows, and the doubts about them."""
+
+
+def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+    """Return, object by object, a row per method: the paper's measures, then stricter ones.
+
+    The first method with a result is what Δ is against. The reference rows stand at the end.
+    """
+    table = figures([replace(entry, name=label) for label, entry in methods.items()])
+    measured = [entry for entry in methods.values() if entry.reports]
+    objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
+    if not objects:  # nothing was measured: the paper's figures and why there are no others
+        objects = list(dict.fromkeys(name for one in layout.paper.values() for name in one))
+    rows = []
+    for name in objects:
+        for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
+            known = layout.paper.get(label, {})
+            own = layout.recomputed.get(label, {}).get(name, {})
+            # The paper's mean is over its own objects.
+            is_other_mean = name == MEAN and set(known) != set(objects)
+            printed = {} if is_other_mean else known.get(name, {})
+            entry = methods.get(label)
+            if entry is not None and name in entry.objects:
+                found = select(table, method=label, object=name)
+                rows.append(_pose_row(layout, label, name, _texts(found), printed))
+            elif entry is not None:
+                reason = f"{label}: {entry.failure or 'not measured on it'}"
+                rows.append(_pose_row(layout, reason, name, {}, printed))
+            elif own or name in known or name in layout.recomputed.get(label, {}):
+                texts = {_field(layout, key): _number(value) for key, value in own.items()}
+                rows.append(_pose_row(layout, label, name, texts, printed))
+    for name in objects if measured else ():
+        for reference, by_object in measured[0].reports[0].references.items():
+            if name in by_object:
+                texts = _texts(row_figures(reference, by_object[name]))
+                rows.append(_pose_row(layout, reference, name, texts, {}))
+    return rows, noise(table)
+
+
+def _texts(table: Iterable[Figure]) -> Row:
+    return {one.measure: summary(one) for one in table}
+
+
+def _field(layout: PaperTable, key: str) -> str:
+    """Return the field of ``PoseRow`` that a config's figure is of."""
+    return layout.pass_field if key == "pass" else key
+
+
+def _pose_row(
+    layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
+) -> Row:
+    """Return a row: every measure, the paper's figure and Δ behind it.
+
+    Args:
+        layout: The table.
+        method: What was measured, or why it was not.
+        name: The object.
+        texts: By measure.
+        printed: What the paper prints.
+    """
+    row = {_METHOD: method, _OBJECT: name}
+    for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
+        measure = _field(layout, key)
+        row[heading(measure)] = texts.get(measure, "")
+        if key in ("pass", "auc_10cm"):
+            row[f"{_PAPER}: {heading(measure)}"] = _number(printed.get(key))
+        if key in ("pass", _STRICT):
+            row[f"{DELTA}{heading(measure)}"] = texts.get(f"{DELTA}{measure}", "")
+    return row
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:,}"
+
+
+def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+    """Return pass rates at every share, the paper's and Δ beside them; draw them for all methods.
+
+    Rates are means over seeds. Δ is to the first method at the same share; its interval is
+    Student's t of the differences of equal seeds.
+    """
+    measured = {label: _shading(label, entry) for label, entry in methods.items()}
+    table = [one for own in measured.values() for one in own]
+    rows: list[Row] = [
+        {_METHOD: _failed(label, methods[label]), _OBJECT: "", _MEASURE: ""}
+        for label, own in measured.items()
+        if not own
+    ]
+    panels: dict[str, dict[str, RateCurve]] = {}
+    for name in dict.fromkeys(one.object for one in table):
+        for measure in (layout.pass_field, _STRICT):
+            baseline: _ByShare = {}
+            head = {_OBJECT: name, _MEASURE: heading(measure)}
+            for label in dict.fromkeys(one.method for one in select(table, object=name)):
+                rates = _by_share(select(table, method=label, object=name, measure=measure))
+                means = {f"{100 * share:g} %": _mean(own) for share, own in rates.items()}
+                rows.append({_METHOD: label, **head, **means})
+                if baseline:
+                    changes = {f"{100 * share:g} %": _change(own, baseline.get(share, []))
+                               for share, own in rates.items()}  # fmt: skip
+                    rows.append({_METHOD: f"{DELTA}{label}", **head, **changes})
+                baseline = baseline or rates
+                printed = layout.paper.get(label, {}).get(name, {})
+                if printed and measure == layout.pass_field:
+                    texts = {share: _number(value) for share, value in printed.items()}
+                    rows.append({_METHOD: f"{label}, {_PAPER}", **head, **texts})
+                panel = panels.setdefault(f"{name}: {heading(measure)}", {})
+                panel[label] = rate_curve(map(_pooled, rates.values()), SHADING.per_unit)
+    if panels:
+        figure = rates_figure(panels, SHADING.axis, 2)
+        write_png(folder / "table_shading.png", figure_image(figure))
+    return rows, []
+
+
+_ByShare = dict[float, list[Figure]]
+"""A rate of one method and object, seed by seed, by share."""
+
+
+def _shading(label: str, entry: Entry) -> list[Figure]:
+    """Return what a method's runs have measured; of one network a part, the mean, too.
+
+    Of several methods in one run's file, the run's own is the last.
+    """
+    found: dict[object, Figure] = {}
+    for run in entry.runs:
+        for row in read_csv(run.folder / SHADING.table_file):
+            for measure in (column.field for column in COLUMNS if row.get(column.field)):
+                key = row["object"], measure, float(row["share"]), run.seed
+                found[key] = Figure(
+                    label, row["object"], measure, float(row[measure]), float(row["share"]),
+                    (run.seed,), int(row["num_instances"]),
+                )  # fmt: skip
+    table = list(found.values())
+    objects = {one.object for one in table}
+    if len(objects) < 2 or MEAN in objects:
+        return table
+    alike: dict[object, list[Figure]] = {}
+    for one in table:
+        alike.setdefault((one.measure, one.condition, one.seeds), []).append(one)
+    # The mean is over what all parts have.
+    whole = [own for own in alike.values() if len(own) == len(objects)]
+    return table + [replace(_pooled(own), object=MEAN) for own in whole]
+
+
+def _by_share(table: Sequence[Figure]) -> _ByShare:
+    return {one.condition: select(table, condition=one.condition) for one in table}
+
+
+def _pooled(rates: Sequence[Figure]) -> Figure:
+    """Return the mean of rates, as one over all their instances."""
+    return replace(
+        rates[0],
+        value=float(np.mean([one.value for one in rates])),
+        num_instances=sum(one.num_instances for one in rates),
+    )
+
+
+def _mean(rates: Sequence[Figure]) -> str:
+    values = [100 * float(one.value or 0) for one in rates]
+    deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.1f}{deviation}"
+
+
+def _change(rates: Sequence[Figure], baseline: Sequence[Figure]) -> str:
+    """Return the mean difference to the baseline and, of several seeds, its 95 % interval."""
+    before = {one.seeds: one.value for one in baseline}
+    pairs = [(one.value, before[one.seeds]) for one in rates if one.seeds in before]
+    if not pairs:
+        return ""
+    points = 100 * np.subtract(*np.array(pairs, np.float64).T)
+    count = len(points)
+    text = f"{points.mean():+.1f}"
+    if count < 2:
+        return text
+    half = t.ppf((1 + _CONFIDENCE) / 2, count - 1) * points.std(ddof=1) / math.sqrt(count)
+    return f"{text} [{points.mean() - half:+.1f}, {points.mean() + half:+.1f}]"
+
+
+def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+    """Return what was counted."""
+    costs, missing = _costs(methods)
+    counted = [
+        {
+            _METHOD: label,
+            "backbone weights": f"{cost['backbone_weights']:,}",
+            _PAPER: _printed(layout, label, "backbone weights"),
+            "parameters": f"{cost['parameters']:,}",
+            "GMACs": f"{cost['gmacs']:.3f}",
+        }
+        for label, cost in costs.items()
+    ]
+    return counted + missing, []
+
+
+def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
+    """Return what was timed, then the paper's other methods; draw the frame rates (Fig. 13)."""
+    costs, missing = _costs(methods)
+    printed = f"{_PAPER}: ms/frame"
+    rows = [
+        {
+            _METHOD: label,
+            "ms/frame": f"{cost['ms_per_frame']:.1f}",
+            printed: _printed(layout, label, "ms/frame"),
+            "network ms": f"{cost['network_ms']:.1f}",
+            "recovery ms": f"{cost['recovery_ms']:.1f}",
+            f"network, frames/s, batch {cost['batch_size']}": f"{cost['frames_per_s']:.1f}",
+            "pixels": "×".join(map(str, cost["input_size"])),
+            "on": f"{cost['device']}, {cost['threads']} threads",
+        }
+        for label, cost in costs.items()
+    ]
+    others = [
+        {_METHOD: label, printed: _printed(layout, label, "ms/frame")}
+        for label in layout.paper
+        if label not in methods
+    ]
+    if costs:
+        folders = {label: methods[label].runs[0].folder for label in costs}
+        frames = {label: read_frames(one / FRAMES_FILE) for label, one in folders.items()}
+        save_frame_rates(folder / "frame_rate.png", frames)
+    return rows + missing + others, []
+
+
+def _printed(layout: PaperTable, label: str, measure: str) -> str:
+    return _number(layout.paper.get(label, {}).get(_NETWORK, {}).get(measure))
+
+
+def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[Row]]:
+    """Return what each method's network costs, and rows of those of which nobody knows."""
+    paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
+    costs = {label: record.read_json(path) for label, path in paths.items() if path.is_file()}
+    return costs, [{_METHOD: _failed(one, methods[one])} for one in methods if one not in costs]
+
+
+def _failed(label: str, entry: Entry) -> str:
+    return f"{label}: {entry.failure or 'no such measurement'}"
+
+
+KINDS: Final[Mapping[str, Callable[[PaperTable, Mapping[str, Entry], Path], Laid]]] = {
+    "poses": pose_rows,
+    "shading": shading_rows,
+    "parameters": parameter_rows,
+    "time": time_rows,
+}

@@ -16,6 +16,7 @@ from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile
 from dopepp.experiment.reports.evaluators import Cost, MeasuredPose, Method, image_id
+from dopepp.experiment.reports.tables import shown_rows
 from dopepp.experiment.runs.images import Fingerprint
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow, mean_row
@@ -58,6 +59,14 @@ class Report:
     def mean(self) -> PoseRow:
         """The mean over objects."""
         return self.rows[MEAN]
+
+    @property
+    def tables(self) -> dict[str, list[PoseRow]]:
+        """Of every object, and the mean of several, the row and the reference rows beside it."""
+        return {
+            name: [row, *(rows[name] for rows in self.references.values())]
+            for name, row in shown_rows(self.rows).items()
+        }
 
     def to_record(self) -> dict[str, Any]:
         """Return what ``metrics.json`` holds."""
@@ -184,11 +193,7 @@ def measure(
         A report per method, and pictures with the truth in green, the last method's predictions in
         yellow and those of the methods before it in blue (paper Fig. 14).
     """
-    # One process measures alone: after a distributed training the others have ended.
-    metrics = {
-        name: PoseMetrics(method.parts, name, sync_on_compute=False)
-        for name, method in methods.items()
-    }
+    metrics = accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     measured = Measured([], [], {name: [] for name in methods}, metrics)
     num_images = 0
@@ -225,6 +230,15 @@ def measure(
         for name, method in methods.items()
     ]
     return measured
+
+
+def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
+    """Return what scores each method's poses on its parts."""
+    # One process measures alone: after a distributed training the others have ended.
+    return {
+        name: PoseMetrics(method.parts, name, sync_on_compute=False)
+        for name, method in methods.items()
+    }
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:

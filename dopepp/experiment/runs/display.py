@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 from rich.tree import Tree
 
 from dopepp.data.datamodule import SourceRow
 from dopepp.experiment.reports.report import Report
+from dopepp.experiment.reports.tables import header_of
 from dopepp.experiment.tuning import Tuning
-from dopepp.metrics.pose import MEAN
-from dopepp.metrics.row import COLUMNS
+from dopepp.metrics.row import shown_columns
 
 # Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
 # overrides, paths and messages hold square brackets of their own.
@@ -54,25 +56,20 @@ def show_report(report: Report, all_measures: bool = False) -> None:
         report: What was measured.
         all_measures: Whether to print the symmetric measures of a part without symmetries, too.
     """
-    for name, row in report.rows.items():
-        if name == MEAN and len(report.rows) == 2:
-            continue
+    for name, (row, *references) in report.tables.items():
         if row.num_instances == 0:
             console.print(
                 f"{name}: n/a, no ground truth in the test set; "
                 f"{row.false_positives} false positives"
             )
             continue
-        rows = [row, *(rows[name] for rows in report.references.values())]
         table = Table("", title=f"{name}: {report.num_images} test images")
-        for number, one in enumerate(rows):
-            style = "bold" if number == 0 else "dim"
-            table.add_column(one.method, justify="right", style=style)
-        shown = [c for c in COLUMNS if all_measures or row.num_symmetries > 1 or not c.symmetric]
-        for column, following in zip(shown, [*shown[1:], None], strict=True):
-            ends = following is not None and following.group != column.group
-            texts = (column.text(one) for one in rows)
-            table.add_row(column.heading, *texts, end_section=ends)
+        for one in (row, *references):
+            table.add_column(one.method, justify="right", style="bold" if one is row else "dim")
+        for _, columns in groupby(shown_columns(row, all_measures), attrgetter("group")):
+            for column in columns:
+                table.add_row(column.heading, *map(column.text, (row, *references)))
+            table.add_section()
         console.print(table)
 
 
@@ -82,11 +79,10 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 
     The columns are those of the fullest row; a row may lack some.
     """
     table = Table(title=title)
-    header = list(rows[max(range(len(rows)), key=lambda number: len(rows[number]))])
+    header = header_of(rows)
     for number, heading in enumerate(header):
-        table.add_column(
-            heading, justify="left" if number < num_labels else "right", overflow="fold"
-        )
+        justify: JustifyMethod = "left" if number < num_labels else "right"
+        table.add_column(heading, justify=justify, overflow="fold")
     for row in rows:
         table.add_row(*(row.get(heading, "") for heading in header))
     console.print(table)

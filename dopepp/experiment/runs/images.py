@@ -1,10 +1,7 @@
-"""Whether an evaluation measures on the images that the checkpoint's run was measured on.
+"""Which images a run has learnt from and was measured on, so that it shows when they are others.
 
-Which images were measured, as one word: results on other images cannot be set off against.
-
-What the images of a run are, so that it shows later when they are others.
-
-The data configuration may stay as it is while files, meshes or the rendering code change. So a
+Results on other images cannot be compared, so a report holds a fingerprint of its test images. The
+data's configuration may stay as it is while files, meshes or the rendering code change. So a
 checkpoint holds, of every split, what its sources say of themselves and how its first image looks:
 its labels and a picture of 16 × 12 pixels, which another machine's rounding does not change.
 """
@@ -21,17 +18,29 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.build.sources import build_test_source
-from dopepp.experiment.config.chosen_data import trained_on
-from dopepp.experiment.config.options import below, flat
+from dopepp.experiment.config.data import DataConfig, trained_on
+from dopepp.experiment.config.parse import flat
 from dopepp.geometry.camera import Letterbox
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Part
 
+_log = logging.getLogger(__name__)
+
 _DECIMALS: Final = 6
 """Of pixels and metres: machines differ in the last digits of what they compute."""
+
+
+_LOOK_SIZE: Final = (16, 12)
+_MAX_LEVELS: Final = 2.0
+"""Mean difference of two small pictures, in grey levels, above which they show something else."""
+_MAX_LABEL: Final = 1e-4
+"""Difference of two camera matrices (relative) or poses (metres) above which they are others."""
+_LONG: Final = 40
+"""Values with more characters are not shown."""
 
 
 class Fingerprint:
@@ -72,15 +81,6 @@ class Fingerprint:
 def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
     """Return rounded numbers, of which none is a negative zero."""
     return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
-
-
-_LOOK_SIZE: Final = (16, 12)
-_MAX_LEVELS: Final = 2.0
-"""Mean difference of two small pictures, in grey levels, above which they show something else."""
-_MAX_LABEL: Final = 1e-4
-"""Difference of two camera matrices (relative) or poses (metres) above which they are others."""
-_LONG: Final = 40
-"""Values with more characters are not shown."""
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:
@@ -145,18 +145,7 @@ def _shown(value: object) -> str:
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
 
 
-_log = logging.getLogger(__name__)
-
-_DECIDE_TEST: Final = (
-    "format", "root", "objects", "parts", "unit", "frames", "image_sets", "virtual",
-    "num_test", "eval_seed", "test.renderer", "targets", "classes",
-)  # fmt: skip
-"""Data options that name a test set; the others cannot mean another one."""
-
-
-def warn_of_other_images(
-    checkpoint: Checkpoint, data: Mapping[str, Any], parts: Sequence[Part], seed: int
-) -> None:
+def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Sequence[Part]) -> None:
     """Say it in one line where figures are not comparable with the checkpoint's own.
 
     Two things are: a test set that has changed although its configuration is the checkpoint's, and
@@ -165,9 +154,8 @@ def warn_of_other_images(
 
     Args:
         checkpoint: What is measured.
-        data: The data config of the evaluation.
+        data: What is evaluated on.
         parts: The checkpoint's objects as these data have them.
-        seed: Of renders.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]
@@ -176,9 +164,13 @@ def warn_of_other_images(
     stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
     if not isinstance(stored, dict) or config is None:
         return  # a checkpoint of an earlier version does not say
-    if _test_set(config) != _test_set(data):
+    try:
+        own = DataConfig.of(config, config.get("virtual"))
+    except UserError:
+        return  # nor does one whose data nobody can read
+    if _test_set(own) != _test_set(data):
         return
-    found = differing_images(stored["test"], describe_images(build_test_source(data, parts, seed)))
+    found = differing_images(stored["test"], describe_images(build_test_source(data, parts)))
     if found:
         _log.warning(
             "the test images are not those of the checkpoint's own figures, "
@@ -187,7 +179,8 @@ def warn_of_other_images(
         )
 
 
-def _test_set(data: Mapping[str, Any]) -> dict[str, object]:
-    return {
-        key: value for key, value in flat(data) if value is not None and below(key, _DECIDE_TEST)
-    }
+def _test_set(data: DataConfig) -> list[object]:
+    """Return the options that name a test set; the others cannot mean another one."""
+    named = (data.format, data.root, data.objects, data.parts, data.unit, data.frames, data.virtual)
+    return [*named, data.image_sets, data.num_test, data.eval_seed, data.test.renderer,
+            data.targets, data.classes or {}]  # fmt: skip

@@ -12,14 +12,14 @@ import socket
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dopepp.core.files import write_whole
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text
 from dopepp.experiment.runs import record
-from dopepp.metrics.pose import MEAN
-from dopepp.metrics.row import COLUMNS
+from dopepp.metrics.row import shown_columns
 from dopepp.training.callbacks.pictures import best_effort
 
 README_FILE: Final = "README.md"
@@ -76,11 +76,11 @@ class RunReadme:
     be written goes on without.
 
     Args:
-        config: The resolved config.
-        run_dir: The run's folder.
+        config: Of the run.
+        run_dir: Its folder.
     """
 
-    def __init__(self, config: Mapping[str, Any], run_dir: Path) -> None:
+    def __init__(self, config: RunConfig, run_dir: Path) -> None:
         self._config, self._folder = config, run_dir
         self._begun = False
 
@@ -106,7 +106,7 @@ class RunReadme:
             self._write(state, reason, report)
 
     def _write(self, state: str, reason: str, report: Report | None = None) -> None:
-        name = f"{self._config['model']['name']} on {self._config['data']['name']}"
+        name = f"{self._config.model.name} on {self._config.data.name}"
         sections = [f"# {name}: {state}", reason, _commands(self._folder)]
         if report is not None:
             sections.append(_result(report))
@@ -117,13 +117,13 @@ class RunReadme:
         run = shlex.quote(shown(self._folder))
         details = {} if report is None else report.details
         best = shlex.quote(shown(self._folder / details.get("checkpoint", record.BEST_CHECKPOINT)))
-        if not self._config["keep_checkpoints"]:
+        if not self._config.keep_checkpoints:
             return (
                 "A trial of the program itself (`keep_checkpoints=false`): nothing to go on with."
             )
         lines = [] if state == FINISHED else [f"python train.py resume={run}  # go on"]
         if state == FINISHED:
-            epochs = 2 * int(self._config["trainer"]["max_epochs"])
+            epochs = 2 * self._config.trainer.max_epochs
             lines += [
                 f"python evaluate.py ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
                 f"python train.py resume={run} trainer.max_epochs={epochs}  # train for longer",
@@ -155,7 +155,7 @@ def write_sweep_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, 
         command: The command line.
         jobs: How each job stands, by its folder's name; empty while none has ended.
     """
-    rows = [{"method": f"[{job}]({job}/)", "folder": state} for job, state in jobs.items()]
+    rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
     state = "finished" if jobs else "running; this page is written again at its end"
     sections = [
         f"# Multirun: {state}",
@@ -163,11 +163,9 @@ def write_sweep_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, 
         "The comparison is in [compare.md](compare.md), its numbers in `compare.csv`."
         if (folder / "compare.md").is_file()
         else "",
-        "".join(
-            f"![{path.stem}]({path.name})\n" for path in [folder / "compare.png"] if path.is_file()
-        ).strip(),
+        "![compare](compare.png)" if (folder / "compare.png").is_file() else "",
         "Every job that has begun to train has a README in its folder.",
-        markdown_text(rows).replace("| method | folder |", "| job | state |") if rows else "",
+        markdown_text(rows, ["job", "state"]) if rows else "",
     ]
     _write(folder, sections)
 
@@ -201,19 +199,15 @@ def _commands(folder: Path) -> str:
 def _result(report: Report) -> str:
     """Return the tables that the terminal showed, one per object."""
     sections = [f"## Result on {report.num_images} test images"]
-    for name, row in report.rows.items():
-        if name == MEAN and len(report.rows) == 2:
-            continue
-        if row.num_instances == 0:
+    for name, rows in report.tables.items():
+        if rows[0].num_instances == 0:
             sections.append(f"{name}: not in the test images.")
             continue
-        methods = [row, *(rows[name] for rows in report.references.values())]
-        columns = [one for one in COLUMNS if row.num_symmetries > 1 or not one.symmetric]
         table = [
-            {"object": column.heading, **{one.method: column.text(one) for one in methods}}
-            for column in columns
+            {name: column.heading, **{row.method: column.text(row) for row in rows}}
+            for column in shown_columns(rows[0])
         ]
-        sections.append(markdown_text(table).replace("| object |", f"| {name} |", 1).rstrip())
+        sections.append(markdown_text(table, [name]).rstrip())
     sections.append(
         "The first column of figures is the network's; the others say what chance and a constant "
         "pose reach on the same images."

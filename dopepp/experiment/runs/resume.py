@@ -21,7 +21,8 @@ from hydra.core.hydra_config import HydraConfig
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.config.options import below, flat
+from dopepp.experiment.config.parse import as_written_now, below, flat
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.images import differing_images
 from dopepp.models.checkpoint.schema import Checkpoint
@@ -44,8 +45,6 @@ _NOT_LEARNT_FROM: Final = (
 _THIS_CALL: Final = ("resume", "resume_anyway", "output_dir")
 _NETWORK: Final = ("model.backbone", "model.attention", "model.head", "model.width")
 _OPTIMIZER: Final = "optimizer._target_"
-_COPY: Final = "data.virtual"
-"""Says again what the node ``virtual`` says."""
 
 _ABSENT: Final = "not set"
 _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re.DOTALL)
@@ -71,7 +70,7 @@ class ConfigDifference:
 
 
 def check_resume(
-    run: Path, config: Mapping[str, Any], saved: Checkpoint, payload: Mapping[str, Any]
+    run: Path, config: RunConfig, saved: Checkpoint, payload: Mapping[str, Any]
 ) -> list[ConfigDifference]:
     """Compare a run with what is to go on with it.
 
@@ -89,7 +88,7 @@ def check_resume(
             ``resume_anyway`` is not set.
     """
     path = run / record.CONFIG_FILE
-    found = config_differences(_read_config(path), config) if path.is_file() else []
+    found = config_differences(_read_config(path), config.plain) if path.is_file() else []
     state = [one for one in found if one.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
         network = [one for one in found if below(one.key, _NETWORK)] + state
@@ -104,7 +103,7 @@ def check_resume(
     learnt = [one for one in found if _is_learnt_from(one.key)]
     if not learnt:  # else the images are others for that reason
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
-    if learnt and config["resume_anyway"] is not True:
+    if learnt and not config.resume_anyway:
         raise UserError(
             f"resume={run} with other data or another loss ({_listed(learnt)})",
             "what the run has learnt from so far",
@@ -115,11 +114,11 @@ def check_resume(
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
     """Return the options in which two configs differ, but for what belongs to one call alone."""
-    one, other = (dict(flat(config)) for config in (old, new))
+    one, other = (dict(flat(as_written_now(config))) for config in (old, new))
     return [
         ConfigDifference(key, _text(one, key), _text(other, key))
         for key in {**one, **other}
-        if one.get(key) != other.get(key) and not below(key, (*_THIS_CALL, _COPY))
+        if one.get(key) != other.get(key) and not below(key, _THIS_CALL)
     ]
 
 

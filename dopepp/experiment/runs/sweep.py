@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from dopepp.experiment.cost import COST_FILE
-from dopepp.experiment.reports.compare.compare import compare_runs
-from dopepp.experiment.reports.compare.runs import read_run
+from dopepp.experiment.reports.compare import compare_runs
+from dopepp.experiment.reports.entries import read_run
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_sweep_readme
@@ -36,32 +35,34 @@ class CompareJobs(Callback):
         Raises:
             SystemExit: With code 1 if a job failed.
         """
-        plain = {
-            key: OmegaConf.to_container(config[key], resolve=True)
-            for key in ("table", "logger")
-            if config.get(key) is not None
-        }
-        if not compare_jobs(Path(str(config.hydra.sweep.dir)), plain):
+        if not compare_jobs(Path(str(config.hydra.sweep.dir)), config):
             raise SystemExit(1)
 
 
-def compare_jobs(folder: Path, config: Mapping[str, Any]) -> bool:
+def compare_jobs(folder: Path, config: DictConfig) -> bool:
     """Compare the jobs that a sweep's folder holds; return whether none has failed.
 
     Args:
         folder: The sweep's folder.
-        config: The resolved config, of which ``table`` and ``logger`` are read.
+        config: Of the multirun; its ``table`` and ``logger`` are read.
     """
+    table = _node(config, "table")
     jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
     if not jobs:
         return True
     entries = compare_runs([read_run(job) for job in jobs], folder)
-    if config.get("table") is not None:
-        write_paper_table(PaperTable.of(config["table"]), entries, folder)
-    log_comparison(config.get("logger"), folder)
+    if table is not None:
+        write_paper_table(PaperTable.of(table), entries, folder)
+    log_comparison(_node(config, "logger"), folder)
     write_sweep_readme(folder, _command(), {job.name: _state(job) for job in jobs})
     display.console.print(f"comparison in {folder}")
     return not any(entry.failure and not entry.pruned for entry in entries)
+
+
+def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
+    """Return a node of a config in plain values, None where there is none."""
+    node = OmegaConf.to_container(config[key], resolve=True) if config.get(key) else None
+    return {str(name): value for name, value in node.items()} if isinstance(node, dict) else None
 
 
 def _command() -> list[str]:

@@ -20,13 +20,14 @@ from lightning.pytorch.loggers import WandbLogger
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.build.registries import LOGGERS
-from dopepp.experiment.reports.compare.compare import (
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.reports.compare import (
     CURVES_FILE,
     LOSS_FILE,
     PICTURES_FILE,
     TABLE_FILE,
 )
-from dopepp.experiment.reports.compare.runs import overrides_of
+from dopepp.experiment.reports.entries import overrides_of
 from dopepp.experiment.reports.paper_table import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import read_csv
@@ -44,21 +45,21 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 
 
 @contextmanager
-def tracked(config: Mapping[str, Any], run_dir: Path) -> Iterator[list[GuardedLogger]]:
+def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
     """Give a training's trackers, and end the run with each of them however the training ends.
 
     Args:
-        config: The resolved config.
+        config: Of the run.
         run_dir: The run's folder; of a job, in its multirun's.
 
     Raises:
         UserError: ``logger`` names something that is no logger.
     """
     chosen = [one for one in overrides_of(run_dir) if not one.startswith(_UNSAID)]
-    name = " ".join([config["model"]["name"], config["data"]["name"], *chosen])
+    name = " ".join([config.model.name, config.data.name, *chosen])
     group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
-    begun = _begun_id(run_dir) if config["resume"] is not None else None
-    with _open(config.get("logger"), run_dir, name, group, "train", begun) as trackers:
+    begun = _begun_id(run_dir) if config.resume is not None else None
+    with _open(config.logger, run_dir, name, group, "train", begun) as trackers:
         yield trackers
 
 

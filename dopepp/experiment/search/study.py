@@ -31,7 +31,7 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.options import below, flat
+from dopepp.experiment.config.parse import FORMER_TARGETS, below, flat
 from dopepp.experiment.runs import record
 from dopepp.training.callbacks.trial import open_storage
 
@@ -145,9 +145,12 @@ _LOCK_FILE: Final = ".search.lock"
 _FACTS: Final = "configuration"
 _NUM_SHOWN: Final = 3
 _DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
-_NO_PART: Final = ("hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel",
-                   "search.storage", "search.space", "callbacks.trial.storage")  # fmt: skip
-"""What may differ between two commands of one study; of the space, its texts are compared."""
+_NO_PART: Final = (
+    "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
+    "search.space", "callbacks.trial.storage", "data.virtual",
+)  # fmt: skip
+"""What may differ between two commands of one study; of the space, its texts are compared, and
+``data.virtual`` is where earlier versions say again what the node ``virtual`` says."""
 
 
 @contextmanager
@@ -202,6 +205,11 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
     """Refuse to mix trials that cannot be compared."""
+    before = {
+        key: FORMER_TARGETS.get(value, value)
+        for key, value in before.items()
+        if not below(key, _NO_PART)
+    }
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return

@@ -1,11 +1,10 @@
-"""How well a posed part fits a depth image, and when that is too little to believe it.
+"""What decides about a pose beside depth's planes: the image's prior, the fit, and the outline.
 
-What the RGB image says about a pose, as a Gaussian around the pose it gave.
+The prior is what the RGB image says, a Gaussian around the pose it gave. The fit tells how well a
+posed part agrees with a depth image, and when that is too little to believe it.
 
-How the outline of a part in a depth image pulls on its pose.
-
-Where a part's point looks past the measured surface, or a pixel beside the part continues its
-surface, the two outlines differ; each such place pulls across the viewing ray. Where they agree,
+The outline pulls where a part's point looks past the measured surface, or a pixel beside the part
+continues its surface: each such place pulls across the viewing ray. Where the two outlines agree,
 nothing pulls, so a surface's inside does not hold the pose back.
 """
 
@@ -26,8 +25,149 @@ from dopepp.inference.refinement.visible import SurfacePoints
 STEP: Final = 2.0
 """Standard deviations of the depth by which a surface may differ from what it goes on from."""
 
-Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
-"""Information matrix and vector of (turn about the object's origin, shift): H ξ = g."""
+UNKNOWN_TURN: Final = math.radians(8.0)
+UNKNOWN_ACROSS: Final = 0.07
+UNKNOWN_ALONG: Final = 0.30
+"""Standard deviations of a pose without covariance: radians, and diameters across and along the
+viewing ray. An image says little about the distance."""
+
+LEAST_TURN: Final = math.radians(2.0)
+LEAST_ACROSS: Final = 0.03
+LEAST_ALONG: Final = 0.15
+"""Never less, in radians and diameters: calibration and CAD have errors that no image shows, and an
+error of the focal length is one of the distance."""
+
+FARTHEST: Final = 3.0
+"""Standard deviations (Mahalanobis distance, with the least deviations above) beyond which depth
+contradicts the image."""
+
+LEAST_INLIERS: Final = 0.5
+"""Of the points with depth that nothing stands before."""
+
+LEAST_SEEN: Final = 0.25
+"""Of the visible points that must have agreeing depth at all."""
+
+MOST_RMS: Final = 2.0
+"""Standard deviations of the depth: a right pose leaves about one."""
+
+CLOSE: Final = 5.0
+"""Spacings before a part up to which nothing else is expected."""
+
+BESIDE: Final = 3.0
+"""Spacings around the part in which its surface must not go on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A pose and the inverse of its covariance.
+
+    Attributes:
+        T_cam_obj: The pose, metres.
+        information: Of (turn about the object's origin, shift), camera axes, radians and metres.
+    """
+
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
+
+    def offset(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
+        """Return the turn and the shift from a pose to the prior's."""
+        # OpenCV's Rodrigues rounds turns below 1e-5 to none.
+        turn = Rotation.from_matrix(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T).as_rotvec()
+        return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
+
+    def doubt(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> str:
+        """Say why a pose contradicts the image; empty where it does not."""
+        offset = self.offset(T_cam_obj)
+        distance = math.sqrt(max(0.0, float(offset @ self.information @ offset)))
+        if distance <= FARTHEST:
+            return ""
+        return f"{distance:.1f} standard deviations from the image's pose, more than {FARTHEST:g}"
+
+
+def make_prior(
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    diameter: float,
+    covariance: Float[np.ndarray, "6 6"] | None = None,
+) -> Prior:
+    """Return the prior of a pose, with a broad covariance where none is given.
+
+    Args:
+        T_cam_obj: The pose.
+        diameter: Of the part, metres.
+        covariance: Of (turn, shift); one that is not finite counts as none.
+    """
+    ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
+    along = np.outer(ray, ray)
+    floor = LEAST_TURN**2 * np.eye(6)
+    floor[3:, 3:] = LEAST_ACROSS**2 * (np.eye(3) - along) + LEAST_ALONG**2 * along
+    floor[3:, 3:] *= diameter**2
+    if covariance is None or not np.isfinite(covariance).all():
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = UNKNOWN_TURN**2 * np.eye(3)
+        shift = UNKNOWN_ACROSS**2 * (np.eye(3) - along) + UNKNOWN_ALONG**2 * along
+        covariance[3:, 3:] = diameter**2 * shift
+    return Prior(T_cam_obj, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Agreement of a pose with depth.
+
+    Attributes:
+        inliers: Share that agrees among the points with depth that nothing stands before.
+        seen: Share that agrees among all points that the part itself does not hide.
+        rms: Of the agreeing points' offsets, in standard deviations of the depth.
+        uncovered: Area beside the part that goes on as its surface does, over the part's own.
+    """
+
+    inliers: float
+    seen: float
+    rms: float
+    uncovered: float
+
+    @property
+    def score(self) -> float:
+        """One number to compare poses by."""
+        return self.seen - (1.0 - self.inliers) - self.uncovered
+
+    def doubt(self, before: Fit) -> str:
+        """Say why not to believe this fit rather than the one before; empty where there is none."""
+        if self.inliers < LEAST_INLIERS:
+            return f"only {self.inliers:.0%} of the part agrees with the depth"
+        if self.seen < LEAST_SEEN:
+            return f"only {self.seen:.0%} of the part is measured and unobstructed"
+        if self.rms > MOST_RMS:
+            return f"a residual of {self.rms:.1f} standard deviations of the depth"
+        if self.score <= before.score:
+            return "the depth fits the given pose no worse"
+        return ""
+
+
+def fit_of(
+    view: DepthView,
+    surface: SurfacePoints,
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    seen: Bool[np.ndarray, "points"],
+) -> Fit:
+    """Measure the agreement of a pose, and of the points it shows, with a depth view."""
+    overlay = lay_over(view, surface, seen, T_cam_obj)
+    if overlay is None:
+        return Fit(0.0, 0.0, np.inf, 0.0)
+    gate = GATE * view.noise
+    offset = overlay.at_points
+    agree = np.abs(offset) <= gate
+    # What lies just before a part is more often the part itself, elsewhere, than something else.
+    wrong = (offset > gate) | ((offset < -gate) & (offset > -CLOSE * surface.spacing))
+    count = int(agree.sum())
+    if count == 0:
+        return Fit(0.0, 0.0, np.inf, 0.0)
+    beside = continues(view, overlay, BESIDE).sum()
+    return Fit(
+        inliers=count / (count + int(wrong.sum())),
+        seen=count / int(seen.sum()),
+        rms=float(np.sqrt(np.mean(offset[agree] ** 2))) / view.noise,
+        uncovered=float(beside / max(1, (overlay.distance <= 1.0).sum())),
+    )
 
 
 def continues(view: DepthView, overlay: Overlay, reach: float) -> Bool[np.ndarray, "height width"]:
@@ -40,6 +180,10 @@ def continues(view: DepthView, overlay: Overlay, reach: float) -> Bool[np.ndarra
     own = overlay.at_points
     here = np.where(np.abs(own) <= GATE * view.noise, own, np.nan)[overlay.nearest]
     return np.asarray(beside & (np.abs(overlay.offset - here) <= STEP * view.noise))
+
+
+Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
+"""Information matrix and vector of (turn about the object's origin, shift): H ξ = g."""
 
 
 def outline_terms(
@@ -124,149 +268,3 @@ def _add(
     ):
         H += weight * row.T @ row
         g += weight * row.T @ pull
-
-
-UNKNOWN_TURN: Final = math.radians(8.0)
-UNKNOWN_ACROSS: Final = 0.07
-UNKNOWN_ALONG: Final = 0.30
-"""Standard deviations of a pose without covariance: radians, and diameters across and along the
-viewing ray. An image says little about the distance."""
-
-LEAST_TURN: Final = math.radians(2.0)
-LEAST_ACROSS: Final = 0.03
-LEAST_ALONG: Final = 0.15
-"""Never less, in radians and diameters: calibration and CAD have errors that no image shows, and an
-error of the focal length is one of the distance."""
-
-FARTHEST: Final = 3.0
-"""Standard deviations (Mahalanobis distance, with the least deviations above) beyond which depth
-contradicts the image."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """A pose and the inverse of its covariance.
-
-    Attributes:
-        T_cam_obj: The pose, metres.
-        information: Of (turn about the object's origin, shift), camera axes, radians and metres.
-    """
-
-    T_cam_obj: Float[np.ndarray, "4 4"]
-    information: Float[np.ndarray, "6 6"]
-
-    def offset(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
-        """Return the turn and the shift from a pose to the prior's."""
-        # OpenCV's Rodrigues rounds turns below 1e-5 to none.
-        turn = Rotation.from_matrix(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T).as_rotvec()
-        return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
-
-    def doubt(self, T_cam_obj: Float[np.ndarray, "4 4"]) -> str:
-        """Say why a pose contradicts the image; empty where it does not."""
-        offset = self.offset(T_cam_obj)
-        distance = math.sqrt(max(0.0, float(offset @ self.information @ offset)))
-        if distance <= FARTHEST:
-            return ""
-        return f"{distance:.1f} standard deviations from the image's pose, more than {FARTHEST:g}"
-
-
-def make_prior(
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    diameter: float,
-    covariance: Float[np.ndarray, "6 6"] | None = None,
-) -> Prior:
-    """Return the prior of a pose, with a broad covariance where none is given.
-
-    Args:
-        T_cam_obj: The pose.
-        diameter: Of the part, metres.
-        covariance: Of (turn, shift); one that is not finite counts as none.
-    """
-    ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
-    along = np.outer(ray, ray)
-    floor = LEAST_TURN**2 * np.eye(6)
-    floor[3:, 3:] = LEAST_ACROSS**2 * (np.eye(3) - along) + LEAST_ALONG**2 * along
-    floor[3:, 3:] *= diameter**2
-    if covariance is None or not np.isfinite(covariance).all():
-        covariance = np.zeros((6, 6))
-        covariance[:3, :3] = UNKNOWN_TURN**2 * np.eye(3)
-        shift = UNKNOWN_ACROSS**2 * (np.eye(3) - along) + UNKNOWN_ALONG**2 * along
-        covariance[3:, 3:] = diameter**2 * shift
-    return Prior(T_cam_obj, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
-
-
-LEAST_INLIERS: Final = 0.5
-"""Of the points with depth that nothing stands before."""
-
-LEAST_SEEN: Final = 0.25
-"""Of the visible points that must have agreeing depth at all."""
-
-MOST_RMS: Final = 2.0
-"""Standard deviations of the depth: a right pose leaves about one."""
-
-CLOSE: Final = 5.0
-"""Spacings before a part up to which nothing else is expected."""
-
-BESIDE: Final = 3.0
-"""Spacings around the part in which its surface must not go on."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Agreement of a pose with depth.
-
-    Attributes:
-        inliers: Share that agrees among the points with depth that nothing stands before.
-        seen: Share that agrees among all points that the part itself does not hide.
-        rms: Of the agreeing points' offsets, in standard deviations of the depth.
-        uncovered: Area beside the part that goes on as its surface does, over the part's own.
-    """
-
-    inliers: float
-    seen: float
-    rms: float
-    uncovered: float
-
-    @property
-    def score(self) -> float:
-        """One number to compare poses by."""
-        return self.seen - (1.0 - self.inliers) - self.uncovered
-
-    def doubt(self, before: Fit) -> str:
-        """Say why not to believe this fit rather than the one before; empty where there is none."""
-        if self.inliers < LEAST_INLIERS:
-            return f"only {self.inliers:.0%} of the part agrees with the depth"
-        if self.seen < LEAST_SEEN:
-            return f"only {self.seen:.0%} of the part is measured and unobstructed"
-        if self.rms > MOST_RMS:
-            return f"a residual of {self.rms:.1f} standard deviations of the depth"
-        if self.score <= before.score:
-            return "the depth fits the given pose no worse"
-        return ""
-
-
-def fit_of(
-    view: DepthView,
-    surface: SurfacePoints,
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    seen: Bool[np.ndarray, "points"],
-) -> Fit:
-    """Measure the agreement of a pose, and of the points it shows, with a depth view."""
-    overlay = lay_over(view, surface, seen, T_cam_obj)
-    if overlay is None:
-        return Fit(0.0, 0.0, np.inf, 0.0)
-    gate = GATE * view.noise
-    offset = overlay.at_points
-    agree = np.abs(offset) <= gate
-    # What lies just before a part is more often the part itself, elsewhere, than something else.
-    wrong = (offset > gate) | ((offset < -gate) & (offset > -CLOSE * surface.spacing))
-    count = int(agree.sum())
-    if count == 0:
-        return Fit(0.0, 0.0, np.inf, 0.0)
-    beside = continues(view, overlay, BESIDE).sum()
-    return Fit(
-        inliers=count / (count + int(wrong.sum())),
-        seen=count / int(seen.sum()),
-        rms=float(np.sqrt(np.mean(offset[agree] ** 2))) / view.noise,
-        uncovered=float(beside / max(1, (overlay.distance <= 1.0).sum())),
-    )

@@ -33,6 +33,9 @@ HIDDEN: Final = 0.5
 PENALTY: Final = 0.03
 """Share of the points that a shift by one standard deviation of the prior must gain."""
 
+LEAST_POINTS: Final = 20
+"""Points that must find their depth."""
+
 
 def best_shift(
     view: DepthView,
@@ -63,10 +66,6 @@ def best_shift(
     return shift if agreeing >= LEAST_POINTS else None
 
 
-LEAST_POINTS: Final = 20
-"""Points that must find their depth."""
-
-
 @compiled()
 def _search(
     depth: Array,
@@ -82,17 +81,9 @@ def _search(
 ) -> int:
     """Try every shift across and vote on the one along the axis; return the votes of the best.
 
-    Args:
-        depth: Metres, shape (H, W).
-        K: Camera matrix, pixels.
-        points: Camera frame, metres, shape (N, 3).
-        information: Of the shift, shape (3, 3), 1/m².
-        moved: From the prior's pose so far, metres, shape (3,).
-        step: Across, metres.
-        bin_size: Along the axis, metres.
-        half: Bins to each side.
-        tolerance: Metres along the axis over which a vote falls to nothing.
-        best: The result, metres, shape (3,).
+    Votes fall into ``half`` bins of ``bin_size`` metres to each side of the present depth, and
+    count less the farther off they are, up to ``tolerance``. ``best`` is filled with the shift,
+    metres; see :func:`best_shift` for the others.
     """
     rows, columns = depth.shape
     count = points.shape[0]

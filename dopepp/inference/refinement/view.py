@@ -1,6 +1,6 @@
-"""The part of a depth image around a predicted pose, and what of it belongs to the part.
+"""Depth images as a user gives them, and the part of one that a posed object can belong to.
 
-Depth as a user gives it: metres along z, aligned to the colour image, 0 or NaN where unknown.
+Depth is in metres along z, aligned to the colour image, and 0 or NaN where it is unknown.
 """
 
 from __future__ import annotations
@@ -21,6 +21,30 @@ from dopepp.inference.refinement.visible import SurfacePoints, plane_depth
 
 FARTHEST: Final = 50.0
 """Metres. No depth camera for parts sees so far; millimetres taken for metres do."""
+
+LONGEST_PX: Final = 112
+"""Longer crops are thinned out: ten thousand pixels fix six numbers as well as a million."""
+
+MARGIN: Final = 0.3
+"""Of the part's extent, looked at around it: the pose may be off by as much."""
+
+NOISE: Final = 2e-3
+"""Standard deviation of a depth camera at 1 m, metres; it grows with the square of the depth."""
+
+LEAST_NOISE: Final = 1e-3
+"""Metres: quantisation and distortion, which no sensor is without."""
+
+GATE: Final = 3.0
+"""Standard deviations within which depth agrees with the part."""
+
+BESIDE: Final = 6.0
+"""Spacings around the part that are compared with it."""
+
+EXTENDED: Final = 4.0
+"""Spacings by which a point's plane may rise or fall: it does not go on for ever."""
+
+COVERED: Final = 1.0
+"""Spacings around a surface point that count as covered by the part."""
 
 
 def checked_depth(
@@ -99,31 +123,6 @@ def undistorted_depth(
     size = depth.shape[::-1]
     maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
     return np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST), np.float32)
-
-
-LONGEST_PX: Final = 112
-"""Longer crops are thinned out: ten thousand pixels fix six numbers as well as a million."""
-
-MARGIN: Final = 0.3
-"""Of the part's extent, looked at around it: the pose may be off by as much."""
-
-NOISE: Final = 2e-3
-"""Standard deviation of a depth camera at 1 m, metres; it grows with the square of the depth."""
-
-LEAST_NOISE: Final = 1e-3
-"""Metres: quantisation and distortion, which no sensor is without."""
-
-GATE: Final = 3.0
-"""Standard deviations within which depth agrees with the part."""
-
-BESIDE: Final = 6.0
-"""Spacings around the part that are compared with it."""
-
-EXTENDED: Final = 4.0
-"""Spacings by which a point's plane may rise or fall: it does not go on for ever."""
-
-COVERED: Final = 1.0
-"""Spacings around a surface point that count as covered by the part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,18 +254,10 @@ def _offsets(
     limit: float,
     offset: Array,
 ) -> None:
-    """Compare a view with the planes of its pixels' nearest points.
+    """Fill ``offset``: each pixel's depth less that of its nearest point's plane, metres.
 
-    Args:
-        depth: Metres, shape (H, W).
-        rays: Of its pixels, shape (H, W, 3).
-        distance: To the nearest points, shape (H, W).
-        nearest: Which these are, shape (H, W).
-        points: Camera frame, metres, shape (N, 3).
-        normals: Camera frame, shape (N, 3).
-        farthest: Distance beyond which nothing is compared.
-        limit: A plane's depth differs from its point's by no more, metres.
-        offset: The result, metres, NaN where nothing is compared, shape (H, W).
+    It is NaN where the nearest point is beyond ``farthest``. A plane's depth differs from its
+    point's by no more than ``limit``.
     """
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):

@@ -137,17 +137,8 @@ def _look(
 ) -> None:
     """Compare every point with the discs around its ray; two of them have to agree.
 
-    Args:
-        points: Camera frame, metres, shape (N, 3).
-        normals: Camera frame, shape (N, 3).
-        rays: ``points`` at z = 1, shape (N, 3).
-        keys: Column and row of each point's cell, shape (N, 2).
-        order: Points by cell, shape (N,).
-        starts: Where each cell begins in ``order``, shape (columns·rows + 1,).
-        columns: Cells in a row.
-        rows: Rows of cells.
-        spacing: Metres between points.
-        seen: The result, shape (N,).
+    Points lie in a grid over the image: ``keys`` are the column and row of each one's cell,
+    ``order`` the points by cell, and ``starts`` where each cell begins there. ``seen`` is filled.
     """
     clearance, reach = CLEARANCE * spacing, DISC * spacing
     for i in range(points.shape[0]):

@@ -1,25 +1,17 @@
-"""Released checkpoints: weights in half precision and the schema, in one safetensors file.
+"""Released checkpoints: weights in half precision and the payload, in one safetensors file.
 
 ``pretrained/NAME`` stands for a file of the package's folder ``dopepp/pretrained``. The file's
 metadata hold the checkpoint's payload as JSON under ``dopepp``; nothing in it names a local path.
-
-Weights as safetensors: a JSON header and bare numbers, in which nothing can be hidden.
-
-A file is the header's length (8 bytes, little endian), the header ``{name: {"dtype", "shape",
-"data_offsets"}, …, "__metadata__": {text: text}}``, and the tensors' bytes one after the other.
-The library that parses it bounds neither what it parses nor the text of the metadata, and its
-errors are not a user's; so the header is held to the file here before the library sees it.
-
-To allow a further type of number, name it in :data:`DTYPES`.
+A safetensors file is its header's length (8 bytes, little endian), the header in JSON, and bare
+numbers: nothing in it can run, and the library holds every tensor to its bytes in the file.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import torch
 from safetensors.torch import load, save
@@ -27,21 +19,13 @@ from torch import Tensor
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.models.checkpoint import released as safetensors_file
+from dopepp.core.json import parse_json
 
-DTYPES: Final = {
-    "BOOL": torch.bool,
-    "U8": torch.uint8,
-    "I8": torch.int8,
-    "I16": torch.int16,
-    "I32": torch.int32,
-    "I64": torch.int64,
-    "F16": torch.float16,
-    "BF16": torch.bfloat16,
-    "F32": torch.float32,
-    "F64": torch.float64,
-}
-"""Types of number, by the format's names."""
+SUFFIX: Final = ".safetensors"
+FOLDER: Final = "pretrained"
+
+KEY: Final = "dopepp"
+"""Of the payload in a file, of either kind."""
 
 MAX_BYTES: Final = 2**30
 """Of a file: five times the full DOPE in float32."""
@@ -49,153 +33,13 @@ MAX_BYTES: Final = 2**30
 MAX_HEADER_BYTES: Final = 8_000_000
 """Of the header with its metadata: the ADD points of forty parts as text."""
 
-MAX_NAME: Final = 200
+_MAX_NAME: Final = 200
 """Characters of a tensor's name or of a key of the metadata."""
 
-MAX_DIMENSIONS: Final = 8
-
-METADATA: Final = "__metadata__"
 _LENGTH_BYTES: Final = 8
-_FIELDS: Final = frozenset({"dtype", "shape", "data_offsets"})
+_METADATA: Final = "__metadata__"
+_FIELDS: Final = {"dtype", "shape", "data_offsets"}
 
-
-def write(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a file, whole or not at all.
-
-    Args:
-        path: The file.
-        tensors: By name, on any device, of any strides.
-        metadata: What else the file says, text by name.
-
-    Raises:
-        ValueError: :func:`read` would refuse the file.
-        OSError: The folder cannot be written.
-    """
-    plain = {name: one.detach().cpu().contiguous().clone() for name, one in tensors.items()}
-    content = save(plain, dict(metadata))
-    _header(content)
-    write_whole(path, content)
-
-
-def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file that anybody may have written.
-
-    Returns:
-        The tensors by name, on the CPU, and the metadata.
-
-    Raises:
-        UserError: The file is missing or too large, or its header is damaged, too long, not
-            within bounds, or does not account for every byte of the file once.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes")
-        content = path.read_bytes()
-        metadata = _header(content)
-        return dict(load(content)), metadata
-    except OSError as error:
-        raise _bad(path, str(error.strerror)) from error
-    except ValueError as error:
-        raise _bad(path, str(error)) from error
-    except Exception as error:  # the library's own, for what it alone finds
-        raise _bad(path, f"{type(error).__name__}: {error}") from error
-
-
-def _header(content: bytes) -> dict[str, str]:
-    """Check a file's header against its size and return the metadata."""
-    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
-    start = _LENGTH_BYTES + length
-    if len(content) < _LENGTH_BYTES or start > len(content):
-        raise ValueError(f"a header of {length} bytes in a file of {len(content)}")
-    if length > MAX_HEADER_BYTES:
-        raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")
-    header = _parsed(content[_LENGTH_BYTES:start])
-    metadata = _metadata(header.pop(METADATA, {}))
-    spans = sorted(_span(name, entry) for name, entry in header.items())
-    end = 0
-    for first, last, name in spans:
-        if first != end:
-            problem = "a gap before it" if first > end else "bytes of another one"
-            raise ValueError(f"tensor {name!r:.80} with {problem}")
-        end = last
-    if start + end != len(content):
-        raise ValueError(f"tensors of {end} bytes, {len(content) - start} in the file")
-    return metadata
-
-
-def _parsed(header: bytes) -> dict[str, Any]:
-    try:
-        parsed = json.loads(
-            header.decode(), object_pairs_hook=_object, parse_constant=_refuse_constant
-        )
-    except RecursionError as error:
-        raise ValueError("a header nested too deep") from error
-    if not isinstance(parsed, dict):
-        raise ValueError(f"a header that is a {type(parsed).__name__}")
-    return parsed
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        raise ValueError("a header with a name twice")
-    return fields
-
-
-def _refuse_constant(text: str) -> NoReturn:
-    raise ValueError(f"a header with {text}")
-
-
-def _metadata(metadata: object) -> dict[str, str]:
-    plain = isinstance(metadata, dict) and all(
-        len(key) <= MAX_NAME and isinstance(value, str) for key, value in metadata.items()
-    )
-    if not plain:
-        raise ValueError(f"{METADATA} that is not text by names of up to {MAX_NAME} characters")
-    return dict(metadata)  # type: ignore[call-overload, no-any-return]
-
-
-def _span(name: str, entry: object) -> tuple[int, int, str]:
-    """Return a tensor's first byte, the one after its last, and its name."""
-    where = f"tensor {name!r:.80}"
-    if not 0 < len(name) <= MAX_NAME or not isinstance(entry, dict) or {*entry} != _FIELDS:
-        raise ValueError(f"{where} that is no {', '.join(sorted(_FIELDS))}, or has a long name")
-    kind, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
-    if not isinstance(kind, str) or kind not in DTYPES:
-        raise ValueError(f"{where} of numbers {kind!s:.50}, none of {', '.join(DTYPES)}")
-    if not _are_sizes(shape, MAX_DIMENSIONS):
-        raise ValueError(f"{where} of a shape that is none")
-    if not _are_sizes(offsets, 2) or len(offsets) != 2:
-        raise ValueError(f"{where} with data_offsets that are not [first, last]")
-    size = math.prod(shape) * DTYPES[kind].itemsize
-    if offsets[1] - offsets[0] != size:
-        raise ValueError(f"{where} of {size} bytes in {offsets[1] - offsets[0]}")
-    return offsets[0], offsets[1], name
-
-
-def _are_sizes(value: object, most: int) -> bool:
-    """Tell whether a value is a short list of whole numbers no larger than a file."""
-    return (
-        isinstance(value, list)
-        and len(value) <= most
-        and all(type(number) is int and 0 <= number <= MAX_BYTES for number in value)
-    )
-
-
-def _bad(path: Path, got: str) -> UserError:
-    return UserError(
-        f"{path}: {got:.300}",
-        f"a whole safetensors file of at most {MAX_BYTES >> 20} MiB",
-        "get the file again from its source",
-    )
-
-
-SUFFIX: Final = ".safetensors"
-FOLDER: Final = "pretrained"
-
-KEY: Final = "dopepp"
-"""Of the description in a file, of either kind."""
 _PLACES: Final = ("root", "cache_dir", "backgrounds")
 """Keys of a data configuration that name folders of the machine it was trained on."""
 
@@ -227,14 +71,13 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
     Raises:
         UserError: The file is missing, damaged or foreign.
     """
-    tensors, metadata = safetensors_file.read(path)
-    try:
-        payload = json.loads(metadata[KEY])
-    except (KeyError, ValueError, RecursionError) as error:
+    tensors, metadata = read_safetensors(path)
+    if KEY not in metadata:
         raise UserError(
             f"{path} without a description under {KEY!r}",
             "a checkpoint written by `dopepp release`", "get the file again",
-        ) from error  # fmt: skip
+        )  # fmt: skip
+    payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
     weights = {name: _single(value) for name, value in tensors.items()}
     size = sum(value.numel() * value.element_size() for value in weights.values())
     return {"state_dict": weights, KEY: payload}, size
@@ -253,13 +96,81 @@ def write_content(content: Mapping[str, Any], path: Path) -> None:
     """
     weights = {name: _half(name, value) for name, value in content["state_dict"].items()}
     payload = json.dumps(_portable(content[KEY]), allow_nan=False)
-    safetensors_file.write(path, weights, {KEY: payload})
+    write_safetensors(path, weights, {KEY: payload})
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a file that anybody may have written.
+
+    Returns:
+        The tensors by name, on the CPU, and the metadata.
+
+    Raises:
+        UserError: The file is missing, damaged or too large, or its header is.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = path.read_bytes()
+        header = _header(content)
+        tensors = load(content)
+        # Here the library has found every tensor and every byte of the file to be in its place.
+        entries: Any = parse_json(header, "its header")
+        metadata = entries.pop(_METADATA, {})
+        # It takes these four: "another field", "a long name", "no name", "metadata of a long name".
+        known = all(entry.keys() == _FIELDS for entry in entries.values())
+        if not known or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
+            raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
+    except OSError as error:
+        raise _bad(path, str(error.strerror)) from error
+    except UserError as error:
+        raise _bad(path, error.got) from error
+    except Exception as error:  # the library's own, and what a foreign header leads to
+        raise _bad(path, str(error)) from error
+    return tensors, metadata
+
+
+def write_safetensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> None:
+    """Write a file, whole or not at all.
+
+    Args:
+        path: The file.
+        tensors: By name, on any device, of any strides.
+        metadata: What else the file says, text by name.
+
+    Raises:
+        ValueError: The header is longer than what is read.
+        OSError: The folder cannot be written.
+    """
+    plain = {name: one.detach().cpu().contiguous().clone() for name, one in tensors.items()}
+    content = save(plain, dict(metadata))
+    _header(content)
+    write_whole(path, content)
+
+
+def _header(content: bytes) -> bytes:
+    """Return a file's header; the library would parse up to 100 MB of it."""
+    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
+    if length > MAX_HEADER_BYTES:
+        raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")
+    return content[_LENGTH_BYTES : _LENGTH_BYTES + length]
+
+
+def _bad(path: Path, got: str) -> UserError:
+    return UserError(
+        f"{path}: {' '.join(got[:300].split())}",
+        f"a whole safetensors file of at most {MAX_BYTES >> 20} MiB",
+        "get the file again from its source",
+    )
 
 
 def _half(name: str, value: Tensor) -> Tensor:
     if not value.is_floating_point():
-        return value.contiguous()
-    half = value.to(torch.float16).contiguous()
+        return value
+    half = value.to(torch.float16)
     if not half.isfinite().all():
         raise UserError(
             f"{name} with values up to {float(value.abs().max()):g}",

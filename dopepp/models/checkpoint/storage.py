@@ -1,10 +1,17 @@
-"""Torch files: written whole or not at all, read as the untrusted input they are."""
+"""Torch files: written whole or not at all, read as the untrusted input they are.
+
+``torch.load(weights_only=True)`` runs no code, but it builds what a pickle of a few bytes asks for,
+and it reads where the archive points. So before it sees a file, the archive, the names that the
+pickle calls and the sizes that it claims are held to what is in the file.
+"""
 
 from __future__ import annotations
 
+import io
 import os
+import pickletools
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -12,15 +19,45 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
-from dopepp.models.checkpoint import pickled
-from dopepp.models.checkpoint.pickled import claimed_storages
+
+MAX_BYTES: Final = 4 * 2**30
+"""The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
+
+_MAX_PICKLE_BYTES: Final = 16_000_000
+"""Of one pickle: over half a million ADD points. What is built takes at most 80 times as much."""
+
+_MAX_TUPLES: Final = 50_000
+"""Ten for each tensor of any optimiser, and few enough to be nested without harm: Python hashes a
+tuple in tuples on the stack of the process."""
 
 _ZIP: Final = b"PK\x03\x04"
 _LEGACY: Final = b"\x80\x02"
 """What a file begins with: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
 
-MAX_BYTES: Final = 4 * 2**30
-"""The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
+_NUM_LEGACY_PICKLES: Final = 5
+"""Before the numbers in a file of torch before 1.6: magic number, version, machine, content and the
+storages' keys."""
+
+_STORAGE_BYTES: Final = {
+    f"torch {name}Storage": size
+    for name, size in {
+        "Bool": 1, "Byte": 1, "Char": 1, "Short": 2, "Half": 2, "BFloat16": 2, "Int": 4,
+        "Float": 4, "Long": 8, "Double": 8, "ComplexFloat": 8, "ComplexDouble": 16,
+    }.items()
+}  # fmt: skip
+"""Bytes of a number in each of torch's kinds of storage."""
+
+_NAMES: Final = {
+    *_STORAGE_BYTES,
+    "collections OrderedDict",
+    "torch Size",
+    "torch._utils _rebuild_parameter",
+    "torch._utils _rebuild_tensor",
+    "torch._utils _rebuild_tensor_v2",
+}
+"""What a pickle may name: each makes an object no larger than its arguments. torch's own list also
+has ``bytearray`` and tensor classes, which allocate what a number says (case "a call that fills the
+memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set on a tensor")."""
 
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
@@ -70,8 +107,7 @@ def _serialise(payload: Mapping[str, Any], stream: IO[bytes]) -> None:
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
 
-    What the file's pickle asks for is looked at first (:mod:`~dopepp.models.checkpoint.pickled`),
-    so that loading takes no more memory than the file has bytes.
+    Loading takes no more memory than the file has bytes.
 
     Args:
         path: The file, also one of torch before 1.6.
@@ -91,7 +127,7 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
             _check_legacy(path)
         elif _ZIP.startswith(begin):
             check_container(path, what)
-            _check_pickle(path)
+            _check_archive(path)
         else:
             raise ValueError("neither a zip archive nor a pickle")
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -110,7 +146,7 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
 
 
 def check_container(path: Path, what: str) -> int:
-    """Return a file's unpacked size after checking that loading it cannot take more memory.
+    """Return a zip archive's unpacked size; it holds no more than the file has bytes.
 
     ``torch.save`` stores without compression, so a file that promises more than it has is a bomb.
 
@@ -146,22 +182,24 @@ def check_container(path: Path, what: str) -> int:
     return size
 
 
-def _check_pickle(path: Path) -> None:
+def _check_archive(path: Path) -> None:
     """Hold a zip archive of torch's to what it may contain.
 
     Raises:
         ValueError: It holds something else.
     """
     with zipfile.ZipFile(path) as archive:
+        # torch takes any of two members of one name, and any of two pickles.
         sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
         if len(sizes) < len(archive.infolist()):
-            raise ValueError("two members of one name")  # and torch may take the other one
+            raise ValueError("two members of one name")
         pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise ValueError(f"{len(pickles)} members FOLDER/data.pkl")
         with archive.open(pickles[0]) as member:
-            claimed = claimed_storages(member.read(pickled.MAX_BYTES + 1))
+            claimed = _claimed_storages(member.read(_MAX_PICKLE_BYTES + 1))
     folder = pickles[0].removesuffix("data.pkl")
+    # Not every version of torch notices a storage that reaches beyond its bytes.
     for key, size in claimed.items():
         stored = sizes.get(f"{folder}data/{key}".casefold())
         if stored != size:
@@ -172,9 +210,82 @@ def _check_legacy(path: Path) -> None:
     """Hold a file of torch before 1.6 to what it may contain.
 
     Raises:
-        ValueError: It holds something else, or fewer numbers than it says.
+        ValueError: It holds something else, or fewer numbers than it says: torch allocates a
+            storage before it reads it (case "a storage of terabytes").
     """
     with path.open("rb") as file:
-        claimed = claimed_storages(file.read(pickled.MAX_BYTES + 1), pickled.NUM_LEGACY)
+        claimed = _claimed_storages(file.read(_MAX_PICKLE_BYTES + 1), _NUM_LEGACY_PICKLES)
     if sum(claimed.values()) > path.stat().st_size:
         raise ValueError(f"{sum(claimed.values())} bytes of numbers in {path.stat().st_size}")
+
+
+def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
+    """Return the bytes that each storage claims to have, by its key.
+
+    Args:
+        content: Pickles one after the other, and whatever follows them.
+        num_pickles: How many of them.
+
+    Raises:
+        ValueError: A pickle is damaged or too long, or does what weights and plain values do not
+            need.
+    """
+    stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
+    try:
+        for _ in range(num_pickles):
+            for kind, key, count in _storage_references(stream):
+                claimed = count * _STORAGE_BYTES[kind]
+                if count < 0 or storages.setdefault(key, claimed) != claimed:
+                    raise ValueError(f"storage {key!r:.20} of {count} numbers, or of two sizes")
+    except (ValueError, KeyError) as error:
+        mb = _MAX_PICKLE_BYTES / 1e6
+        long = f", or over {mb:g} MB" if len(content) > _MAX_PICKLE_BYTES else ""
+        raise ValueError(f"a pickle with {error!s:.200}{long}") from error
+    return storages
+
+
+class _Name(str):
+    """A name that a pickle refers to, in contrast to a text in it."""
+
+    __slots__ = ()
+
+
+def _storage_references(stream: IO[bytes]) -> Iterator[tuple[str, str, int]]:
+    """Follow one pickle and yield every storage's kind, key and count of numbers.
+
+    A reference is a tuple of constants, so only those are known here: ``top`` is what was put last
+    and ``items`` what was put since the last mark, with None for all else.
+    """
+    top: Any = None
+    items: list[Any] = [None]
+    memo: dict[Any, Any] = {}
+    num_tuples = 0
+    for operation, argument, _ in pickletools.genops(stream):
+        name = operation.name
+        num_tuples += name.startswith("TUPLE")
+        if num_tuples > _MAX_TUPLES:
+            raise ValueError(f"over {_MAX_TUPLES} tuples")
+        # torch only warns of "another protocol", and makes 200 bytes of one in "a million sets".
+        if (name == "PROTO" and argument != 2) or name == "EMPTY_SET":
+            raise ValueError(f"operation {name} {argument}")
+        if name == "GLOBAL" and argument not in _NAMES:
+            raise ValueError(f"the name {str(argument).replace(' ', '.')!r:.100}")
+        if name == "BINPERSID":
+            yield _storage_reference(top)
+        if name in ("BINPUT", "LONG_BINPUT"):
+            memo[argument] = top
+        elif operation.stack_after and not operation.stack_before and name != "MARK":
+            constant = _Name(argument) if name == "GLOBAL" else argument
+            top = memo[argument] if name in ("BINGET", "LONG_BINGET") else constant
+            items.append(top)
+        else:
+            top = tuple(items) if name == "TUPLE" else None
+            items = [] if name == "MARK" else [None]
+
+
+def _storage_reference(value: object) -> tuple[str, str, int]:
+    match value:
+        case ("storage", _Name() as kind, str(key), str(), int(count), *_):
+            if kind in _STORAGE_BYTES and key.isascii():
+                return kind, key, count
+    raise ValueError("a reference to something that is no storage")

@@ -1,14 +1,12 @@
-"""STL and 3MF files: checked to be whole and harmless, then read by trimesh.
+"""STL, 3MF and GLB files: checked to be whole and harmless, then read by trimesh.
 
-trimesh takes a file that ends too early for a smaller mesh, and spends what memory and time a file
-asks for. ``tests/parts/test_library.py`` and ``tests/security/test_hostile_scenes.py`` hold the
-cases. To add a format that trimesh reads, check its file first and hand it to :func:`read_scene`.
+trimesh takes a file that ends too early for a smaller mesh, passes over what it does not know, and
+spends what memory and time a file asks for; ``tests/parts/mesh/test_library.py`` and
+``tests/security/test_hostile_scenes.py`` hold the cases. So of GLB, which is glTF in one file,
+compressed, quantised and sparse data, triangle fans and moved textures are refused. Lines, points,
+colours, normals, skins and animations are left out: a part's look is its shape and its texture.
 
-GLB files, glTF in one file: checked to be whole and harmless, then read by trimesh.
-
-What trimesh passes over without a word is refused: compressed, quantised and sparse data, triangle
-fans, textures that are moved. Lines, points, colours, normals, skins and animations are left out:
-a part's look is its shape and its texture.
+To add a format that trimesh reads, check its file first and hand it to :func:`read_scene`.
 """
 
 from __future__ import annotations
@@ -51,56 +49,16 @@ _STL_TRIANGLE: Final = 50
 _FACET: Final = re.compile(rb"\bfacet\s+normal\b", re.IGNORECASE)
 """What begins a triangle in text."""
 
+MAX_HEADER_BYTES: Final = 10_000_000
+"""Of the JSON: Python takes twenty times as much memory."""
 
-def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
-    """Let trimesh read a file's content; without a path it can reach no other file.
+MAX_VALUES: Final = 30_000_000
+"""Numbers and vectors that primitives use: each gets a copy, of an array that others use too."""
 
-    Returns:
-        The meshes that it shows as one, with the unit as it names it, and their number.
-
-    Raises:
-        ValueError: A face has a vertex that its mesh has not, or there are too many triangles.
-        Exception: Whatever trimesh makes of a damaged file.
-    """
-    import trimesh  # takes a while: only for those who read such a file
-
-    # An infinite corner is named later, not in trimesh's own sums.
-    with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
-        # numpy stops at a damaged number with nothing but this warning.
-        warnings.simplefilter("error", DeprecationWarning)
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
-    vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
-    uvs: list[Any] = []
-    start = num_triangles = 0
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        if not hasattr(mesh, "faces"):
-            continue  # lines and points
-        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-            raise ValueError(f"a face index outside of its {len(mesh.vertices)} vertices")
-        num_triangles += len(mesh.faces)
-        if num_triangles > MAX_TRIANGLES:
-            raise ValueError(f"over {MAX_TRIANGLES} triangles")
-        vertices.append(_moved(np.asarray(mesh.vertices), transform))
-        faces.append(np.asarray(mesh.faces) + start)
-        uvs.append(getattr(mesh.visual, "uv", None))
-        start += len(mesh.vertices)
-    uv = None if not uvs or any(uv is None for uv in uvs) else np.concatenate(uvs)
-    if uv is not None and uv.shape != (start, 2):
-        raise ValueError(f"{len(uv)} texture coordinates of {start} vertices")
-    unit = scene.metadata.get("units")
-    return RawMesh(np.concatenate(vertices), np.concatenate(faces), uv, unit=unit), len(uvs)
-
-
-def _moved(
-    vertices: Float[np.ndarray, "vertices 3"], transform: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "vertices 3"]:
-    if (transform == np.eye(4)).all():
-        return vertices  # as they are: a product would make NaN of an infinite one's neighbours
-    # Not a product of matrices, whose last digits depend on the processor.
-    rows = zip(vertices.T, transform[:3, :3].T, strict=True)
-    return np.asarray(sum(x[:, None] * row for x, row in rows) + transform[:3, 3])
+_FLOAT: Final = 5126
+_TRIANGLES: Final = 4
+_FAN: Final = 6
+"""glTF's numbers of a type and of two modes; lower modes are points and lines."""
 
 
 def read_stl(path: Path) -> RawMesh:
@@ -197,18 +155,6 @@ def _count_pieces(model: bytes) -> int:
 def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
     if num_bytes > min(most, MAX_UNPACKED_BYTES):
         raise ValueError(f"{num_bytes / 1e6:.0f} MB of text, over {most / 1e6:.0f} MB")
-
-
-MAX_HEADER_BYTES: Final = 10_000_000
-"""Of the JSON: Python takes twenty times as much memory."""
-
-MAX_VALUES: Final = 30_000_000
-"""Numbers and vectors that primitives use: each gets a copy, of an array that others use too."""
-
-_FLOAT: Final = 5126
-_TRIANGLES: Final = 4
-_FAN: Final = 6
-"""glTF's numbers of a type and of two modes; lower modes are points and lines."""
 
 
 def read_glb(path: Path) -> RawMesh:
@@ -318,3 +264,54 @@ def _texture(
     except ValueError as error:
         raise ValueError(f"a texture that cannot be read: {error}") from error
     return np.asarray(image.convert("RGB"))
+
+
+def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
+    """Let trimesh read a file's content; without a path it can reach no other file.
+
+    Returns:
+        The meshes that it shows as one, with the unit as it names it, and their number.
+
+    Raises:
+        ValueError: A face has a vertex that its mesh has not, or there are too many triangles.
+        Exception: Whatever trimesh makes of a damaged file.
+    """
+    import trimesh  # takes a while: only for those who read such a file
+
+    # An infinite corner is named later, not in trimesh's own sums.
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
+        # numpy stops at a damaged number with nothing but this warning.
+        warnings.simplefilter("error", DeprecationWarning)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+    vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
+    uvs: list[Any] = []
+    start = num_triangles = 0
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not hasattr(mesh, "faces"):
+            continue  # lines and points
+        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+            raise ValueError(f"a face index outside of its {len(mesh.vertices)} vertices")
+        num_triangles += len(mesh.faces)
+        if num_triangles > MAX_TRIANGLES:
+            raise ValueError(f"over {MAX_TRIANGLES} triangles")
+        vertices.append(_moved(np.asarray(mesh.vertices), transform))
+        faces.append(np.asarray(mesh.faces) + start)
+        uvs.append(getattr(mesh.visual, "uv", None))
+        start += len(mesh.vertices)
+    uv = None if not uvs or any(uv is None for uv in uvs) else np.concatenate(uvs)
+    if uv is not None and uv.shape != (start, 2):
+        raise ValueError(f"{len(uv)} texture coordinates of {start} vertices")
+    unit = scene.metadata.get("units")
+    return RawMesh(np.concatenate(vertices), np.concatenate(faces), uv, unit=unit), len(uvs)
+
+
+def _moved(
+    vertices: Float[np.ndarray, "vertices 3"], transform: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "vertices 3"]:
+    if (transform == np.eye(4)).all():
+        return vertices  # as they are: a product would make NaN of an infinite one's neighbours
+    # Not a product of matrices, whose last digits depend on the processor.
+    rows = zip(vertices.T, transform[:3, :3].T, strict=True)
+    return np.asarray(sum(x[:, None] * row for x, row in rows) + transform[:3, 3])

@@ -1,6 +1,4 @@
-"""How far points lie from a surface: exact distances to triangles, the nearest found by a tree.
-
-What is measured on triangles: areas, surface samples, the largest distance, a hash.
+"""What is measured on triangles: areas, samples, the largest distance, a hash, distances from them.
 
 Lengths come out in the unit they go in. Arrays rather than a :class:`~dopepp.parts.part.Mesh`, so
 that a file's raw triangles can be measured before they are known to be a usable mesh.
@@ -20,14 +18,23 @@ from scipy.spatial.distance import cdist
 NUM_SURFACE_POINTS: Final = 2000
 """ADD points of a CAD part, a fixed number so that the results of two runs compare."""
 
+SURFACE_SEED: Final = 2000
+"""Fixed seed of the surface samples: the same mesh has the same ADD points everywhere."""
+
 _FEW_CORNERS: Final = 5000
 """Corners of a hull whose distances are all computed: a quarter of a second."""
 
 _NUM_DIRECTIONS: Final = 2500
 """Directions along which a larger hull is measured: a second for 100,000 corners."""
 
-SURFACE_SEED: Final = 2000
-"""Fixed seed of the surface samples: the same mesh has the same ADD points everywhere."""
+NUM_COVERING: Final = 60_000
+"""Surface points of a :class:`SurfaceTree` besides vertices: about 0.6 % of a compact part's
+diameter apart."""
+
+_COVERING_SEED: Final = 17
+_NUM_NEIGHBOURS: Final = 6
+"""Surface points whose triangles are measured: the nearest point's own is not always the nearest
+triangle along an edge."""
 
 
 class RawMesh(NamedTuple):
@@ -66,9 +73,16 @@ def sample_surface(
     # Without the last bound, a product that rounds up to the total still falls into a triangle.
     bounds = cumulative[:-1]
     chosen = np.searchsorted(bounds, rng.random(num_points) * cumulative[-1], side="right")
-    a, b, c = vertices[faces[chosen]].swapaxes(0, 1)
+    return _points_inside(vertices[faces[chosen]], rng)
+
+
+def _points_inside(
+    triangles: Float[np.ndarray, "triangles 3 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "triangles 3"]:
+    """Draw a point of each triangle, uniformly."""
+    a, b, c = triangles.swapaxes(0, 1)
     # √ makes the share of points between a and a parallel to bc equal to the share of area there.
-    root, along = np.sqrt(rng.random((num_points, 1))), rng.random((num_points, 1))
+    root, along = np.sqrt(rng.random((len(a), 1))), rng.random((len(a), 1))
     return np.asarray((1 - root) * a + root * (1 - along) * b + root * along * c)
 
 
@@ -131,19 +145,22 @@ def _longest_of_directions(
     Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
     least, and 2,500 directions leave φ under 2.42°.
     """
-    # A spiral from pole to equator spreads them evenly over half a sphere (the golden angle).
-    number = np.arange(_NUM_DIRECTIONS) + 0.5
-    z, turn = number / _NUM_DIRECTIONS, np.pi * (3 - np.sqrt(5)) * number
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
     # Single precision finds the extreme points as well, in half of the time.
-    directions = directions.astype(np.float32)
+    directions = half_sphere(_NUM_DIRECTIONS).astype(np.float32)
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
     for start in range(0, len(directions), 16):
         along = directions[start : start + 16] @ columns
         one, other = along.argmin(axis=1), along.argmax(axis=1)
         distances = np.linalg.norm(points[one] - points[other], axis=1)
         yield float(distances.max()), int(one[distances.argmax()])
+
+
+def half_sphere(num_directions: int) -> Float[np.ndarray, "directions 3"]:
+    """Return unit vectors spread evenly over half a sphere: a spiral by the golden angle."""
+    number = np.arange(num_directions) + 0.5
+    z, turn = number / num_directions, np.pi * (3 - np.sqrt(5)) * number
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 def hash_triangles(
@@ -168,15 +185,6 @@ def weld(
     index = np.empty(len(ranked), np.int64)
     index[order] = np.cumsum(new) - 1
     return ranked[new], index[faces]
-
-
-NUM_COVERING: Final = 60_000
-"""Surface points in the tree, besides vertices: about 0.6 % of a compact part's diameter apart."""
-
-_COVERING_SEED: Final = 17
-_NUM_NEIGHBOURS: Final = 6
-"""Surface points whose triangles are measured: the nearest point's own is not always the nearest
-triangle along an edge."""
 
 
 class SurfaceTree:
@@ -223,9 +231,7 @@ class SurfaceTree:
         cumulative = np.cumsum(self.areas)
         places = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]
         owners = np.searchsorted(cumulative[:-1], places, side="right")
-        a, b, c = self.triangles[owners].swapaxes(0, 1)
-        root, along = np.sqrt(rng.random((num_points, 1))), rng.random((num_points, 1))
-        return (1 - root) * a + root * (1 - along) * b + root * along * c, owners
+        return _points_inside(self.triangles[owners], rng), owners
 
     def nearest(
         self, points: Float[np.ndarray, "points 3"]

@@ -1,12 +1,11 @@
-"""A strict Wavefront OBJ reader: positions, faces, texture coordinates, one texture.
+"""Wavefront OBJ files: positions, faces, texture coordinates and one texture.
 
-trimesh does not read them, as a damaged line must be an error that names it: trimesh leaves out
-faces that are cut short or written with tabs, takes index 0 for a vertex and relative ones from
-the file's end, loses a texture without a word, and splits vertices where normals differ, so that
-the mesh would be another one (``tests/parts/test_library.py``). Normals, groups, smoothing, lines,
-colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its texture.
-
-Materials and textures that a mesh names: found in its folder only, read whole or not at all.
+trimesh does not read them: it leaves out faces that are cut short or written with tabs, takes
+index 0 for a vertex and relative ones from the file's end, loses a texture without a word, and
+splits vertices where normals differ, so that the mesh would be another one
+(``tests/parts/mesh/test_library.py``). Here a damaged line is an error that names it. Normals,
+groups, lines, colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its
+texture. The files that a mesh names are looked for in its own folder only.
 """
 
 from __future__ import annotations
@@ -23,104 +22,21 @@ from jaxtyping import UInt8
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, read_picture
 from dopepp.parts.mesh.measure import RawMesh
-from dopepp.parts.mesh.polygons import fans, first_folded_polygon
+from dopepp.parts.mesh.polygons import FoldedPolygonError, fans
 
 MAX_MATERIAL_BYTES: Final = 10_000_000
 """Size of a material file: a hundred thousand materials, and a bound on memory."""
 
-
-def companion_path(mesh_path: Path, name: str, field: str) -> Path:
-    """Return the path of a file that a mesh file names.
-
-    Args:
-        mesh_path: The mesh's path.
-        name: What it wrote, relative to its own folder; Windows separators are understood.
-        field: Where the name stands, for the error.
-
-    Raises:
-        UserError: The name leads out of the mesh's folder, or there is no such file.
-    """
-    folder = mesh_path.parent.resolve()
-    written = PureWindowsPath(name)  # splits at / and at \, and knows C:
-    path = (folder / written.as_posix()).resolve()
-    if written.anchor or not path.is_relative_to(folder):
-        raise UserError(
-            f"{mesh_path} whose {field} {name!r} lies outside of its folder",
-            "files in the mesh's folder or below it",
-            "copy the file beside the mesh and write its plain name",
-        )
-    if not path.is_file():
-        raise UserError(
-            f"{mesh_path} whose {field} {name!r} does not exist",
-            "a file in the mesh's folder",
-            "put the file there, or delete the line for a part without texture",
-        )
-    return path
-
-
-def read_texture(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image as RGB, first row on top.
-
-    Raises:
-        UserError: It is no image, is damaged, or is larger than 8,192 pixels a side.
-    """
-    try:
-        return read_picture(path)
-    except ValueError as error:
-        raise UserError(
-            f"texture {path}: {error}",
-            f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels",
-            "replace the image",
-        ) from error
-
-
-def read_text(path: Path) -> str:
-    """Return a text file with plain line ends; a file name in any encoding in it stays intact."""
-    return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
-
-
-def read_materials(path: Path) -> dict[str | None, str | None]:
-    """Return the file name of each MTL material's colour map, None for one without.
-
-    Raises:
-        UserError: The file is too large, or a map has options, which would change how it lies on
-            the part.
-    """
-    if path.stat().st_size > MAX_MATERIAL_BYTES:
-        raise UserError(
-            f"material file {path} of {path.stat().st_size / 1e6:.0f} MB",
-            f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB",
-            "keep only the materials that the mesh uses",
-        )
-    maps: dict[str | None, str | None] = {}
-    material: str | None = None
-    for line in read_text(path).split("\n"):
-        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
-        if keyword.lower() == "newmtl":
-            material = " ".join(rest.split())
-            maps[material] = None
-        elif keyword.lower() == "map_kd":
-            if rest.strip().startswith("-"):
-                raise UserError(
-                    f"material file {path} with map_Kd {rest.strip()!r}",
-                    "a file name without options",
-                    "bake scale and offset into the texture coordinates",
-                )
-            maps[material] = rest.strip()
-    return maps
-
-
-NO_COORDINATE = -1
+NO_COORDINATE: Final = -1
 """Index of the texture coordinate of a corner that has none."""
 
 
 @dataclass
 class ObjFile:
-    """An OBJ file's statements, indices from 0.
+    """An OBJ file's statements, indices from 0; arrays take a tenth of the memory of lists.
 
     Attributes:
-        positions: x, y, z of each ``v`` line, one after the other; arrays take a tenth of the
-            memory of lists of lists.
+        positions: x, y, z of each ``v`` line, one after the other.
         coordinates: u, v of each ``vt`` line.
         corners: Position and coordinate index of each corner of each ``f`` line.
         counts: Corners of each ``f`` line.
@@ -153,7 +69,10 @@ class ObjFile:
                 if len(words) < 3:
                     raise ValueError("a face needs at least 3 corners")
                 for word in words:
-                    self.corners.extend(self._corner(word))
+                    position, coordinate, *_ = [*word.split("/"), ""]
+                    self.corners.append(_index(position, len(self.positions) // 3))
+                    count = len(self.coordinates) // 2
+                    self.corners.append(_index(coordinate, count) if coordinate else NO_COORDINATE)
                 self.counts.append(len(words))
                 self.lines.append(number)
                 self.materials.add(self._material)
@@ -161,59 +80,6 @@ class ObjFile:
                 self._material = " ".join(words)
             case ["mtllib", *_]:
                 self.libraries.append(line.strip().removeprefix("mtllib").strip())
-
-    def _corner(self, word: str) -> tuple[int, int]:
-        position, coordinate, *_ = [*word.split("/"), ""]
-        index = _index(coordinate, len(self.coordinates) // 2) if coordinate else NO_COORDINATE
-        return _index(position, len(self.positions) // 3), index
-
-
-def read_obj(path: Path) -> RawMesh:
-    """Read an OBJ file: vertices in the file's unit, faces, and uv and texture where it has one.
-
-    A textured vertex that has several texture coordinates (on a seam) becomes several vertices.
-
-    Raises:
-        UserError: A line is damaged, a polygon is not convex, a material file or a texture is
-            missing, outside of the folder or damaged, or there is more than one texture.
-    """
-    obj = _parse(path)
-    triangles, polygons = fans(np.array(obj.counts, np.int64))
-    corners = np.array(obj.corners, np.int64).reshape(-1, 2)[triangles]
-    positions = np.array(obj.positions, np.float64).reshape(-1, 3)
-    folded = first_folded_polygon(positions, corners[..., 0], polygons)
-    if folded is not None:
-        raise UserError(
-            f"mesh {path} with a polygon that is not convex in line {obj.lines[folded]}",
-            "triangles and convex polygons",
-            "switch on 'triangulate' when exporting the mesh",
-        )
-    texture = _texture(obj, path)
-    if texture is None:
-        return RawMesh(positions, corners[..., 0])
-    if (corners[..., 1] == NO_COORDINATE).any():
-        raise UserError(
-            f"textured mesh {path} with faces without texture coordinates",
-            "texture coordinates (vt) on every face",
-            "unwrap the whole mesh, or delete its map_Kd line",
-        )
-    pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-    uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
-    return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
-
-
-def _parse(path: Path) -> ObjFile:
-    obj = ObjFile()
-    for number, line in enumerate(read_text(path).replace("\\\n", " ").split("\n"), start=1):
-        try:
-            obj.add(line, number)
-        except ValueError as error:
-            raise UserError(
-                f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})",
-                "a whole OBJ file whose faces name vertices above them",
-                "export the mesh again",
-            ) from error
-    return obj
 
 
 def _numbers(words: list[str], count: int) -> list[float]:
@@ -233,13 +99,56 @@ def _index(word: str, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
+def read_obj(path: Path) -> RawMesh:
+    """Read an OBJ file: vertices in the file's unit, faces, and uv and texture where it has one.
+
+    A textured vertex that has several texture coordinates (on a seam) becomes several vertices.
+
+    Raises:
+        UserError: A line is damaged, a polygon is not convex, a material file or a texture is
+            missing, outside of the folder or damaged, or there is more than one texture.
+    """
+    obj = ObjFile()
+    for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):
+        try:
+            obj.add(line, number)
+        except ValueError as error:
+            raise UserError(
+                f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})",
+                "a whole OBJ file whose faces name vertices above them",
+                "export the mesh again",
+            ) from error
+    positions = np.array(obj.positions, np.float64).reshape(-1, 3)
+    corners = np.array(obj.corners, np.int64).reshape(-1, 2)
+    try:
+        corners = corners[fans(positions, corners[:, 0], np.array(obj.counts, np.int64))]
+    except FoldedPolygonError as error:
+        raise UserError(
+            f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}",
+            "triangles and convex polygons",
+            "switch on 'triangulate' when exporting the mesh",
+        ) from error
+    texture = _texture(obj, path)
+    if texture is None:
+        return RawMesh(positions, corners[..., 0])
+    if (corners[..., 1] == NO_COORDINATE).any():
+        raise UserError(
+            f"textured mesh {path} with faces without texture coordinates",
+            "texture coordinates (vt) on every face",
+            "unwrap the whole mesh, or delete its map_Kd line",
+        )
+    pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
+    return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
+
+
 def _texture(obj: ObjFile, path: Path) -> UInt8[np.ndarray, "height width 3"] | None:
     """Read the one texture that the used materials name, or return None if they name none."""
     if not obj.libraries:
         return None
     maps: dict[str | None, str | None] = {None: None}
     for library in obj.libraries:
-        maps |= read_materials(companion_path(path, library, "mtllib"))
+        maps |= _colour_maps(companion_path(path, library, "mtllib"))
     unknown = sorted(name for name in obj.materials if name not in maps and name is not None)
     if unknown:
         raise UserError(
@@ -256,3 +165,82 @@ def _texture(obj: ObjFile, path: Path) -> UInt8[np.ndarray, "height width 3"] | 
         )
     name = next(iter(used), None)
     return None if name is None else read_texture(companion_path(path, name, "map_Kd"))
+
+
+def _colour_maps(path: Path) -> dict[str | None, str | None]:
+    """Return the file name of each MTL material's colour map, None for one without.
+
+    A map with options is refused, as they would change how it lies on the part.
+    """
+    if path.stat().st_size > MAX_MATERIAL_BYTES:
+        raise UserError(
+            f"material file {path} of {path.stat().st_size / 1e6:.0f} MB",
+            f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB",
+            "keep only the materials that the mesh uses",
+        )
+    maps: dict[str | None, str | None] = {}
+    material: str | None = None
+    for line in _text(path).split("\n"):
+        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
+        if keyword.lower() == "newmtl":
+            material = " ".join(rest.split())
+            maps[material] = None
+        elif keyword.lower() == "map_kd":
+            if rest.strip().startswith("-"):
+                raise UserError(
+                    f"material file {path} with map_Kd {rest.strip()!r}",
+                    "a file name without options",
+                    "bake scale and offset into the texture coordinates",
+                )
+            maps[material] = rest.strip()
+    return maps
+
+
+def _text(path: Path) -> str:
+    """Return a text file with plain line ends; a file name in any encoding in it stays intact."""
+    return path.read_bytes().decode("utf-8", "surrogateescape").replace("\r\n", "\n")
+
+
+def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
+    """Return the path of a file that a mesh file names.
+
+    Args:
+        mesh_path: The mesh's path.
+        name: What it wrote, relative to its own folder; Windows separators are understood.
+        statement: Where the name stands, for the error.
+
+    Raises:
+        UserError: The name leads out of the mesh's folder, or there is no such file.
+    """
+    folder = mesh_path.parent.resolve()
+    written = PureWindowsPath(name)  # splits at / and at \, and knows C:
+    path = (folder / written.as_posix()).resolve()
+    if written.anchor or not path.is_relative_to(folder):
+        raise UserError(
+            f"{mesh_path} whose {statement} {name!r} lies outside of its folder",
+            "files in the mesh's folder or below it",
+            "copy the file beside the mesh and write its plain name",
+        )
+    if not path.is_file():
+        raise UserError(
+            f"{mesh_path} whose {statement} {name!r} does not exist",
+            "a file in the mesh's folder",
+            "put the file there, or delete the line for a part without texture",
+        )
+    return path
+
+
+def read_texture(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Return an image as RGB, first row on top.
+
+    Raises:
+        UserError: It is no image, is damaged, or is larger than 8,192 pixels a side.
+    """
+    try:
+        return read_picture(path)
+    except ValueError as error:
+        raise UserError(
+            f"texture {path}: {error}",
+            f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels",
+            "replace the image",
+        ) from error

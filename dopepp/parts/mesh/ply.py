@@ -1,24 +1,24 @@
-"""A strict PLY reader: text and both byte orders, polygons, any further elements and properties.
+"""PLY files: text and both byte orders, polygons, any further elements and properties.
 
-trimesh does not read them, as only who reads a file's every list can tell that it is whole:
-trimesh refuses a binary file of triangles and quads, or takes it for others where their sizes
-happen to agree, and of a text that ends too early it makes a smaller mesh
-(``tests/parts/test_library.py``).
+trimesh does not read them, as only who reads a file's every list can tell that it is whole: it
+refuses a binary file of triangles and quads, or takes it for others where their sizes happen to
+agree, and of a text that ends too early it makes a smaller mesh. It would also put a quad's
+triangles in another order, and a mesh's hash is what checkpoints and render caches know it by
+(``tests/parts/mesh/test_library.py``).
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.parts.mesh.measure import RawMesh
 from dopepp.parts.mesh.obj import companion_path, read_texture
-from dopepp.parts.mesh.polygons import fans, first_folded_polygon
+from dopepp.parts.mesh.polygons import fans
 
 TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -39,23 +39,25 @@ MAX_UNEVEN_ROWS: Final = 2_000_000
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 """Names that programs give to a vertex's texture coordinates."""
 
-Columns = dict[str, NDArray[Any]]
-"""Values of each property; of a list all values in a row, and its lengths under ``NAME#``."""
+
+class Column(NamedTuple):
+    """A property: its name, the type of its numbers and, of a list, that of its length."""
+
+    name: str
+    number: np.dtype[Any]
+    length: np.dtype[Any] | None
 
 
-@dataclass(frozen=True)
-class Element:
-    """A table: vertices, faces or anything else.
-
-    Attributes:
-        name: Its name.
-        num_rows: How many rows the header promises.
-        columns: Of each property the name, its numbers' type, and that of a list's length.
-    """
+class Element(NamedTuple):
+    """A table of vertices, faces or anything else, and how many rows the header promises."""
 
     name: str
     num_rows: int
-    columns: list[tuple[str, np.dtype[Any], np.dtype[Any] | None]] = field(default_factory=list)
+    columns: list[Column]
+
+
+Table = dict[str, NDArray[Any]]
+"""Values of each property; of a list all values in a row, and its lengths under ``NAME#``."""
 
 
 def read_ply(path: Path) -> RawMesh:
@@ -68,8 +70,8 @@ def read_ply(path: Path) -> RawMesh:
     """
     header, body = _split(path.read_bytes())
     lines = [line.split() for line in header.decode("utf-8", "surrogateescape").splitlines()]
-    tables, start = {}, 0
-    is_text, elements = _parse_header(lines)
+    tables: dict[str, Table] = {}
+    start, (is_text, elements) = 0, _parse_header(lines)
     body = _doubles(body) if is_text else body
     for element in elements:
         tables[element.name], start = _read_table(body, start, element)
@@ -80,13 +82,10 @@ def read_ply(path: Path) -> RawMesh:
     if not {"x", "y", "z"} <= set(vertex) or f"{list_name}#" not in face:
         raise ValueError("no vertex table with x, y, z or no face table with vertex_indices")
     vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    triangles, polygons = fans(face[f"{list_name}#"].astype(np.int64))
-    faces = face[list_name].astype(np.int64)[triangles]
-    if (faces != face[list_name][triangles]).any():
+    corners = face[list_name].astype(np.int64)
+    if (corners != face[list_name]).any():
         raise ValueError("a vertex index that is no integer")
-    folded = first_folded_polygon(vertices, faces, polygons)
-    if folded is not None:
-        raise ValueError(f"a polygon that is not convex, face {folded}")
+    faces = corners[fans(vertices, corners, face[f"{list_name}#"].astype(np.int64))]
     names = [" ".join(words[2:]) for words in lines if words[:2] == ["comment", "TextureFile"]]
     if not names:
         return RawMesh(vertices, faces)
@@ -104,10 +103,10 @@ def _split(data: bytes) -> tuple[bytes, bytes]:
         raise ValueError("no PLY header")
     if len(header) > _MAX_HEADER_BYTES:
         raise ValueError(f"a header of {len(header)} bytes, over {_MAX_HEADER_BYTES}")
-    line_end = b"\r\n" if rest.startswith(b"\r\n") else rest[:1]
-    if line_end not in (b"\r\n", b"\n", b"\r"):
-        raise ValueError("a header without an end")
-    return header, rest[len(line_end) :]
+    for line_end in (b"\r\n", b"\n", b"\r"):
+        if rest.startswith(line_end):
+            return header, rest[len(line_end) :]
+    raise ValueError("a header without an end")
 
 
 def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
@@ -119,16 +118,17 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
     elements: list[Element] = []
     for words in lines:
         if words[:1] == ["element"]:
-            elements.append(Element(words[1], int(words[2])))
+            elements.append(Element(words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
             is_list = words[1] == "list"
             written = [order + TYPES[name] for name in words[2 if is_list else 1 : -1]]
             types = [np.dtype("<f8" if is_text else name) for name in written]
-            elements[-1].columns.append((words[-1], types[-1], types[0] if is_list else None))
-    for element in elements:
-        names = [name for name, _, _ in element.columns]
-        if element.num_rows < 0 or not names or len(set(names)) < len(names):
-            raise ValueError(f"element {element.name} with {element.num_rows} rows of {names}")
+            column = Column(words[-1], types[-1], types[0] if is_list else None)
+            elements[-1].columns.append(column)
+    for name, num_rows, columns in elements:
+        names = [column.name for column in columns]
+        if num_rows < 0 or not names or len(set(names)) < len(names):
+            raise ValueError(f"element {name} with {num_rows} rows of {names}")
     return is_text, elements
 
 
@@ -141,50 +141,46 @@ def _doubles(text: bytes) -> bytes:
     return numbers.astype("<f8").tobytes() if text.strip() else b""
 
 
-def _read_table(body: bytes, start: int, element: Element) -> tuple[Columns, int]:
+def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
     """Read a table at once if its lists are as long in every row as in the first, else by rows."""
-    promise = f"less data than {element.num_rows} rows of element {element.name}"
-    smallest = sum((n if c is None else c).itemsize for _, n, c in element.columns)
-    if start + element.num_rows * smallest > len(body):
-        raise ValueError(promise)
+    name, num_rows, columns = element
+    too_short = ValueError(f"less data than {num_rows} rows of element {name}")
+    smallest = sum((c.number if c.length is None else c.length).itemsize for c in columns)
+    if start + num_rows * smallest > len(body):
+        raise too_short
     fields: list[tuple[Any, ...]] = []
-    for name, number, count in element.columns:
-        length: tuple[int, ...] = ()
-        if count is not None:
+    for name, number, length in columns:
+        shape: tuple[int, ...] = ()
+        if length is not None:
             place = start + np.dtype(fields).itemsize
-            length = (_length(body, place, count) if element.num_rows else 0,)
-            fields.append((f"{name}#", count))
-        fields.append((name, number, length))
+            shape = (_length(body, place, length) if num_rows else 0,)
+            fields.append((f"{name}#", length))
+        fields.append((name, number, shape))
     row = np.dtype(fields)
-    end = start + element.num_rows * row.itemsize
+    end = start + num_rows * row.itemsize
     if end <= len(body):
-        rows = np.frombuffer(body, row, element.num_rows, start)
-        if all(
-            (rows[f"{n}#"] == rows[f"{n}#"][:1]).all()
-            for n, _, c in element.columns
-            if c is not None
-        ):
+        rows = np.frombuffer(body, row, num_rows, start)
+        counts = [rows[f"{c.name}#"] for c in columns if c.length is not None]
+        if all((count == count[:1]).all() for count in counts):
             return {name: rows[name].reshape(-1) for name in row.names or ()}, end
-    if element.num_rows > MAX_UNEVEN_ROWS:
+    if num_rows > MAX_UNEVEN_ROWS:
         raise ValueError(f"over {MAX_UNEVEN_ROWS} rows with lists of different lengths")
-    pieces: dict[str, list[bytes]] = {name: [] for name, _, _ in element.columns}
-    lengths: dict[str, list[int]] = {
-        f"{name}#": [] for name, _, c in element.columns if c is not None
-    }
-    for _ in range(element.num_rows):
-        for name, number, count in element.columns:
+    values: dict[str, list[bytes]] = {c.name: [] for c in columns}
+    lengths: dict[str, list[int]] = {f"{c.name}#": [] for c in columns if c.length is not None}
+    for _ in range(num_rows):
+        for name, number, length in columns:
             num_values = 1
-            if count is not None:
-                num_values = _length(body, start, count)
+            if length is not None:
+                num_values = _length(body, start, length)
                 lengths[f"{name}#"].append(num_values)
-                start += count.itemsize
+                start += length.itemsize
             end = start + num_values * number.itemsize
             if end > len(body):
-                raise ValueError(promise)
-            pieces[name].append(body[start:end])
+                raise too_short
+            values[name].append(body[start:end])
             start = end
-    columns = {n: np.frombuffer(b"".join(pieces[n]), number) for n, number, _ in element.columns}
-    return columns | {name: np.array(counts) for name, counts in lengths.items()}, start
+    table = {c.name: np.frombuffer(b"".join(values[c.name]), c.number) for c in columns}
+    return table | {name: np.array(counts) for name, counts in lengths.items()}, start
 
 
 def _length(body: bytes, start: int, kind: np.dtype[Any]) -> int:

@@ -1,9 +1,7 @@
-"""OFF files: text of vertices and polygons.
+"""Polygons cut into triangles, and OFF files, which hold nothing else.
 
-trimesh does not read them: of a file that is cut short it makes a smaller mesh, and with numpy 2 it
-fails at polygons of more than four corners (``tests/parts/test_library.py``).
-
-Polygons of a mesh file: cut into fans of triangles, where a fan is the polygon's area.
+trimesh does not read OFF files: of one that is cut short it makes a smaller mesh, and it fails at
+polygons of more than four corners (``tests/parts/mesh/test_library.py``).
 """
 
 from __future__ import annotations
@@ -13,70 +11,20 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dopepp.parts.mesh.measure import RawMesh
 
-
-def fans(
-    counts: Int[np.ndarray, " polygons"],
-) -> tuple[Int[np.ndarray, "triangles 3"], Int[np.ndarray, " triangles"]]:
-    """Cut polygons into fans around their first corner.
-
-    Args:
-        counts: Corners of each polygon.
-
-    Returns:
-        Triangles as places in the row of all polygons' corners; the polygon each is cut from.
-
-    Raises:
-        ValueError: A polygon has fewer than three corners.
-    """
-    if (counts < 3).any():
-        raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")
-    polygons = np.repeat(np.arange(len(counts)), counts - 2)
-    first = (np.cumsum(counts) - counts)[polygons]
-    # The how-many-th triangle of its polygon each one is.
-    turn = np.arange(len(polygons)) - (np.cumsum(counts - 2) - (counts - 2))[polygons]
-    return np.stack([first, first + turn + 1, first + turn + 2], axis=1), polygons
-
-
-def first_folded_polygon(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    polygons: Int[np.ndarray, " faces"],
-) -> int | None:
-    """Return a polygon whose fan of triangles folds over, so that it is not the polygon's area.
-
-    Args:
-        vertices: Positions.
-        faces: The fans' triangles.
-        polygons: The polygon each triangle was cut from.
-
-    Returns:
-        The first such polygon's number in ``polygons``; None where there is none, or where a face
-        has a vertex that is not there, which is the caller's to name.
-    """
-    polygon_ids, index = np.unique(polygons, return_inverse=True)
-    if len(polygon_ids) == len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
-        return None
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    normals = np.cross(b - a, c - a)
-    totals = np.zeros((len(polygon_ids), 3))
-    np.add.at(totals, index, normals)
-    alignment = np.einsum("fi,fi->f", normals, totals[index])
-    # A triangle that is flat but for rounding may point anywhere.
-    folded = alignment < -1e-9 * np.einsum("pi,pi->p", totals, totals)[index]
-    # A bow tie's two halves cancel out.
-    parts = np.bincount(index, np.einsum("fi,fi->f", normals, normals))
-    cancelled = np.einsum("pi,pi->p", totals, totals) <= 1e-9 * parts
-    tiny = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
-    folded |= (cancelled & (parts > tiny * tiny))[index]
-    return int(polygons[folded.argmax()]) if folded.any() else None
-
-
 MAX_BYTES: Final = 50_000_000
-"""Its words take fifteen times as much memory."""
+"""Of an OFF file: its words take fifteen times as much memory."""
+
+
+class FoldedPolygonError(ValueError):
+    """The polygon of a number, from 0, is not convex: its fan of triangles is not its area."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"a polygon that is not convex, face {number}")
+        self.number = number
 
 
 def read_off(path: Path) -> RawMesh:
@@ -103,9 +51,60 @@ def read_off(path: Path) -> RawMesh:
     for number, (count, *corners) in enumerate(polygons):
         if len(corners) != count:
             raise ValueError(f"face {number} of {count} corners, {len(corners)} in its line")
-    triangles, index = fans(np.array([count for count, *_ in polygons], np.int64))
-    faces = np.array([i for _, *corners in polygons for i in corners], np.int64)[triangles]
-    folded = first_folded_polygon(vertices, faces, index)
-    if folded is not None:
-        raise ValueError(f"a polygon that is not convex, face {folded}")
-    return RawMesh(vertices, faces)
+    counts = np.array([count for count, *_ in polygons], np.int64)
+    row_of_corners = np.array([i for _, *corners in polygons for i in corners], np.int64)
+    return RawMesh(vertices, row_of_corners[fans(vertices, row_of_corners, counts)])
+
+
+def fans(
+    vertices: Float[np.ndarray, "vertices 3"],
+    corners: Int[np.ndarray, " corners"],
+    counts: Int[np.ndarray, " polygons"],
+) -> Int[np.ndarray, "triangles 3"]:
+    """Cut polygons into fans of triangles around their first corners.
+
+    Args:
+        vertices: Positions.
+        corners: The vertex at each corner, one polygon behind the other.
+        counts: Corners of each polygon.
+
+    Returns:
+        Triangles, each as three places in ``corners``.
+
+    Raises:
+        ValueError: A polygon has fewer than three corners or, as a :class:`FoldedPolygonError`, is
+            not convex. A vertex that is not there is the caller's to name.
+    """
+    if (counts < 3).any():
+        raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")
+    polygons = np.repeat(np.arange(len(counts)), counts - 2)
+    first = (np.cumsum(counts) - counts)[polygons]
+    # The how-many-th triangle of its polygon each one is.
+    turn = np.arange(len(polygons)) - (np.cumsum(counts - 2) - (counts - 2))[polygons]
+    triangles = np.stack([first, first + turn + 1, first + turn + 2], axis=1)
+    faces = corners[triangles]
+    if (counts > 3).any() and 0 <= faces.min() <= faces.max() < len(vertices):
+        folded = _folded(vertices, faces, polygons)
+        if folded.any():
+            raise FoldedPolygonError(int(polygons[folded.argmax()]))
+    return triangles
+
+
+def _folded(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    polygons: Int[np.ndarray, " faces"],
+) -> Bool[np.ndarray, " faces"]:
+    """Tell triangles that face against their polygon, or whose polygon cancels out."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    totals = np.zeros((int(polygons[-1]) + 1, 3))
+    np.add.at(totals, polygons, normals)
+    squared = np.einsum("pi,pi->p", totals, totals)
+    # A triangle that is flat but for rounding may point anywhere.
+    folded = np.einsum("fi,fi->f", normals, totals[polygons]) < -1e-9 * squared[polygons]
+    # A bow tie's two halves cancel out.
+    parts = np.bincount(polygons, np.einsum("fi,fi->f", normals, normals))
+    tiny = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
+    cancelled = (squared <= 1e-9 * parts) & (parts > tiny * tiny)
+    return np.asarray(folded | cancelled[polygons])

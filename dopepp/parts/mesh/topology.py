@@ -78,9 +78,9 @@ def opposed_faces(
     turned = np.zeros(len(faces), bool)
     if topology.opposed.any():
         turned = _minority(face_areas(vertices, faces), topology)
-    if topology.is_closed and _volume(vertices, turn_over(faces, turned)) < 0:
-        turned = ~turned
     if topology.is_closed:
+        if _signed_volumes(vertices, turn_over(faces, turned)).sum() < 0:
+            turned = ~turned
         turned ^= _inverted_bodies(vertices, turn_over(faces, turned), topology)
     return turned
 
@@ -131,11 +131,6 @@ def _inverted_bodies(
         around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
         inverted[body] = not around.any()
     return np.asarray(inverted[bodies])
-
-
-def _volume(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> float:
-    """Return the volume inside a closed surface, negative if it faces inwards."""
-    return float(_signed_volumes(vertices, faces).sum())
 
 
 def _signed_volumes(

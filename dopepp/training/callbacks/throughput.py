@@ -11,14 +11,13 @@ import time
 from collections.abc import Iterable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.profilers import Profiler, PyTorchProfiler, SimpleProfiler
 from torch.profiler import profile
 
-from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
 
 _log = logging.getLogger(__name__)
@@ -172,25 +171,18 @@ class Operators(PyTorchProfiler):
         )
 
 
-def make_profiler(kind: object, run_dir: Path) -> Profiler | None:
+def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
     """Build the profiler that ``trainer.profiler`` names.
 
     Args:
         kind: ``simple`` (hooks of the training loop), ``pytorch`` (operators, a few steps) or None.
         run_dir: The run's folder.
-
-    Raises:
-        UserError: It is something else.
     """
     if kind is None:
         return None
     if kind == "simple":
         return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
-    if kind == "pytorch":
-        return Operators(run_dir / FOLDER)
-    raise UserError(
-        f"trainer.profiler={kind!r:.100}", "null, simple, pytorch", "choose one of them"
-    )
+    return Operators(run_dir / FOLDER)
 
 
 def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:

@@ -141,7 +141,9 @@ class LastCheckpoint(Checkpoint):
         self._stop.end()
         self._save(trainer, resume_point.between_epochs)
         if trainer.is_global_zero:
-            _files(trainer).finish()
+            files = trainer.strategy.checkpoint_io
+            assert isinstance(files, AtomicCheckpointIO)
+            files.finish()
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -276,9 +278,3 @@ def _forget_later_best(trainer: Trainer) -> None:
     best.best_k_models, best.kth_value = {}, fresh.kth_value
     best.best_model_path = best.kth_best_model_path = ""
     best.best_model_score = None
-
-
-def _files(trainer: Trainer) -> AtomicCheckpointIO:
-    files = trainer.strategy.checkpoint_io
-    assert isinstance(files, AtomicCheckpointIO)
-    return files

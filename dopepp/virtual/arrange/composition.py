@@ -1,15 +1,12 @@
 """A scene in the making: what is in it so far, and whether one more object fits.
 
-A small depth image of the scene so far: does one more object leave every target visible?
-
-Each object is drawn once, alone; trying another costs that one object, not the whole scene.
+Whether every target stays visible is told by a small depth image of the objects so far. Each object
+is drawn once, alone; trying another costs that one object, not the whole scene.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,15 +14,18 @@ from jaxtyping import Float, Float32
 
 from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.virtual.arrange.body import Body
+from dopepp.virtual.body import Body
 from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.renderers.raster.visibility import (
-    CENTRE_SAMPLE,
-    bounds,
-    project_vertices,
-    rasterise,
+    Box,
+    centres_within,
+    draw_alone,
+    project_object,
 )
 from dopepp.virtual.scene import NEAR, Material, SceneObject
+
+_SMALLEST_PX: Final = 2.0
+"""A target whose image is smaller than this both ways is not shown by any camera."""
 
 _WIDTH_PX: Final = 160
 """Width of the depth image; smaller images are looked at as they are."""
@@ -35,105 +35,6 @@ _WIDEST: Final = 4.0
 
 _MARGIN: Final = 0.03
 """Added to the smallest visible fraction, because coarse pixels are counted."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Layer:
-    """One object's depth image, on a canvas as large as the object needs.
-
-    Attributes:
-        inverse_depth: 1/m, 0 where the object is not.
-        left: Column of the frame at the canvas's first column.
-        top: Row of the frame at the canvas's first row.
-        num_px: Pixels of the whole silhouette.
-    """
-
-    inverse_depth: Float32[np.ndarray, "rows columns"]
-    left: int
-    top: int
-    num_px: int
-
-
-class Preview:
-    """The objects accepted so far, seen coarsely.
-
-    Args:
-        K: Camera matrix of the image, pixels.
-        size: Image (width, height), pixels.
-        min_visible: Smallest visible fraction of every target.
-    """
-
-    def __init__(
-        self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], min_visible: float
-    ) -> None:
-        scale = min(_WIDTH_PX / size[0], 1.0)
-        self._width, self._height = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
-        self._K = resize_camera(K, self._width / size[0], self._height / size[1])
-        self._least = min_visible + _MARGIN
-        self._nearest = np.zeros((self._height, self._width), np.float32)
-        self._owners = np.full((self._height, self._width), -1, np.int64)
-        self._visible: list[int] = []
-        self._needed: list[float] = []
-
-    def add(self, item: SceneObject) -> bool:
-        """Add an object if every target, itself included, stays visible enough.
-
-        Returns:
-            Whether it was added; if not, nothing has changed.
-        """
-        layer = self._draw(item)
-        if layer is None or (item.is_target and layer.num_px == 0):
-            return False
-        frame, canvas = self._overlap(layer)
-        drawn, nearest = layer.inverse_depth[canvas], self._nearest[frame]
-        # At equal depth the first stays, as in the renderer.
-        in_front = drawn > nearest
-        hidden = self._owners[frame][in_front]
-        losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
-        left = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
-        own = int(np.count_nonzero(in_front))
-        needed = self._least * layer.num_px if item.is_target else 0.0
-        if own < needed or any(px < least for px, least in zip(left, self._needed, strict=True)):
-            return False
-        nearest[in_front] = drawn[in_front]
-        self._owners[frame][in_front] = len(left)
-        self._visible = [*left, own]
-        self._needed.append(needed)
-        return True
-
-    def _overlap(self, layer: _Layer) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Return the common pixels of frame and layer, as slices of either."""
-        rows, columns = layer.inverse_depth.shape
-        top, bottom = max(layer.top, 0), min(layer.top + rows, self._height)
-        left, right = max(layer.left, 0), min(layer.left + columns, self._width)
-        bottom, right = max(bottom, top), max(right, left)
-        frame = slice(top, bottom), slice(left, right)
-        canvas = (
-            slice(top - layer.top, bottom - layer.top),
-            slice(left - layer.left, right - layer.left),
-        )
-        return frame, canvas
-
-    def _draw(self, item: SceneObject) -> _Layer | None:
-        """Draw an object alone; None if it reaches the camera or is far larger than the frame."""
-        surface = item.surface
-        cam, hom = np.empty_like(surface.vertices), np.empty_like(surface.vertices)
-        project_vertices(surface.vertices, item.T_cam_obj, self._K, cam, hom)
-        left, top, right, bottom = bounds(hom, NEAR)
-        if not max(right - left, bottom - top) <= _WIDEST * max(self._width, self._height):
-            return None
-        x0, y0 = math.ceil(left), math.ceil(top)
-        shape = (max(math.floor(bottom) - y0 + 1, 0), max(math.floor(right) - x0 + 1, 0), 1)
-        canvas, ids = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-        if canvas.size:
-            rasterise(
-                hom, surface.faces, surface.closed, NEAR, (x0, y0), CENTRE_SAMPLE, canvas, ids, 0
-            )
-        return _Layer(canvas[..., 0], x0, y0, int(np.count_nonzero(canvas)))
-
-
-_SMALLEST_PX: Final = 2.0
-"""A target whose image is smaller than this both ways is not shown by any camera."""
 
 
 class Composition:
@@ -195,3 +96,71 @@ class Composition:
             if not ((centre >= -0.5) & (centre < np.array(self.size) - 0.5)).all():
                 return False
         return bool(np.ptp(project(extremes, self.K), axis=0).max() >= _SMALLEST_PX)
+
+
+class Preview:
+    """The objects accepted so far, seen coarsely.
+
+    Args:
+        K: Camera matrix of the image, pixels.
+        size: Image (width, height), pixels.
+        min_visible: Smallest visible fraction of every target.
+    """
+
+    def __init__(
+        self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], min_visible: float
+    ) -> None:
+        scale = min(_WIDTH_PX / size[0], 1.0)
+        self._width, self._height = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+        self._K = resize_camera(K, self._width / size[0], self._height / size[1])
+        self._least = min_visible + _MARGIN
+        self._nearest = np.zeros((self._height, self._width), np.float32)
+        self._owners = np.full((self._height, self._width), -1, np.int64)
+        self._visible: list[int] = []
+        self._needed: list[float] = []
+
+    def add(self, item: SceneObject) -> bool:
+        """Add an object if every target, itself included, stays visible enough.
+
+        Returns:
+            Whether it was added; if not, nothing has changed.
+        """
+        layer = self._draw(item)
+        if layer is None:
+            return False
+        box, inverse_depth = layer
+        whole = int(np.count_nonzero(inverse_depth))
+        if item.is_target and whole == 0:
+            return False
+        frame, canvas = self._overlap(box)
+        drawn, nearest = inverse_depth[canvas], self._nearest[frame]
+        # At equal depth the first stays, as in the renderer.
+        in_front = drawn > nearest
+        hidden = self._owners[frame][in_front]
+        losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
+        left = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
+        own = int(np.count_nonzero(in_front))
+        needed = self._least * whole if item.is_target else 0.0
+        if own < needed or any(px < least for px, least in zip(left, self._needed, strict=True)):
+            return False
+        nearest[in_front] = drawn[in_front]
+        self._owners[frame][in_front] = len(left)
+        self._visible = [*left, own]
+        self._needed.append(needed)
+        return True
+
+    def _draw(self, item: SceneObject) -> tuple[Box, Float32[np.ndarray, "rows columns"]] | None:
+        """Draw an object alone; None if it reaches the camera or is far larger than the frame."""
+        seen = project_object(item, self._K)
+        left, top, right, bottom = seen.extent
+        if not max(right - left, bottom - top) <= _WIDEST * max(self._width, self._height):
+            return None
+        box = centres_within(seen.extent)
+        return box, draw_alone(item, seen.hom, box)[0]
+
+    def _overlap(self, box: Box) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Return the pixels of a box within the frame, as slices of the frame and of the box."""
+        left, top = max(box[0], 0), max(box[1], 0)
+        right, bottom = max(min(box[2], self._width), left), max(min(box[3], self._height), top)
+        canvas = slice(top - box[1], bottom - box[1]), slice(left - box[0], right - box[0])
+        return (slice(top, bottom), slice(left, right)), canvas

@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.rotation import random_rotation
-from dopepp.virtual.arrange.body import Body
 from dopepp.virtual.arrange.composition import Composition
+from dopepp.virtual.body import Body
 from dopepp.virtual.scene import NEAR, SceneObject
 
 _TARGET_TRIES: Final = 200

@@ -1,11 +1,10 @@
 """Random scenes: from a preset, bodies and a generator to one :class:`Scene`.
 
-The same scene from nearer or farther: the camera moves, the world stays (paper Fig. 11).
-
-The camera goes along the ray to the middle of the targets and keeps its orientation and its lens.
-So a single part stays at its place in the image and grows about as a picture of it would. Objects,
-lamps and the plane keep their places in the world; light from everywhere, and the picture behind
-objects in mid-air, are infinitely far away and do not change.
+A scale shows the same scene from nearer or farther: the camera moves, the world stays (paper Fig.
+11). The camera goes along the ray to the middle of the targets and keeps its orientation and its
+lens. So a single part stays at its place in the image and grows about as a picture of it would.
+Objects, lamps and the plane keep their places in the world; light from everywhere, and the picture
+behind objects in mid-air, are infinitely far away and do not change.
 """
 
 from __future__ import annotations
@@ -17,64 +16,16 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import transform
+from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.virtual.arrange.body import Body
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.arrange.floating import arrange_floating
 from dopepp.virtual.arrange.tabletop import arrange_on_table
 from dopepp.virtual.backgrounds import Backgrounds
+from dopepp.virtual.body import Body
 from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.presets.table import plane_of
-from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
-
-
-def approach(objects: Sequence[SceneObject], scale: float) -> Float[np.ndarray, "3"]:
-    """Return by how much the world moves in the camera frame, metres.
-
-    Args:
-        objects: What is in the scene; without a target the camera stays where it is.
-        scale: How many times as large the targets are to appear: the distance from the camera to
-            the mean of their cuboids' centres is divided by it. Positive.
-    """
-    centres = [
-        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
-        for item in objects
-        if item.part is not None
-    ]
-    if not centres or scale == 1:
-        return np.zeros(3)
-    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
-
-
-def moved(
-    T_cam: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Return the pose of something that moves by ``shift`` in the camera frame."""
-    T = np.array(T_cam, np.float64)
-    T[:3, 3] += shift
-    return T
-
-
-def moved_objects(
-    objects: Iterable[SceneObject], shift: Float[np.ndarray, "3"]
-) -> tuple[SceneObject, ...]:
-    """Return objects after the move, without those that the camera has reached or passed."""
-    there = (replace(item, T_cam_obj=moved(item.T_cam_obj, shift)) for item in objects)
-    return tuple(
-        item for item in there if transform(item.T_cam_obj, item.surface.hull)[:, 2].min() > NEAR
-    )
-
-
-def moved_lights(lights: Iterable[Light], shift: Float[np.ndarray, "3"]) -> tuple[Light, ...]:
-    """Return lamps after the move; how strongly they light the scene stays the same."""
-    x, y, z = (float(value) for value in shift)
-    return tuple(
-        replace(
-            light, position=(light.position[0] + x, light.position[1] + y, light.position[2] + z)
-        )
-        for light in lights
-    )
+from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject, triple
 
 
 def random_scene(
@@ -118,38 +69,64 @@ def random_scene(
         picture = preset.table.draw_picture(
             rng, backgrounds, composition.K, composition.size, T_cam_table
         )
-        T_cam_table = moved(T_cam_table, shift)
+        T_cam_table = _moved(T_cam_table, shift)
         plane = plane_of(T_cam_table)
         if plane.offset >= 0:
-            raise _below_table(scale)
+            raise UserError(
+                f"scale {scale:g} of a scene whose parts reach higher than the camera",
+                "a scale at which the camera is above the table",
+                "choose a larger scale",
+            )
         background = picture.seen(composition.K, composition.size, T_cam_table)
     if chosen and not any(item.is_target for item in composition.objects):
-        raise _unshowable(chosen[0], preset)
+        part = chosen[0].part
+        assert part is not None
+        raise UserError(
+            f"part {part.name} of diameter {part.diameter:.3g} m, which found no place in any draw "
+            f"of preset {preset.name}",
+            "a part that the preset's distances and field of view can show",
+            "check the mesh's unit, or replace the preset's distances or field of view",
+        )
+    objects = _moved_objects(composition.objects, shift)
+    lights = tuple(_moved_light(light, shift) for light in lights)
     sensor = preset.sensors.draw(rng)
-    return Scene(
-        composition.K,
-        background,
-        moved_objects(composition.objects, shift),
-        moved_lights(lights, shift),
-        ambient,
-        plane,
-        sensor,
+    return Scene(composition.K, background, objects, lights, ambient, plane, sensor)
+
+
+def approach(objects: Sequence[SceneObject], scale: float) -> Float[np.ndarray, "3"]:
+    """Return by how much the world moves in the camera frame, metres.
+
+    Args:
+        objects: What is in the scene; without a target the camera stays where it is.
+        scale: How many times as large the targets are to appear: the distance from the camera to
+            the mean of their cuboids' centres is divided by it. Positive.
+    """
+    centres = [
+        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
+        for item in objects
+        if item.part is not None
+    ]
+    if not centres or scale == 1:
+        return np.zeros(3)
+    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
+
+
+def _moved_objects(
+    objects: Iterable[SceneObject], shift: Float[np.ndarray, "3"]
+) -> tuple[SceneObject, ...]:
+    """Return objects after the move, without those that the camera has reached or passed."""
+    there = (replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in objects)
+    return tuple(
+        item for item in there if transform(item.T_cam_obj, item.surface.hull)[:, 2].min() > NEAR
     )
 
 
-def _below_table(scale: float) -> UserError:
-    return UserError(
-        f"scale {scale:g} of a scene whose parts reach higher than the camera",
-        "a scale at which the camera is above the table",
-        "choose a larger scale",
-    )
+def _moved_light(light: Light, shift: Float[np.ndarray, "3"]) -> Light:
+    """Return a lamp after the move; how strongly it lights the scene stays the same."""
+    return replace(light, position=triple(np.array(light.position) + shift))
 
 
-def _unshowable(body: Body, preset: Preset) -> UserError:
-    assert body.part is not None
-    return UserError(
-        f"part {body.part.name} of diameter {body.part.diameter:.3g} m, which found no place in "
-        f"any draw of preset {preset.name}",
-        "a part that the preset's distances and field of view can show",
-        "check the mesh's unit, or replace the preset's distances or field of view",
-    )
+def _moved(
+    T_cam: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)

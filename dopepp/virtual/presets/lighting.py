@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.checks import check_counts, check_number, check_range
-from dopepp.virtual.scene import Ambient, Light
+from dopepp.virtual.scene import Ambient, Light, triple
 
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 """Luminance of linear sRGB (BT.709)."""
@@ -91,14 +91,14 @@ class Lighting:
             reach = far * rng.uniform(*self.distance)
             position = centre + reach * _in_cap(rng, towards, self.max_angle_deg)
             strength = rng.uniform(*(self.fill_intensity if number else self.key_intensity))
-            lights.append(Light(_triple(position), _triple(strength * self._colour(rng)), reach))
+            lights.append(Light(triple(position), triple(strength * self._colour(rng)), reach))
         if normal is None:
             # Mostly from above and from behind the camera, as in a room.
             towards = rng.normal(size=3) + np.array([0.0, -1.5, -0.5])
             towards = towards / np.linalg.norm(towards)
         above = rng.uniform(*self.ambient_intensity) * self._colour(rng)
         below = above * rng.uniform(*self.ground_share)
-        return tuple(lights), Ambient(_triple(towards), _triple(above), _triple(below))
+        return tuple(lights), Ambient(triple(towards), triple(above), triple(below))
 
     def _colour(self, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
         """Draw the linear RGB of a lamp of luminance about 1."""
@@ -141,7 +141,3 @@ def _in_cap(
     across /= np.linalg.norm(across)
     around = np.cos(azimuth) * across + np.sin(azimuth) * np.cross(axis, across)
     return np.asarray(cosine * axis + sine * around)
-
-
-def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])

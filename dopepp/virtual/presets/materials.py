@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.checks import check_number, check_range
-from dopepp.virtual.scene import Grooves, Material
+from dopepp.virtual.scene import Grooves, Material, Triple, triple
 from dopepp.virtual.surface import Surface
 
 _GREY_CAST: Final = 0.05
@@ -112,13 +112,9 @@ class Materials:
                 slope=rng.uniform(*self.brush_slope),
                 irregularity=1.0,
             )
+        roughness = rng.uniform(*self.metal_roughness)
         return Material(
-            colour,
-            roughness=rng.uniform(*self.metal_roughness),
-            metallic=1.0,
-            noise=noise,
-            noise_pitch=pitch,
-            grooves=grooves,
+            colour, roughness, metallic=1.0, noise=noise, noise_pitch=pitch, grooves=grooves
         )
 
     def _dielectric(
@@ -135,34 +131,27 @@ class Materials:
                 pitch=rng.uniform(*self.layer_pitch),
                 slope=rng.uniform(*self.layer_slope),
             )
+        roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
         return Material(
-            colour,
-            roughness=rng.uniform(*self.roughness),
-            specular=rng.uniform(*self.specular),
-            noise=noise,
-            noise_pitch=pitch,
-            grooves=grooves,
+            colour, roughness, specular, noise=noise, noise_pitch=pitch, grooves=grooves
         )
 
-    def _colour(self, rng: np.random.Generator, brightness: float) -> tuple[float, float, float]:
+    def _colour(self, rng: np.random.Generator, brightness: float) -> Triple:
         """Draw the linear albedo of a random hue whose brightest channel is given."""
         srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
-        red, green, blue = (float(brightness * channel**_DISPLAY_POWER) for channel in srgb)
-        return red, green, blue
+        return triple(brightness * channel**_DISPLAY_POWER for channel in srgb)
 
 
-def _grey(rng: np.random.Generator, brightness: float) -> tuple[float, float, float]:
-    channels = np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0)
-    return float(channels[0]), float(channels[1]), float(channels[2])
+def _grey(rng: np.random.Generator, brightness: float) -> Triple:
+    return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
-def _build_axis(rng: np.random.Generator, surface: Surface) -> tuple[float, float, float]:
+def _build_axis(rng: np.random.Generator, surface: Surface) -> Triple:
     """Draw the axis a print was built up along: two times of three the thinnest, as slicers lay."""
     extents: Float[np.ndarray, "3"] = np.ptp(surface.hull, axis=0)
     thinnest = rng.random() < 2 / 3
     return _unit_axis(int(extents.argmin()) if thinnest else int(rng.integers(3)))
 
 
-def _unit_axis(number: int) -> tuple[float, float, float]:
-    x, y, z = (float(number == axis) for axis in range(3))
-    return x, y, z
+def _unit_axis(number: int) -> Triple:
+    return triple(number == axis for axis in range(3))

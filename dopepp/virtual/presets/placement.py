@@ -17,6 +17,10 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import project
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 
+Vector = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "3 3"]
+Points = Float[np.ndarray, "points 3"]
+
 _CENTRING_STEPS: Final = 10
 _CENTRED_PX: Final = 0.05
 """Perspective moves a tilted part's box off its centre's image; a few steps bring it back."""
@@ -35,7 +39,7 @@ FACING: Final = np.diag([1.0, -1.0, -1.0])
 class Turning(Protocol):
     """Draws a target's orientation."""
 
-    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    def draw(self, rng: np.random.Generator) -> Matrix:
         """Return a rotation from the object to the camera frame."""
 
 
@@ -43,12 +47,8 @@ class Placement(Protocol):
     """Draws a target's position."""
 
     def draw(
-        self,
-        rng: np.random.Generator,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        rotated_hull: Float[np.ndarray, "hull 3"],
-    ) -> Float[np.ndarray, "3"]:
+        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+    ) -> Vector:
         """Return the object's origin in the camera frame, metres.
 
         Args:
@@ -58,9 +58,7 @@ class Placement(Protocol):
             rotated_hull: The object's extreme vertices, already turned into camera axes, metres.
         """
 
-    def redraw(
-        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "3"] | None:
+    def redraw(self, rng: np.random.Generator, place: Vector) -> Vector | None:
         """Return what to try after a place at which the object is not well in the frame.
 
         What a placement keeps of such a place has the distribution it was drawn from, however often
@@ -80,7 +78,7 @@ class Placement(Protocol):
 class FreeTurning:
     """Any rotation, uniform over SO(3)."""
 
-    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    def draw(self, rng: np.random.Generator) -> Matrix:
         """Return a rotation from the object to the camera frame."""
         return random_rotation(rng)
 
@@ -105,7 +103,7 @@ class FacingTurning:
         for name in ("in_plane_deg", "tilt_deg"):
             check_number(self, name, 0.0, 180.0, "degrees")
 
-    def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    def draw(self, rng: np.random.Generator) -> Matrix:
         """Return a rotation from the object to the camera frame."""
         in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
         tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
@@ -145,19 +143,13 @@ class OffsetPlacement(Placement):
             )
 
     def draw(
-        self,
-        rng: np.random.Generator,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        rotated_hull: Float[np.ndarray, "hull 3"],
-    ) -> Float[np.ndarray, "3"]:
+        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+    ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
-    def redraw(
-        self, rng: np.random.Generator, place: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "3"]:
+    def redraw(self, rng: np.random.Generator, place: Vector) -> Vector:
         """Return the same offsets across the optical axis at another depth, metres."""
         return np.array([place[0], place[1], self._draw_depth(rng)])
 
@@ -192,12 +184,8 @@ class DistancePlacement(Placement):
             )
 
     def draw(
-        self,
-        rng: np.random.Generator,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        rotated_hull: Float[np.ndarray, "hull 3"],
-    ) -> Float[np.ndarray, "3"]:
+        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+    ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
         pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
@@ -231,12 +219,8 @@ class FillPlacement(Placement):
             )
 
     def draw(
-        self,
-        rng: np.random.Generator,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        rotated_hull: Float[np.ndarray, "hull 3"],
-    ) -> Float[np.ndarray, "3"]:
+        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+    ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)
@@ -257,11 +241,7 @@ class FillPlacement(Placement):
 
 
 def _depth_that_fills(
-    share: float,
-    ray: Float[np.ndarray, "3"],
-    K: Float[np.ndarray, "3 3"],
-    size: tuple[int, int],
-    centred_hull: Float[np.ndarray, "hull 3"],
+    share: float, ray: Vector, K: Matrix, size: tuple[int, int], centred_hull: Points
 ) -> float:
     """Find the depth on a ray at which the hull's bounding box fills a share of the image."""
     closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)

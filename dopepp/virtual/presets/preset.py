@@ -1,9 +1,8 @@
-"""A preset with some of its fields changed by plain values, as a config gives them.
+"""Named, typed descriptions of random scenes; every range has its unit in its name or docstring.
 
-Named, typed descriptions of random scenes; every range has its unit in its name or docstring.
-
-To change one, use :func:`dataclasses.replace` (and :meth:`Preset.resized` for the image size); to
-add one, put a :class:`Preset` into ``PRESETS``.
+To change one, use :func:`dataclasses.replace` (and :meth:`Preset.resized` for the image size), or
+:func:`customised_preset` with plain values, as a config gives them. To add one, put a
+:class:`Preset` into :data:`PRESETS`.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
@@ -36,7 +35,7 @@ from dopepp.virtual.presets.placement import (
 from dopepp.virtual.presets.table import Table
 from dopepp.virtual.sensor import Sensors
 
-__all__ = ["PRESETS", "Distractors", "Lighting", "Materials", "Preset", "Sensors", "Table"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -176,14 +175,11 @@ PRESETS: dict[str, Preset] = {
 """The scenes to choose from, by name."""
 
 
-T = TypeVar("T")
-
-
 def customised_preset(name: str, changes: Mapping[str, Any]) -> Preset:
     """Return a preset by name, with nested fields replaced.
 
     Args:
-        name: Key of :data:`~dopepp.virtual.presets.preset.PRESETS`.
+        name: Key of :data:`PRESETS`.
         changes: Field to value; for a field that is itself a group of fields, a mapping, e.g.
             ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the
             preset lacks (``table`` of ``paper``) starts from its defaults; None takes it away.
@@ -201,14 +197,12 @@ def _changed(described: T, changes: Any, where: str) -> T:
     """Replace fields of a dataclass, going down into those that are dataclasses."""
     if not isinstance(changes, Mapping):
         raise UserError(f"{changes!r} for {where}", "a mapping of fields to values", "nest it")
-    known = {entry.name: getattr(described, entry.name) for entry in fields(described)}  # type: ignore[arg-type]
     hints = get_type_hints(type(described))
     values = {}
     for key, value in changes.items():
-        if key not in known:
-            raise UserError(f"{key!r} in {where}", ", ".join(known), "correct the field's name")
-        place = f"{key} of {where}"
-        values[key] = _converted(value, hints[key], known[key], place)
+        if key not in hints:
+            raise UserError(f"{key!r} in {where}", ", ".join(hints), "correct the field's name")
+        values[key] = _converted(value, hints[key], getattr(described, key), f"{key} of {where}")
     return replace(described, **values)  # type: ignore[type-var]
 
 

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, UInt8
 from dopepp.core.checks import check_flag, check_number, check_range
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.virtual.arrange.body import Hull
 from dopepp.virtual.backgrounds import Backgrounds
-from dopepp.virtual.scene import Plane
+from dopepp.virtual.body import Hull
+from dopepp.virtual.scene import Plane, triple
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -67,10 +67,8 @@ class Table:
 
     def draw_view(self, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
-        distance, elevation = (
-            rng.uniform(*self.distance),
-            np.radians(rng.uniform(*self.elevation_deg)),
-        )
+        distance = rng.uniform(*self.distance)
+        elevation = np.radians(rng.uniform(*self.elevation_deg))
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
         sine, cosine = np.sin(elevation), np.cos(elevation)
         level = np.array([[1, 0, 0], [0, -sine, -cosine], [0, cosine, -sine]])
@@ -144,12 +142,9 @@ class TablePicture:
         # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
         image_table = K @ T_cam_table[:3, [0, 1, 3]]
         image = cv2.warpPerspective(
-            self.picture,
-            self.picture_table @ np.linalg.inv(image_table),
-            size,
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REFLECT_101,
-        )
+            self.picture, self.picture_table @ np.linalg.inv(image_table), size,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT_101,
+        )  # fmt: skip
         beyond = _beyond(self.end, K, size, T_cam_table)
         if beyond is None or self.surroundings is None:
             return np.asarray(image)
@@ -158,8 +153,15 @@ class TablePicture:
 
 def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
     """Return the plane z = 0 of the table's frame, in the camera frame."""
-    x, y, z = (float(value) for value in T_cam_table[:3, 2])
-    return Plane((x, y, z), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
+    return Plane(triple(T_cam_table[:3, 2]), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
+
+
+def inverse_depth_of(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """Return what a homogeneous pixel is multiplied with to give the plane's 1/depth, 1/m.
+
+    A ray r (with z = 1) meets the plane at depth offset/(normal · r).
+    """
+    return np.asarray(np.array(plane.normal) @ np.linalg.inv(K) / plane.offset)
 
 
 def _downwards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -178,10 +180,7 @@ def _beyond(
 ) -> Bool[np.ndarray, "height width"] | None:
     """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
     width, height = size
-    plane = plane_of(T_cam_table)
-    # A ray r (with z = 1) meets the plane at depth offset/(normal · r), and 1/depth is linear in
-    # the pixel.
-    slope = np.array(plane.normal) @ np.linalg.inv(K) / plane.offset
+    slope = inverse_depth_of(plane_of(T_cam_table), K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
     if across.min() + down.min() >= 1 / end:
         return None

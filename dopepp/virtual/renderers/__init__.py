@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final
 
 from dopepp.core.errors import UserError
+from dopepp.virtual.scene import Rendered, Scene
 
-if TYPE_CHECKING:
-    from dopepp.virtual.scene import Rendered, Scene
-
-Renderer: TypeAlias = "Callable[[Scene], Rendered]"
+Renderer = Callable[[Scene], Rendered]
 """Draws a scene as an ideal camera sees it; the factory applies the scene's sensor."""
 
 RENDERERS: Final = {

@@ -1,18 +1,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
+from dopepp.core.errors import UserError
 from dopepp.experiment.build import hardware
 from dopepp.experiment.build.hardware import choose_precision, estimate_training_s
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system
+from dopepp.experiment.config.run import RunConfig, TrainerConfig
 
-Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 
 
 @pytest.mark.parametrize("accelerator", ["cpu", "cuda", "mps"])
@@ -43,16 +45,66 @@ def test_other_accelerators_are_not_guessed_at() -> None:
     assert choose_precision("auto", "mps")[0] == "32-true"
 
 
-def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Composer) -> None:
+def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Parser) -> None:
     config = tiny("model.backbone.batch_norm=true")
-    parts = build_parts(config["data"])
-    module, system = build_datamodule(config["data"], parts, 0), build_system(config, parts, "")
+    parts = build_parts(config.data)
+    module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
     before = {name: value.clone() for name, value in system.network.state_dict().items()}
-    trainer = {**config["trainer"], "max_epochs": 1000, "max_steps": -1}
+    trainer = replace(config.trainer, max_epochs=1000, max_steps=-1)
     long = estimate_training_s(system.network, module, trainer, "32-true")
-    short = estimate_training_s(system.network, module, {**trainer, "max_steps": 2}, "32-true")
+    trainer = replace(trainer, max_steps=2)
+    short = estimate_training_s(system.network, module, trainer, "32-true")
     assert 0 < short < long
     assert system.network.training
     for name, value in system.network.state_dict().items():
         assert torch.equal(value, before[name]), f"{name} has changed"
     assert all(parameter.grad is None for parameter in system.network.parameters())
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, 1),
+        ({"devices": 1}, 1),
+        ({"devices": "1"}, 1),
+        ({"devices": [3]}, 1),
+        ({"devices": "3,"}, 1),
+        ({"devices": 1, "strategy": "ddp"}, 1),  # one process, whatever it is called
+        ({"devices": 2}, 2),
+        ({"devices": "2"}, 2),
+        ({"devices": [0, 1]}, 2),
+        ({"devices": "0,1"}, 2),
+        ({"devices": "auto", "accelerator": "cpu"}, 1),
+        ({"devices": "auto", "accelerator": "auto"}, 4),
+        ({"devices": -1, "accelerator": "gpu"}, 4),
+        ({"devices": "-1", "accelerator": "gpu"}, 4),
+        ({"devices": 1, "num_nodes": 2}, 2),
+        ({"devices": 2, "num_nodes": 3}, 6),
+    ],
+)
+def test_how_many_processes_there_will_be(
+    options: dict[str, Any], count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert TrainerConfig(max_epochs=1, **options).num_processes == count
+
+
+def test_processes_that_torchrun_has_started_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert TrainerConfig(max_epochs=1, devices=1).num_processes == 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"devices": 0}, {"devices": []}, {"devices": "all"}, {"devices": 1.5}, {"devices": True},
+     {"devices": None}, {"devices": -2}, {"devices": 1, "num_nodes": 0}],
+)  # fmt: skip
+def test_a_number_that_means_nothing_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match=r"trainer\.(devices|num_nodes)="):
+        _ = TrainerConfig(max_epochs=1, **options).num_processes

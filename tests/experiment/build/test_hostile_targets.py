@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.registries import (
     AUGMENTATIONS,
     CALLBACKS,
@@ -21,13 +20,14 @@ from dopepp.experiment.build.registries import (
     optimizer_factory,
     scheduler_factory,
 )
-from dopepp.experiment.build.sources import build_datamodule
+from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs.tracking import tracked
 from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
-Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 HOSTILE = (
     "os.system",
     "subprocess.Popen",
@@ -56,9 +56,9 @@ PLACES = (
 )
 
 
-def build_all(config: dict[str, Any], run_dir: Path) -> None:
-    parts = build_parts(config["data"])
-    build_datamodule(config["data"], parts, seed=0)
+def build_all(config: RunConfig, run_dir: Path) -> None:
+    parts = build_parts(config.data)
+    build_datamodule(config.data, parts, seed=0)
     build_system(config, parts, "")
     with tracked(config, run_dir) as trackers:
         build_trainer(config, run_dir, trackers=trackers)
@@ -68,9 +68,7 @@ def build_all(config: dict[str, Any], run_dir: Path) -> None:
     ("place", "target"),
     [(place, HOSTILE[number % len(HOSTILE)]) for number, place in enumerate(PLACES)],
 )
-def test_a_hostile_target_is_refused(
-    place: str, target: str, tiny: Composer, tmp_path: Path
-) -> None:
+def test_a_hostile_target_is_refused(place: str, target: str, tiny: Parser, tmp_path: Path) -> None:
     config = tiny(f"++{place}._target_='{target}'")
     with pytest.raises(UserError, match="_target_") as error:
         build_all(config, tmp_path)
@@ -92,7 +90,7 @@ def test_no_gate_lets_a_hostile_target_through(target: str) -> None:
 
 
 @pytest.mark.parametrize("place", ["optimizer", "callbacks.checkpoint", "data.masking"])
-def test_nested_targets_are_refused(place: str, tiny: Composer, tmp_path: Path) -> None:
+def test_nested_targets_are_refused(place: str, tiny: Parser, tmp_path: Path) -> None:
     argument = {"optimizer": "lr", "data.masking": "probability"}.get(place, "filename")
     override = f"++{place}.{argument}={{_target_: os.system, command: true}}"
     # Where the optimiser's rate is one, the schedule's copy of it is one too.

@@ -12,7 +12,6 @@ import yaml
 from hydra.experimental.callback import Callback
 from hydra.utils import get_class
 
-from dopepp.experiment.build.objects import build_parts
 from dopepp.experiment.build.registries import (
     AUGMENTATIONS,
     CALLBACKS,
@@ -21,11 +20,14 @@ from dopepp.experiment.build.registries import (
     OPTIMIZERS,
     SCHEDULERS,
 )
+from dopepp.experiment.build.sources import build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.config.run import RunConfig
 from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
 Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 CONF = Path(__file__).parents[3] / "conf"
 GATES: dict[str, Registry[Any]] = {
     "model/backbone": BACKBONES,
@@ -83,6 +85,7 @@ def test_a_file_names_only_allowed_targets(path: Path) -> None:
 @pytest.mark.parametrize(("group", "name"), CHOICES, ids=lambda text: str(text))
 def test_every_choice_composes(group: str, name: str, composed: Composer) -> None:
     config = composed(f"{group}={name}")
+    RunConfig.of(config)
     node: Any = config
     for key in group.split("/"):
         # Overlays (`# @package _global_`) leave no key of their own.
@@ -108,9 +111,9 @@ MODEL_CHOICES = [
 
 
 @pytest.mark.parametrize("choice", MODEL_CHOICES)
-def test_every_model_choice_trains_one_step(choice: str, tiny: Composer) -> None:
+def test_every_model_choice_trains_one_step(choice: str, tiny: Parser) -> None:
     config = tiny(choice, "data.parts=[pivconnector,servoholder]")
-    system = build_system(config, build_parts(config["data"]), "")
+    system = build_system(config, build_parts(config.data), "")
     stages = system(torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8))
     belief, field = stages[-1]
     assert belief.shape == (1, 18, 8, 8)
@@ -124,10 +127,10 @@ def test_every_model_choice_trains_one_step(choice: str, tiny: Composer) -> None
 @pytest.mark.parametrize("name", ["adam", "adamw", "sgd"])
 @pytest.mark.parametrize("schedule", ["constant", "cosine", "onecycle"])
 def test_every_optimizer_takes_every_schedule_to_its_end(
-    name: str, schedule: str, tiny: Composer
+    name: str, schedule: str, tiny: Parser
 ) -> None:
     config = tiny(f"optimizer={name}", f"scheduler={schedule}", "optimizer.lr=0.01")
-    system = build_system(config, build_parts(config["data"]), "")
+    system = build_system(config, build_parts(config.data), "")
     optimizer = system.make_optimizer(system.network.parameters())
     if schedule == "constant":
         assert system.make_scheduler is None
@@ -145,7 +148,7 @@ def test_every_optimizer_takes_every_schedule_to_its_end(
 
 
 @pytest.mark.parametrize("name", ["auto", "cpu", "ddp"])
-def test_trainers_are_built(name: str, tiny: Composer, tmp_path: Path) -> None:
+def test_trainers_are_built(name: str, tiny: Parser, tmp_path: Path) -> None:
     config = tiny(f"trainer={name}", "trainer.accelerator=cpu", "trainer.precision=32-true")
     trainer = build_trainer(config, tmp_path)
     assert trainer.world_size == (2 if name == "ddp" else 1)

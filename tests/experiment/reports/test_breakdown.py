@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -231,17 +232,18 @@ def test_options_are_put_in_order() -> None:
 
 
 def test_the_papers_rate_goes_with_the_data() -> None:
-    ycb = {"format": "ycb_video", "root": "data"}
+    data: Any = SimpleNamespace(format="ycb_video", root=Path("data"))
     parts = [part("a")]
-    assert [one.heading for one in reported_rates(ycb, parts)] == ["ADD<10cm %", "ADD-0.1d %"]
-    renders = {**ycb, "root": None}
-    assert [one.heading for one in reported_rates(renders, parts)] == ["ADD<5cm %", "ADD-0.1d %"]
+    assert [one.heading for one in reported_rates(data, parts)] == ["ADD<10cm %", "ADD-0.1d %"]
+    data.root = None
+    assert [one.heading for one in reported_rates(data, parts)] == ["ADD<5cm %", "ADD-0.1d %"]
 
 
 def test_of_a_symmetric_part_its_symmetries_count(tmp_path: Path) -> None:
     half_turn = np.diag([-1.0, -1, 1, 1])
     symmetric = replace(part("a"), symmetries_discrete=half_turn[None])
-    rates = reported_rates({"format": "bop", "root": None}, [symmetric])
+    data: Any = SimpleNamespace(format="bop", root=None)
+    rates = reported_rates(data, [symmetric])
     assert [one.heading for one in rates][2:] == ["MSSD-0.1d %"]
     metrics = PoseMetrics([symmetric])
     for T in poses(10):

@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,12 +163,14 @@ def test_images_have_bops_numbers_or_their_place(
 
 def test_objects_have_their_data_sets_numbers(root: Path, ycb_root: Path) -> None:
     piv = pivconnector()
-    bop = {"root": root, "format": "bop"}
+    bop: Any = SimpleNamespace(root=root, format="bop")
     assert object_numbers(bop, [piv]) == {"servoholder": 1, "pivconnector": 2}
-    ycb = object_numbers({"root": ycb_root, "format": "ycb_video"}, [])
+    frames: Any = SimpleNamespace(root=ycb_root, format="ycb_video")
+    ycb = object_numbers(frames, [])
     assert len(ycb) == 21
     assert (ycb["002_master_chef_can"], ycb["003_cracker_box"]) == (1, 2)
-    assert object_numbers({"root": None, "format": "bop"}, [piv]) == {"pivconnector": 1}
+    bop.root = None
+    assert object_numbers(bop, [piv]) == {"pivconnector": 1}
 
 
 @pytest.mark.parametrize(("num", "everything"), [(1, False), (2, False), (1, True)])

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from dopepp.experiment.reports.compare.compare import compare_paths
 from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.cost import measure_cost
-from dopepp.experiment.reports.compare.compare import compare_paths
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
+from dopepp.experiment.train import do_job
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import mean_row, summarise
 
@@ -212,7 +212,7 @@ def test_costs(composed: Composer, tmp_path: Path, experiment: str) -> None:
         folder = tmp_path / str(number)
         job(folder, [f"model={name}"], None)
         (folder / record.FAILURE_FILE).unlink()
-        measure_cost(composed(f"experiment={experiment}", f"model={name}", *small), folder)
+        do_job(composed(f"experiment={experiment}", f"model={name}", *small), folder)
     printed = {"DOPE++": {"network": {"ms/frame": 33, "backbone weights": 1106696}}}
     end(tmp_path, {**config["table"], "labels": LABELS, "paper": {**printed, "DRNet": {}}})
     dope, dopepp, *others = read_table(tmp_path)

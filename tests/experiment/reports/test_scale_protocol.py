@@ -12,25 +12,30 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from dopepp.experiment.reports.condition import record_condition
+from dopepp.experiment.reports.scale import SCALE, measure_scales
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Sample
-from dopepp.experiment.build.objects import build_parts
-from dopepp.experiment.build.sources import build_scaled_test_source, build_test_source
+from dopepp.experiment.build.sources import (
+    build_parts,
+    build_scaled_test_source,
+    build_test_source,
+)
 from dopepp.experiment.build.system import build_system
 from dopepp.experiment.command_line import entry
+from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.evaluate import measure_and_record
-from dopepp.experiment.reports.condition import record_condition
 from dopepp.experiment.reports.evaluators import Cost, FileMethod, FilePose, ImageId
 from dopepp.experiment.reports.protocols import SHORT_NAMES, Protocols
 from dopepp.experiment.reports.report import measure
-from dopepp.experiment.reports.scale import SCALE, measure_scales
 from dopepp.experiment.reports.tables import ADD_01D, ADD_5CM
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint.schema import load_network, write_atomic
 from dopepp.parts.part import Part
 
 Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
 SCALES = (0.5, 20.0)
 
 
@@ -55,12 +60,12 @@ class Finder:
 
 
 def test_every_method_is_measured_at_every_scale(
-    tiny: Composer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tiny: Parser, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    data = tiny()["data"]
+    data = tiny().data
     (part,) = build_parts(data)
-    source = build_test_source(data, [part], 0)
-    scaled = {scale: build_scaled_test_source(data, [part], 0, scale) for scale in SCALES}
+    source = build_test_source(data, [part])
+    scaled = {scale: build_scaled_test_source(data, [part], scale) for scale in SCALES}
     usual = [source.sample(index).instances[0] for index in range(3)]
     far = [scaled[0.5].sample(index).instances[0] for index in range(3)]
     for one, other in zip(usual, far, strict=True):
@@ -101,17 +106,15 @@ def test_every_method_is_measured_at_every_scale(
     assert cv2.imread(str(tmp_path / "scale.png")).std() > 0
 
 
-def test_untrained_networks_end_to_end(tiny: Composer, tmp_path: Path) -> None:
+def test_untrained_networks_end_to_end(tiny: Parser, tmp_path: Path) -> None:
     config = tiny("data.num_test=2")
-    data, parts = config["data"], build_parts(config["data"])
+    data, parts = config.data, build_parts(config.data)
     system = build_system(config, parts, "")
     weights = {f"network.{name}": value for name, value in system.network.state_dict().items()}
     write_atomic({"state_dict": weights, "dopepp": system.payload}, tmp_path / "untrained.ckpt")
     estimator = PoseEstimator(*load_network(tmp_path / "untrained.ckpt"))
     both, protocols = {"dope": estimator, "dopepp": estimator}, Protocols(scales=(0.5,))
-    reports = measure_and_record(
-        both, parts, data, 0, tmp_path, num_pictures=2, protocols=protocols
-    )
+    reports = measure_and_record(both, parts, data, tmp_path, num_pictures=2, protocols=protocols)
     with (tmp_path / "scale.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["method"], row["scale"]) for row in rows] == [
@@ -124,10 +127,10 @@ def test_untrained_networks_end_to_end(tiny: Composer, tmp_path: Path) -> None:
         assert cv2.imread(str(tmp_path / name)) is not None, name
 
 
-def test_a_camera_that_cannot_be_moved_is_refused(tiny: Composer) -> None:
-    data = {**tiny()["data"], "root": "photos"}
+def test_a_camera_that_cannot_be_moved_is_refused(tiny: Parser) -> None:
+    data = replace(tiny().data, root=Path("photos"))
     with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
-        build_scaled_test_source(data, [], 0, 2.0)
+        build_scaled_test_source(data, [], 2.0)
     assert "\n" not in str(error.value)
     poses = FileMethod.__new__(FileMethod)
     with pytest.raises(UserError, match="scale with results of posecnn"):

@@ -2,18 +2,19 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from dopepp.experiment.runs import readme, record
 
-CONFIG: dict[str, Any] = {
-    "model": {"name": "dopepp"},
-    "data": {"name": "hybrid"},
-    "trainer": {"max_epochs": 3},
-    "keep_checkpoints": True,
-}
+CONFIG: Any = SimpleNamespace(
+    model=SimpleNamespace(name="dopepp"),
+    data=SimpleNamespace(name="hybrid"),
+    trainer=SimpleNamespace(max_epochs=3),
+    keep_checkpoints=True,
+)
 
 
 @pytest.fixture

@@ -88,7 +88,7 @@ def test_a_name_stands_for_a_file_of_the_package(
 @pytest.mark.parametrize("text", ["", "{", "[" * 100_000, json.dumps({"spec": 1})])
 def test_a_file_without_a_description(text: str, trained: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "other.safetensors"
-    released.safetensors_file.write(path, {"network.a": torch.zeros(2)}, {"dopepp": text})
+    released.write_safetensors(path, {"network.a": torch.zeros(2)}, {"dopepp": text})
     with pytest.raises(UserError, match=r"other\.safetensors"):
         read(path)
 

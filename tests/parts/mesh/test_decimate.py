@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import logging
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +9,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from trimesh.exchange.stl import export_stl
 
-from dopepp.core.errors import UserError
-from dopepp.parts import Mesh, load_part, make_part, part, servoholder
-from dopepp.parts.mesh.decimate import MAX_FACES, decimate
+from dopepp.parts import Mesh, make_part, part, servoholder
+from dopepp.parts.mesh.decimate import decimate
 
 
 def subdivided(mesh: Mesh, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -143,16 +140,3 @@ def test_specks_that_no_triangle_can_stand_for_are_refused() -> None:
     specks = grid + 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(ValueError, match="no 4 triangles can stand for its 216"):
         decimate(specks.reshape(-1, 3), np.arange(648).reshape(-1, 3), None, 4)
-
-
-def test_many_faces_of_a_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=7, radius=40)
-    assert len(ball.faces) == 327_680
-    (tmp_path / "ball.stl").write_bytes(export_stl(ball))
-    loaded = load_part(tmp_path / "ball.stl", "mm")
-    assert loaded.mesh is not None
-    assert 0.5 * MAX_FACES < len(loaded.mesh.faces) <= MAX_FACES
-    assert loaded.diameter == pytest.approx(0.08, rel=1e-6)
-    assert "327680 triangles decimated" in caplog.text
-    with pytest.raises(UserError, match="diameter"):
-        load_part(tmp_path / "ball.stl", "m")

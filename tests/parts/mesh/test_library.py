@@ -1,27 +1,33 @@
-"""What trimesh makes of the files that are checked before it reads, or that it does not read."""
+"""STL, GLB and 3MF files through trimesh, and what it makes of files that are not left to it."""
 
 from __future__ import annotations
 
+import io
+import json
+import logging
 import re
 import struct
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from trimesh.exchange.ply import export_ply
-from trimesh.exchange.stl import export_stl_ascii
+from trimesh.exchange.stl import export_stl, export_stl_ascii
 
 from dopepp.core.errors import UserError
-from dopepp.parts import read_mesh
+from dopepp.parts import Mesh, load_part, read_mesh
+from dopepp.parts.mesh.library import UNITS_3MF
 
 BOX = trimesh.creation.box((10.0, 20.0, 30.0))
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-
-
-def write(folder: Path, name: str, content: str | bytes) -> Path:
-    path = folder / name
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
+TURN = trimesh.transformations.rotation_matrix(0.3, [1, 2, 3], [4, 5, 6])
+Write = Callable[[str, str | bytes], Path]
+Refused = Callable[[str, str | bytes, str], None]
 
 
 def obj(faces: str, before: str = "") -> str:
@@ -31,10 +37,10 @@ def obj(faces: str, before: str = "") -> str:
 HEXAGON = "v 2 0 0\nv 1 2 0\nv -1 2 0\nv -2 0 0\nv -1 -2 0\nv 1 -2 0\nvt 0 0\n"
 
 
-def ply_faces(*faces: list[int], form: str = "<", lists: str = "B{}i") -> bytes:
+def ply_faces(*faces: list[int]) -> bytes:
     header = export_ply(BOX).split(b"end_header")[0]
     header = re.sub(rb"element face \d+", b"element face %d" % len(faces), header)
-    rows = [struct.pack(form + lists.format(len(face)), len(face), *face) for face in faces]
+    rows = [struct.pack(f"<B{len(face)}i", len(face), *face) for face in faces]
     return header + b"end_header\n" + BOX.vertices.astype("<f4").tobytes() + b"".join(rows)
 
 
@@ -56,7 +62,6 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
     "zero.obj": (obj("f 0 2 3\n"), 1, "index 0 among 4"),
     "outside.obj": (obj("f 1 2 3\nf 1 2 5\n"), -1, "index 5 among 4"),
     "tab.obj": (obj("f 1 2 3\nf\t1 3 4\n"), 1, 2),
-    "relative.obj": (obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n", 2, 2),
     "hexagon.obj": (HEXAGON + "f 1/1 2/1 3/1\nf 1 2 3 4 5 6\n", 2, 5),
     "library.obj": (obj("usemtl m\nf 1/1 2/2 3/1\n", "mtllib gone.mtl\n"), 1, "does not exist"),
     "cut.stl": (export_stl_ascii(BOX) + export_stl_ascii(BOX)[:900], 12, "begun and 12 ended"),
@@ -67,43 +72,322 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_trimesh_makes_of_it(tmp_path: Path, name: str) -> None:
+def test_what_trimesh_makes_of_it(write: Write, refused: Refused, name: str) -> None:
     """Where one of these fails, trimesh has learned it and a check or a reader here can go."""
     content, theirs, ours = WRONG[name]
-    path = write(tmp_path, name, content)
+    path = write(name, content)
     try:
         num_theirs = len(trimesh.load_mesh(path, process=False).faces)
     except Exception:
         num_theirs = -1
     assert num_theirs == theirs
     if isinstance(ours, str):
-        with pytest.raises(UserError, match=ours):
-            read_mesh(path, "mm")
+        refused(name, content, ours)
     else:
         assert len(read_mesh(path, "cm").faces) == ours
 
 
-def test_trimesh_reads_garbage_where_the_sizes_of_polygons_agree(tmp_path: Path) -> None:
-    path = write(tmp_path, "a.ply", ply_faces(*PENTAGON_AND_TRIANGLE))
-    assert trimesh.load_mesh(path, process=False).faces.max() > 8
-    assert read_mesh(path, "mm").faces.max() < 8
-
-
-def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(tmp_path: Path) -> None:
-    path = write(tmp_path, "a.obj", WRONG["relative.obj"][0])
+def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write: Write) -> None:
+    path = write("a.obj", obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n")
     theirs = trimesh.load_mesh(path, process=False)
     assert theirs.vertices[theirs.faces[0]].tolist() == [[1, 0, 0], [1, 1, 0], [0, 1, 0]]
     ours = read_mesh(path, "m")
     assert ours.vertices[ours.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
 
 
-def test_trimesh_splits_vertices_where_normals_differ(tmp_path: Path) -> None:
+def test_trimesh_splits_vertices_where_normals_differ(write: Write) -> None:
     box = BOX.copy()
     normals = box.face_normals.tolist()
     text = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices.tolist())
     text += "".join(f"vn {x} {y} {z}\n" for x, y, z in normals)
     for number, face in enumerate((box.faces + 1).tolist(), start=1):
         text += "f " + " ".join(f"{corner}//{number}" for corner in face) + "\n"
-    path = write(tmp_path, "a.obj", text)
+    path = write("a.obj", text)
     assert len(trimesh.load_mesh(path, process=False).vertices) == 36
     assert len(read_mesh(path, "mm").vertices) == 8
+
+
+def test_trimesh_puts_the_triangles_of_quads_in_another_order(write: Write) -> None:
+    """A mesh's hash, which checkpoints and render caches know it by, depends on the order."""
+    path = write("a.ply", ply_faces(*QUADS))
+    theirs, ours = trimesh.load_mesh(path, process=False).faces, read_mesh(path, "mm").faces
+    assert ours[:2].tolist() == [[0, 1, 3], [0, 3, 2]]
+    assert theirs.tolist() != ours.tolist()
+
+
+# STL
+
+
+@pytest.mark.parametrize("count", [0, 1, 11, 13, 10**9, 2**32 - 1])
+def test_a_binary_stl_that_lies_about_its_triangles(refused: Refused, count: int) -> None:
+    binary = export_stl(BOX)
+    lie = binary[:80] + struct.pack("<I", count) + binary[84:]
+    refused("a.stl", lie, rf"684 bytes where its header promises {count} triangles")
+
+
+def test_a_binary_stl_may_begin_like_text(write: Write) -> None:
+    path = write("a.stl", b"solid part".ljust(80) + export_stl(BOX)[80:])
+    assert len(read_mesh(path, "mm").faces) == 12
+
+
+def test_a_text_stl_may_be_laid_out_in_any_way(write: Write) -> None:
+    text = export_stl_ascii(BOX)
+    for number, (num_faces, dialect) in enumerate([
+        (12, text.upper()),
+        (12, text.replace("\n", "\r\n")),
+        (12, text.replace("facet normal", "facet \t normal").replace("vertex", "  vertex ")),
+        (12, "\n" + text.replace("endsolid", "endsolid of a facet")),
+        (24, text + "\n" + text.replace("30", "40")),
+    ]):  # fmt: skip
+        assert len(read_mesh(write(f"{number}.stl", dialect), "mm").faces) == num_faces
+
+
+@pytest.mark.parametrize(("old", "new"), [("-5", "nan"), ("vertex", "vertex x")])
+def test_a_text_stl_of_no_numbers_is_refused(refused: Refused, old: str, new: str) -> None:
+    refused("m.stl", export_stl_ascii(BOX).replace(old, new, 1), "m.stl with")
+
+
+def exported(mesh: trimesh.Trimesh | trimesh.Scene, kind: str) -> bytes:
+    return bytes(mesh.export(file_type=kind))
+
+
+def edited(content: bytes, edit: Callable[[dict[str, Any]], object]) -> bytes:
+    """Change the JSON of a GLB file."""
+    size = int.from_bytes(content[12:16], "little")
+    header = json.loads(content[20 : 20 + size])
+    edit(header)
+    text = json.dumps(header).encode()
+    rest = content[20 + size :]
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON")
+    return head + text + rest
+
+
+def repacked(content: bytes, edit: Callable[[bytes], bytes]) -> bytes:
+    """Change the root model of a 3MF file."""
+    file = io.BytesIO()
+    with (
+        zipfile.ZipFile(io.BytesIO(content)) as source,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as target,
+    ):
+        for name in source.namelist():
+            data = source.read(name)
+            target.writestr(name, edit(data) if name.endswith(".model") else data)
+    return file.getvalue()
+
+
+def textured_square(size: float = 0.1) -> trimesh.Trimesh:
+    """A square whose texture, 2×2 pixels, shows at its corners."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+    picture = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    return trimesh.Trimesh(
+        size * np.column_stack([corners, np.zeros(4)]),
+        [[0, 1, 2], [0, 2, 3]],
+        visual=trimesh.visual.TextureVisuals(uv=corners, material=material),
+        process=False,
+    )
+
+
+def ordered(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points[np.lexsort(np.round(points, 4).T)])
+
+
+def volume(mesh: Mesh) -> float:
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert solid.is_volume
+    return float(solid.volume)
+
+
+# GLB
+
+
+def test_a_glb_file_is_in_metres_and_another_unit_is_said(
+    write: Write, caplog: pytest.LogCaptureFixture
+) -> None:
+    small = BOX.copy()
+    small.apply_scale(0.001)
+    path = write("box.glb", exported(small, "glb"))
+    with caplog.at_level(logging.INFO):
+        np.testing.assert_allclose(np.ptp(read_mesh(path).vertices, axis=0), [0.01, 0.02, 0.03])
+        assert load_part(path).diameter == pytest.approx(np.sqrt(1400) / 1000)
+        assert not caplog.records
+    assert np.ptp(read_mesh(path, "cm").vertices) == pytest.approx(0.0003)
+    assert f"{path} is in m by its format: taken as cm, as asked" in caplog.text
+    with pytest.raises(UserError, match=r"37\.42 m, its file read with unit=m; .*unit=mm"):
+        load_part(write("large.glb", exported(BOX, "glb")))
+
+
+def test_a_glb_scene_is_one_mesh_where_its_nodes_are(write: Write) -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(BOX, transform=TURN)
+    scene.add_geometry(BOX, transform=np.diag([1, 1, -2, 1]))
+    scene.add_geometry(trimesh.load_path(np.array([[[0, 0, 0], [99, 0, 0]]])))
+    loaded = read_mesh(write("two.glb", exported(scene, "glb")), "mm")
+    # The line is left out, and the mirrored box faces outwards.
+    expected = [trimesh.transform_points(BOX.vertices, TURN), BOX.vertices * [1, 1, -2]]
+    np.testing.assert_allclose(
+        ordered(1000 * loaded.vertices), ordered(np.concatenate(expected)), atol=1e-5
+    )
+    assert volume(loaded) == pytest.approx(3 * 6e-6, rel=1e-6)
+
+
+def test_a_glb_file_has_one_hash(write: Write) -> None:
+    """trimesh gives the pieces of one mesh random names."""
+
+    def edit(header: dict[str, Any]) -> None:
+        primitive = header["meshes"][0]["primitives"][0]
+        header["meshes"][0]["primitives"] = [primitive, primitive | {"mode": 5}, primitive]
+
+    path = write("a.glb", edited(exported(BOX, "glb"), edit))
+    assert len({load_part(path, "mm").mesh_hash for _ in range(5)}) == 1
+
+
+def test_a_glb_texture_lies_as_that_of_an_obj_file(tmp_path: Path, write: Write) -> None:
+    square = textured_square()
+    loaded = read_mesh(write("a.glb", exported(square, "glb")))
+    assert loaded.uv is not None
+    np.testing.assert_array_equal(loaded.texture, square.visual.material.baseColorTexture)
+    np.testing.assert_allclose(loaded.vertices[:, :2], 0.1 * loaded.uv, atol=1e-7)
+    square.export(tmp_path / "a.obj")
+    same = read_mesh(tmp_path / "a.obj", "m")
+    assert same.uv is not None
+    np.testing.assert_array_equal(loaded.texture, same.texture)
+    np.testing.assert_allclose(loaded.uv[loaded.faces], same.uv[same.faces], atol=1e-7)
+
+
+def info(**fields: Any) -> Callable[[dict[str, Any]], object]:
+    def edit(header: dict[str, Any]) -> None:
+        header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] |= fields
+
+    return edit
+
+
+def array(name: str, **fields: Any) -> Callable[[dict[str, Any]], object]:
+    def edit(header: dict[str, Any]) -> None:
+        index = header["meshes"][0]["primitives"][0]["attributes"][name]
+        header["accessors"][index] |= fields
+
+    return edit
+
+
+SPARSE = {"count": 1, "indices": {}, "values": {}}
+MOVED = {"KHR_texture_transform": {"scale": [2, 2]}}
+TWICE = [{"children": [1]}, {"mesh": 0}, {"children": [1], "scale": [2, 2, 2]}]
+
+GLB_CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "a moved texture": (info(extensions=MOVED), "a texture with a transform"),
+    "other coordinates": (info(texCoord=1), "second texture coordinates"),
+    "coordinates in bytes": (
+        array("TEXCOORD_0", componentType=5121, normalized=True),
+        "coordinates that are floats",
+    ),
+    "too few coordinates": (
+        array("TEXCOORD_0", count=3), "3 texture coordinates of 4 vertices"
+    ),
+    "sparse positions": (array("POSITION", sparse=SPARSE), "compressed, sparse or left out"),
+    "a fan": (
+        lambda header: header["meshes"][0]["primitives"][0].update(mode=6), "a fan of triangles"
+    ),
+    "a quantised mesh": (
+        lambda header: header.update(extensionsRequired=["KHR_mesh_quantization"]),
+        "the extension KHR_mesh_quantization",
+    ),
+    "a node in two places": (
+        lambda header: header.update(nodes=TWICE, scenes=[{"nodes": [0, 2]}]),
+        "a node in two places",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GLB_CASES)
+def test_what_trimesh_passes_over_in_a_glb_file_is_refused(
+    write: Write, refused: Refused, name: str
+) -> None:
+    edit, message = GLB_CASES[name]
+    content = edited(exported(textured_square(), "glb"), edit)
+    trimesh.load_scene(write("a.glb", content))  # without a word
+    refused("a.glb", content, message)
+
+
+def test_one_texture_must_cover_a_glb_file(refused: Refused) -> None:
+    scene = trimesh.Scene([textured_square(), BOX])
+    refused("a.glb", exported(scene, "glb"), r"faces of 2 textures; .* bake")
+
+
+def test_a_glb_file_without_its_data_is_cut_short(refused: Refused) -> None:
+    content = exported(BOX, "glb")
+    end = 20 + int.from_bytes(content[12:16], "little")
+    nothing = content[:8] + struct.pack("<I", end) + content[12:end]
+    refused("a.glb", nothing, r"a\.glb with error: unpack_from")
+    short = content[:end] + struct.pack("<I", 4) + b"BIN\0" + bytes(4)
+    refused("b.glb", short[:8] + struct.pack("<I", len(short)) + short[12:], r"b\.glb with")
+
+
+# 3MF
+
+
+@pytest.mark.parametrize("unit", UNITS_3MF)
+def test_a_3mf_file_states_its_unit(
+    write: Write, unit: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    metres = {"millimeter": 1e-3, "centimeter": 1e-2, "meter": 1, "inch": 0.0254}[unit]
+    content = repacked(
+        exported(BOX, "3mf"), lambda model: model.replace(b"millimeter", unit.encode())
+    )
+    path = write("box.3mf", content)
+    loaded = read_mesh(path)
+    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), metres * np.array([10, 20, 30]))
+    assert volume(loaded) == pytest.approx(6000 * metres**3)
+    assert not caplog.records
+    if unit != "inch":
+        read_mesh(path, "inch")
+        assert f"is in {UNITS_3MF[unit]} by its format: taken as inch" in caplog.text
+
+
+def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write: Write) -> None:
+    content = exported(BOX, "3mf")
+    bare = repacked(content, lambda model: model.replace(b'unit="millimeter"', b""))
+    loaded = read_mesh(write("bare.3mf", bare))
+    np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.01, 0.02, 0.03])
+    feet = repacked(content, lambda model: model.replace(b"millimeter", b"foot"))
+    with pytest.raises(UserError, match=r"the unit 'foot'; allowed: millimeter, .*millimetres"):
+        read_mesh(write("feet.3mf", feet))
+
+
+def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write: Write) -> None:
+    def transform(x: float) -> str:
+        return f'transform="1 0 0 0 0 1 0 -1 0 {x} 0 7"'
+
+    def assemble(model: bytes) -> bytes:
+        text = re.sub(r"<build.*</build>", "<build>@</build>", model.decode(), flags=re.DOTALL)
+        number = re.findall(r'<object[^>]*\bid="(\d+)"', text)[0]
+        arm = f'<component objectid="{number}"/><component objectid="{number}" {transform(40)}/>'
+        text = text.replace(
+            "</resources>", f'<object id="99"><components>{arm}</components></object></resources>'
+        )
+        items = f'<item objectid="99" {transform(100)}/><item objectid="{number}"/>'
+        return text.replace("@", items).encode()
+
+    path = write("three.3mf", repacked(exported(BOX, "3mf"), assemble))
+    loaded = read_mesh(path)
+    assert volume(loaded) == pytest.approx(3 * 6e-6)
+    # A 3MF row is a column of ours: a quarter turn about x, then a shift.
+    T = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 7], [0, 0, 0, 1.0]])
+    places = []
+    for matrix in (
+        np.eye(4),
+        T + 100 * np.eye(4, k=3),
+        (T + 100 * np.eye(4, k=3)) @ (T + 40 * np.eye(4, k=3)),
+    ):
+        places.append(trimesh.transform_points(BOX.vertices, matrix))
+    np.testing.assert_allclose(
+        ordered(1000 * loaded.vertices), ordered(np.concatenate(places)), atol=1e-9
+    )
+
+
+def test_a_3mf_model_that_ends_too_early_is_refused(refused: Refused) -> None:
+    content = exported(BOX, "3mf")
+    size = len(repacked(content, lambda model: model))
+    for length in range(500, size, 97):
+        cut = repacked(content, lambda model, n=length: model[:n])
+        refused("a.3mf", cut, r"a\.3mf with .*export the mesh again")

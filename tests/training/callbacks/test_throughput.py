@@ -8,7 +8,6 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
 
-from dopepp.core.errors import UserError
 from dopepp.training.callbacks import throughput
 from dopepp.training.callbacks.throughput import Operators, make_profiler, profile_rows
 
@@ -55,10 +54,3 @@ def test_the_operators_of_training_and_validation(tmp_path: Path) -> None:
     assert "2 calls  aten::mm" in profiler.summary()
     traces = sorted(path.name for path in (tmp_path / "profile").iterdir())
     assert traces == ["trace_0.json", "trace_1.json"]
-
-
-@pytest.mark.parametrize("kind", ["fast", 3, ["simple"]])
-def test_other_profilers_are_refused(kind: object, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"trainer\.profiler=.*simple, pytorch"):
-        make_profiler(kind, tmp_path)
-    assert make_profiler(None, tmp_path) is None

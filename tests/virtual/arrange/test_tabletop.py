@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import manifold3d
@@ -11,16 +12,25 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import invert_transform, transform
-from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.read import read_mesh, ycb_part
-from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual import Factory, Scene, SceneObject
+from dopepp.parts.part import Part, make_part
+from dopepp.virtual import (
+    PRESETS,
+    Distractors,
+    Factory,
+    Preset,
+    Scene,
+    SceneObject,
+    Surface,
+    Table,
+    customised_preset,
+    visible_fractions,
+)
 from dopepp.virtual.arrange.tabletop import HeightMap
-from dopepp.virtual.presets.preset import PRESETS, Distractors, Preset, Table, customised_preset
-from dopepp.virtual.surface import make_surface
 
 NUM_SCENES = 25
 CONTACT = 1e-4
+MakeSurface = Callable[[trimesh.Trimesh], Surface]
 
 
 class Constant:
@@ -48,11 +58,6 @@ def heights(scene: Scene, item: SceneObject) -> np.ndarray:
     assert scene.plane is not None
     points = transform(item.T_cam_obj, item.surface.vertices)
     return np.asarray(points @ np.array(scene.plane.normal) - scene.plane.offset)
-
-
-@pytest.fixture(scope="module")
-def parts() -> list[Part]:
-    return [servoholder(), pivconnector()]
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +95,7 @@ def test_what_does_not_lean_rests_on_a_face(parts: list[Part]) -> None:
 
 def test_heaps_stand_on_the_plane(heaps: list[Scene]) -> None:
     for scene in heaps:
-        lowest = [heights(scene, item).min() for item in scene.objects]
-        assert min(lowest) >= -1e-9
-        assert min(lowest) <= CONTACT
+        assert -1e-9 <= min(heights(scene, item).min() for item in scene.objects) <= CONTACT
     assert any(max(heights(s, i).min() for i in s.objects) > 0.005 for s in heaps)
     counts = [len(scene.targets) for scene in heaps]
     assert min(counts) >= 2
@@ -125,9 +128,8 @@ def test_objects_do_not_pierce_each_other(
 def test_heaps_hide_but_not_too_much(parts: list[Part]) -> None:
     preset = small("bin")
     factory = Factory(parts, preset, 2, Constant())
-    fractions = np.concatenate(
-        [(r := factory.render(0, i)).visible_fractions[list(r.scene.targets)] for i in range(12)]
-    )
+    scenes = [factory.scene(0, index) for index in range(12)]
+    fractions = np.concatenate([visible_fractions(s)[list(s.targets)] for s in scenes])
     assert fractions.min() >= preset.min_visible_fraction
     assert np.mean(fractions < 0.8) > 0.2
 
@@ -143,10 +145,8 @@ def test_the_cameras_place_keeps_to_its_ranges(tables: list[Scene]) -> None:
         elevations.append(np.degrees(np.arcsin(-normal[2])))
         for light in scene.lights:
             assert normal @ np.array(light.position) > scene.plane.offset
-    assert 0.25 <= min(distances) < 0.32
-    assert 0.52 < max(distances) <= 0.60
-    assert 30 - 1e-9 <= min(elevations) < 45
-    assert 70 < max(elevations) <= 85 + 1e-9
+    assert 0.25 <= min(distances) < 0.32 < 0.52 < max(distances) <= 0.60
+    assert 30 - 1e-9 <= min(elevations) < 45 < 70 < max(elevations) <= 85 + 1e-9
 
 
 def test_the_background_is_a_picture_that_lies_on_the_plane(parts: list[Part]) -> None:
@@ -187,22 +187,21 @@ def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None
         preset = replace(
             PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
         )
-        rendered = [Factory(parts, preset, 0).render(0, index) for index in range(2)]
-        assert all(r.scene.targets == () for r in rendered)
-        assert sum(len(r.scene.objects) for r in rendered) >= 4
+        scenes = [Factory(parts, preset, 0).scene(0, index) for index in range(2)]
+        assert all(scene.targets == () for scene in scenes)
+        assert sum(len(scene.objects) for scene in scenes) >= 4
         empty = replace(preset, distractors=Distractors((0, 0)))
         assert Factory(parts, empty, 0).render(0, 1).scene.objects == ()
 
 
-def test_parts_no_table_can_show_are_an_error(box_part: Part) -> None:
-    assert box_part.mesh is not None
-    for scale, name in ((40, "huge"), (0.06, "tiny")):
-        mesh = replace(box_part.mesh, vertices=box_part.mesh.vertices * scale)
-        part = make_part(name, mesh)
-        for preset in (PRESETS["table"], PRESETS["bin"]):
-            far = replace(preset, table=Table(distance=(20.0, 20.0))) if scale < 1 else preset
-            with pytest.raises(UserError, match=f"part {name} of diameter"):
-                Factory([part], far, 0, Constant()).scene(0, 0)
+@pytest.mark.parametrize("preset", [PRESETS["table"], PRESETS["bin"]])
+def test_parts_no_table_can_show_are_an_error(
+    preset: Preset, sized_box: Callable[[str, float], Part]
+) -> None:
+    far = replace(preset, table=Table(distance=(20.0, 20.0)))
+    for part, where in ((sized_box("huge", 40), preset), (sized_box("tiny", 0.06), far)):
+        with pytest.raises(UserError, match=f"part {part.name} of diameter"):
+            Factory([part], where, 0, Constant()).scene(0, 0)
 
 
 @pytest.mark.parametrize("name", ["table", "bin"])
@@ -222,9 +221,8 @@ def test_somebody_elses_parts_lie_well(name: str, request: pytest.FixtureRequest
         assert name == "bin" or max(lowest) <= CONTACT
 
 
-def test_a_dropped_box_lands_on_what_is_there() -> None:
-    box = trimesh.creation.box((0.04, 0.02, 0.03))
-    surface = make_surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+def test_a_dropped_box_lands_on_what_is_there(surface_of: MakeSurface) -> None:
+    surface = surface_of(trimesh.creation.box((0.04, 0.02, 0.03)))
     table = HeightMap(0.001, 0.1)
     footprint = table.footprint(surface, np.eye(3), -0.015)
     assert footprint is not None
@@ -243,25 +241,19 @@ def test_a_dropped_box_lands_on_what_is_there() -> None:
     assert table.height(lying, (0, 0)) == pytest.approx(0.06, abs=1e-6)
 
 
-def test_a_slope_is_met_where_it_is_highest() -> None:
+def test_a_slope_is_met_where_it_is_highest(surface_of: MakeSurface) -> None:
     profile, ends = ((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05)), (-0.05, 0.05)
     wedge = trimesh.convex.convex_hull(np.array([[x, y, z] for x, z in profile for y in ends]))
-    box = trimesh.creation.box((0.01, 0.01, 0.01))
-    shapes = [
-        make_surface(Mesh(np.asarray(m.vertices), np.asarray(m.faces, np.int32)))
-        for m in (wedge, box)
-    ]
     table = HeightMap(0.001, 0.1)
-    slope = table.footprint(shapes[0], np.eye(3), 0.0)
-    block = table.footprint(shapes[1], np.eye(3), -0.005)
+    slope = table.footprint(surface_of(wedge), np.eye(3), 0.0)
+    block = table.footprint(surface_of(trimesh.creation.box([0.01] * 3)), np.eye(3), -0.005)
     assert slope is not None
     assert block is not None
     table.put(slope, (0, 0), 0.0)
     # Height z = (x + 5 cm)/2; the block's right edge is 5 mm beside its middle.
     for x in (-20, 0, 30):
-        assert table.height(block, (x, 0)) == pytest.approx(
-            (0.001 * x + 0.005 + 0.05) / 2, abs=8e-4
-        )
+        expected = (0.001 * x + 0.005 + 0.05) / 2
+        assert table.height(block, (x, 0)) == pytest.approx(expected, abs=8e-4)
 
 
 def test_the_tables_frame_is_rigid() -> None:

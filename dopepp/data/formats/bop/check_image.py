@@ -1,25 +1,33 @@
-"""Check BOP's records of one image, which are the same in scene files and in tar shards."""
+"""Hold BOP's records of one image against each other, its models and its masks.
+
+Scene files and tar shards share this: the records are parsed by
+:mod:`~dopepp.data.formats.bop.records`, whose problems are defects; here is what only a look at
+several of them, or at pixels, can tell.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float
 
-from dopepp.data.formats.bop.check_models import Model, Models
-from dopepp.data.formats.problems import CheckReport, entries, mapping, numbers
+from dopepp.data.formats.bop.models import INFO_FILE, info_path, parse_models
+from dopepp.data.formats.bop.records import MM, Place, Record, read_cameras, read_poses
+from dopepp.data.formats.bop.scene import is_number
+from dopepp.data.formats.problems import CheckReport, load_object, mapping, numbers, scalar
 from dopepp.data.formats.tolerances import (
+    DIAMETERS_MM,
     Box,
     box_problem,
     camera_problem,
-    rotation_problem,
     translation_problem,
 )
+from dopepp.geometry.camera import transform
+from dopepp.geometry.cuboid import cuboid_keypoints
 
 FRACTION_TOLERANCE: Final = 0.05
 """Between ``visib_fract`` and the quotient of the pixel counts, which renderers round apart."""
@@ -30,20 +38,21 @@ PIXEL_TOLERANCE: Final = 0.01
 BOX_EDGE_PX: Final = 2.0
 """Between ``bbox_visib`` and the box of ``mask_visib``: tools differ on whether ends count."""
 
-Place = Callable[[str], tuple[Path | str, str]]
-"""From ``camera``, ``gt`` or ``gt_info`` to (file, start of the field)."""
+_ROUNDING: Final = 1.001
+"""Diameters and boxes are rounded to a few digits."""
 
 Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
-class ImageRecords:
-    """The JSON records of an image, as they are; None where there are none."""
+class Model:
+    """An object's size, metres; None where it is not stated or damaged."""
 
-    camera: Any
-    truths: Any
-    infos: Any
-    has_depth: bool
+    diameter: float | None = None
+    corners: Float[np.ndarray, "8 3"] | None = None
+
+
+Models = dict[int, Model]
 
 
 @dataclass(frozen=True)
@@ -54,11 +63,58 @@ class Silhouettes:
     visible: Callable[[int], Mask | None]
 
 
-def check_image_records(
+def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
+    """Check the first ``models*/models_info.json`` below one of the folders; None without one."""
+    path = next(filter(None, map(info_path, roots)), None)
+    if path is None:
+        report.note(f"no {INFO_FILE}: objects' numbers, sizes and boxes are not checked")
+        return None
+    records = load_object(report, path)
+    if records is None:
+        return None
+    infos = parse_models(path, records, report)
+    for info in infos.values():
+        if not info.path.is_file():
+            report.report(info.path, "file", "missing")
+    return {
+        int(key): _model(report, path, key, record, infos[int(key)].diameter)
+        for key, record in records.items()
+        if is_number(key)
+    }
+
+
+def _model(report: CheckReport, path: Path, key: str, record: Any, stated: float) -> Model:
+    fields, diameter = mapping(record), None if np.isnan(stated) else stated
+    if fields and "diameter" not in fields:
+        report.report(path, f"{key}.diameter", "missing")
+    if diameter is not None and not DIAMETERS_MM[0] <= diameter * MM <= DIAMETERS_MM[1]:
+        least, most = DIAMETERS_MM
+        allowed = f"{least:g} … {most:g} mm: is it in another unit?"
+        report.report(path, f"{key}.unit", f"{diameter * MM:.4g} mm", allowed)
+        diameter = None
+    bounds = [fields.get(f"{what}_{axis}") for what in ("min", "size") for axis in "xyz"]
+    if all(value is None for value in bounds):
+        return Model(diameter)
+    low, size = numbers(report, path, f"{key}.min_x … size_z", bounds, 2, 3) / MM
+    if (size < 0).any():
+        report.report(path, f"{key}.size_x … size_z", f"{(size * MM).tolist()}", "0 and above")
+    if not (size >= 0).all():
+        return Model(diameter)
+    length = float(np.linalg.norm(size))
+    if diameter is not None and not size.max() / _ROUNDING <= diameter <= length * _ROUNDING:
+        got = f"{diameter * MM:.5g} mm for a box of {np.round(size * MM, 3).tolist()} mm"
+        report.report(path, f"{key}.diameter", got)
+    return Model(diameter, cuboid_keypoints(low, low + size)[:8])
+
+
+def check_image(
     report: CheckReport,
     place: Place,
-    records: ImageRecords,
-    size: tuple[int, int] | None,
+    camera: object,
+    truths: Sequence[Record],
+    infos: Sequence[Record | None],
+    shape: tuple[int, int] | None,
+    has_depth: bool,
     models: Models | None,
     silhouettes: Silhouettes,
 ) -> None:
@@ -67,156 +123,129 @@ def check_image_records(
     Args:
         report: Takes the defects.
         place: Says where a record stands.
-        records: The records.
-        size: (width, height) of the image; None where it cannot be read.
+        camera: The image's camera record; None where there is none.
+        truths: Its ``gt`` records.
+        infos: Its ``gt_info`` records, one for each of them.
+        shape: (height, width) of the image; None where it cannot be read.
+        has_depth: Whether its depth must have a scale.
         models: The objects; None where they are not known.
         silhouettes: The masks.
     """
-    K = None if records.camera is None else _check_camera(report, place, records, size)
-    if records.truths is None:
-        return
-    truths = entries(report, place("gt")[0], place("gt")[1], records.truths)
-    infos: list[Any] = []
-    if records.infos is not None:
-        path, start = place("gt_info")
-        infos = entries(report, path, start, records.infos)
-        if len(infos) != len(truths):
-            report.add(path, start, f"{len(infos)} objects; {len(truths)} have a pose")
-    for number, truth in enumerate(truths):
-        item = _Object(report, place, number, truth, models)
-        info = infos[number] if number < len(infos) else None
-        item.check(info, K, silhouettes)
+    K = None if camera is None else _check_camera(report, place, camera, shape, has_depth)
+    poses = read_poses(truths, infos, place, report)
+    for n, info in enumerate(infos):
+        model = _find_model(report, place("gt", n), int(poses.obj_ids[n]), models)
+        item = _Object(report, place, n, model)
+        pose, fraction = poses.T_cam_obj[n], float(poses.visible_fractions[n])
+        item.check(pose, None if np.isnan(fraction) else fraction, info, K, silhouettes)
 
 
 def _check_camera(
-    report: CheckReport, place: Place, records: ImageRecords, size: tuple[int, int] | None
-) -> NDArray[np.float64] | None:
-    path, start = place("camera")
-    camera = mapping(records.camera)
-    K = numbers(report, path, f"{start}.cam_K", camera.get("cam_K"), 3, 3)
-    if K is not None and size is not None:
-        problem = camera_problem(K, size)
-        if problem is not None:
-            report.add(path, f"{start}.cam_K", problem)
-            K = None
-    if "depth_scale" in camera or records.has_depth:
-        where = f"{start}.depth_scale"
-        scale = numbers(report, path, where, camera.get("depth_scale"), 1)
-        if scale is not None and scale[0] <= 0:
-            report.add(path, where, f"{scale[0]:g}; allowed: above 0")
-    return K
+    report: CheckReport,
+    place: Place,
+    camera: object,
+    shape: tuple[int, int] | None,
+    has_depth: bool,
+) -> Float[np.ndarray, "3 3"] | None:
+    path, start = place("camera", 0)
+    K: Float[np.ndarray, "3 3"] = read_cameras([camera], place, report)[0][0]
+    if has_depth and "depth_scale" not in mapping(camera):
+        report.report(path, f"{start}.depth_scale", "missing", "millimetres a unit of the depth")
+    if not np.isfinite(K).all():
+        return None
+    problem = None if shape is None else camera_problem(K, shape)
+    if problem is None:
+        return K
+    report.report(path, f"{start}.cam_K", problem)
+    return None
+
+
+def _find_model(
+    report: CheckReport, place: tuple[Path | str, str], obj_id: int, models: Models | None
+) -> Model:
+    if models is None or obj_id < 0:  # which the reader has reported
+        return Model()
+    if obj_id in models:
+        return models[obj_id]
+    listed = sorted(models)
+    few = ", ".join(map(str, listed[:10])) + (", …" if len(listed) > 10 else "")
+    got = f"unknown object {obj_id}; {INFO_FILE} has {few}"
+    report.report(place[0], f"{place[1]}.obj_id", got)
+    return Model()
 
 
 class _Object:
-    """One object of an image."""
+    """One object of an image, and where its records stand."""
 
-    def __init__(
-        self, report: CheckReport, place: Place, number: int, truth: Any, models: Models | None
-    ) -> None:
-        self._report, self._number, self._truth = report, number, mapping(truth)
-        self._path, start = place("gt")
-        self._start = f"{start}[{number}]"
-        self._info_path, start = place("gt_info")
-        self._info_start = f"{start}[{number}]"
-        self._model = self._find_model(models)
+    def __init__(self, report: CheckReport, place: Place, n: int, model: Model) -> None:
+        self._report, self._number, self._model = report, n, model
+        self._path, self._start = place("gt", n)
+        self._info_path, self._info_start = place("gt_info", n)
 
-    def _add(self, field: str, message: str) -> None:
-        self._report.add(self._path, f"{self._start}.{field}", message)
+    def _add(self, field: str, got: str) -> None:
+        self._report.report(self._path, f"{self._start}.{field}", got)
 
-    def _add_info(self, field: str, message: str) -> None:
-        self._report.add(self._info_path, f"{self._info_start}.{field}", message)
-
-    def _find_model(self, models: Models | None) -> Model:
-        number = self._truth.get("obj_id")
-        if type(number) is not int or number < 0:
-            self._add("obj_id", f"{number!r:.40}; allowed: an object's number")
-        elif models is not None and number not in models:
-            self._add("obj_id", f"unknown object {number}; models_info.json has {_few(models)}")
-        elif models is not None:
-            return models[number]
-        return Model(None, None)
+    def _add_info(self, field: str, got: str) -> None:
+        self._report.report(self._info_path, f"{self._info_start}.{field}", got)
 
     def check(
         self,
-        info: Any,
-        K: NDArray[np.float64] | None,
+        T_cam_obj: Float[np.ndarray, "4 4"],
+        fraction: float | None,
+        info: Record | None,
+        K: Float[np.ndarray, "3 3"] | None,
         silhouettes: Silhouettes,
     ) -> None:
-        T = self._pose()
+        place = translation_problem(T_cam_obj[:3, 3], self._model.diameter)
+        if place is not None:
+            self._add(f"cam_t_m2c.{place[0]}", place[1])
         whole, visible = silhouettes.whole(self._number), silhouettes.visible(self._number)
         if whole is not None and visible is not None and whole.shape == visible.shape:
             outside = int(np.count_nonzero(visible & ~whole))
             if outside > PIXEL_TOLERANCE * visible.sum():
                 self._add("mask_visib", f"{outside} visible pixels outside the whole mask")
-        fraction, seen = None, None if visible is None else Box.of_mask(visible)
+        seen = None if visible is None else Box.of_mask(visible)
         if info is not None:
-            fraction, seen = self._info(info, visible, seen)
-        if T is None or K is None or self._model.corners is None:
-            return
-        points = self._model.corners @ T[:, :3].T + T[:, 3]
-        problem = box_problem(points, K, seen, fraction)
-        if problem is not None:
-            self._add("box", problem)
+            self._check_counts(info, visible, fraction)
+            seen = self._check_boxes(info, seen)
+        is_posed = place is None and bool(np.isfinite(T_cam_obj).all())
+        if is_posed and K is not None and self._model.corners is not None:
+            points = transform(T_cam_obj, self._model.corners)
+            problem = box_problem(points, K, seen, fraction)
+            if problem is not None:
+                self._add("box", problem)
 
-    def _pose(self) -> NDArray[np.float64] | None:
-        """Return [R t], None where the object has no usable pose."""
-        read = self._report, self._path
-        R = numbers(*read, f"{self._start}.cam_R_m2c", self._truth.get("cam_R_m2c"), 3, 3)
-        t = numbers(*read, f"{self._start}.cam_t_m2c", self._truth.get("cam_t_m2c"), 3)
-        problem = None if R is None else rotation_problem(R)
-        if problem is not None:
-            self._add("cam_R_m2c", problem)
-        place = None if t is None else translation_problem(t, self._model.diameter)
-        if place is not None:
-            self._add(f"cam_t_m2c.{place[0]}", place[1])
-        if R is None or t is None or problem or place:
-            return None
-        return np.column_stack([R, t])
-
-    def _info(
-        self, info: Any, visible: Mask | None, seen: Box | None
-    ) -> tuple[float | None, Box | None]:
-        """Check ``scene_gt_info``'s record; return the visible fraction and the visible box."""
-        info = mapping(info)
-        fraction = self._number_of(info, "visib_fract")
-        if fraction is not None and not 0 <= fraction <= 1:
-            self._add_info("visib_fract", f"{fraction:g}; allowed: 0 … 1")
-            fraction = None
-        total, count = (self._number_of(info, f"px_count_{what}") for what in ("all", "visib"))
-        if total is not None and count is not None:
-            if not 0 <= count <= total:
-                self._add_info("px_count_visib", f"{count:g} of {total:g} pixels")
-            elif fraction is not None and total > 0:
-                quotient = count / total
-                slack = FRACTION_TOLERANCE + 1 / np.sqrt(total)
-                if abs(quotient - fraction) > slack:
-                    message = f"{fraction:.3g}, the pixel counts say {quotient:.3g}"
-                    self._add_info("visib_fract", message)
-        if visible is not None and count is not None:
+    def _check_counts(
+        self, info: Mapping[str, Any], visible: Mask | None, fraction: float | None
+    ) -> None:
+        """Hold pixel counts against each other, the visible fraction and the mask."""
+        total, count = (
+            scalar(self._report, self._info_path, f"{self._info_start}.{field}", info[field])
+            if field in info
+            else np.nan
+            for field in ("px_count_all", "px_count_visib")
+        )
+        if count < 0 or count > total:
+            self._add_info("px_count_visib", f"{count:g} of {total:g} pixels")
+        elif fraction is not None and total > 0:
+            slack = FRACTION_TOLERANCE + 1 / np.sqrt(total)
+            if abs(count / total - fraction) > slack:
+                got = f"{fraction:.3g}, the pixel counts say {count / total:.3g}"
+                self._add_info("visib_fract", got)
+        if visible is not None:
             pixels = int(np.count_nonzero(visible))
             if abs(pixels - count) > PIXEL_TOLERANCE * max(pixels, count) + np.sqrt(pixels):
                 self._add_info("px_count_visib", f"{count:g}, mask_visib has {pixels} pixels")
-        stated = self._box_of(info, "bbox_visib")
-        self._box_of(info, "bbox_obj")
-        if seen is not None and stated is not None and seen.distance(stated) > BOX_EDGE_PX:
-            self._add_info("bbox_visib", f"{stated}, mask_visib has {seen}")
-        return fraction, seen or stated
 
-    def _number_of(self, info: Any, field: str) -> float | None:
-        if field not in info:
-            return None
-        where = f"{self._info_start}.{field}"
-        value = numbers(self._report, self._info_path, where, info[field], 1)
-        return None if value is None else float(value[0])
-
-    def _box_of(self, info: Any, field: str) -> Box | None:
-        if field not in info:
-            return None
-        where = f"{self._info_start}.{field}"
-        value = numbers(self._report, self._info_path, where, info[field], 4)
-        return None if value is None else Box.of_bop(value)
-
-
-def _few(models: Models) -> str:
-    listed = sorted(models)
-    return ", ".join(map(str, listed[:10])) + (", …" if len(listed) > 10 else "")
+    def _check_boxes(self, info: Mapping[str, Any], seen: Box | None) -> Box | None:
+        """Hold ``bbox_visib`` against the mask's box; return the latter, or else the former."""
+        stated: dict[str, Box | None] = {}
+        for field in ("bbox_visib", "bbox_obj"):
+            if field in info:
+                where = f"{self._info_start}.{field}"
+                values = numbers(self._report, self._info_path, where, info[field], 4)
+                stated[field] = Box.of_bop(values)
+        box = stated.get("bbox_visib")
+        if seen is not None and box is not None and seen.distance(box) > BOX_EDGE_PX:
+            self._add_info("bbox_visib", f"{box}, mask_visib has {seen}")
+        return seen or box

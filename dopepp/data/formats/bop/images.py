@@ -1,30 +1,107 @@
-"""Masks in BOP-WebDataset: run lengths down the columns, as COCO's uncompressed RLE.
+"""BOP's images as bytes, in a file or in a tar member: read whole or refused, and written.
 
+Masks in BOP-WebDataset are run lengths down the columns, as COCO's uncompressed RLE:
 ``{"size": [height, width], "counts": [zeros, ones, zeros, …]}``.
-
-BOP's images as bytes, in a file or in a tar member, read whole or refused.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
-from PIL import Image
 
-from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import MAX_PIXELS, whole_picture
-
-FORMATS: Final = ("PNG", "JPEG", "TIFF")
+from dopepp.data.formats.problems import STRICT, Problems, mapping, one_channel, picture
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
 """Millimetres a unit of the depth images that are written: up to 6.5 m, and up to 65 m."""
 
+DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
+"""Pillow's names of the whole numbers that a depth image may hold."""
+
 _MAX_UNITS: Final = 65_535
-_DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
+
+
+def decode_rgb(content: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Read a colour or grey image as RGB; an alpha channel is dropped.
+
+    Args:
+        content: The file.
+        where: Its name, for the error.
+
+    Raises:
+        UserError: It is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
+    """
+    image = picture(STRICT, where, content)
+    assert image is not None
+    if image.mode not in ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr"):
+        STRICT.report(where, "image", f"pixels of type {image.mode}", "colour or grey of 8 bits")
+    return np.array(image.convert("RGB"))
+
+
+def decode_depth(
+    content: bytes, where: str, depth_scale: float, shape: tuple[int, int]
+) -> Float[np.ndarray, "height width"]:
+    """Read a depth image as metres, float32, 0 where unknown.
+
+    Args:
+        content: The file.
+        where: Its name, for the error.
+        depth_scale: Millimetres a unit; NaN where it is not stated.
+        shape: (height, width) of the colour image.
+
+    Raises:
+        UserError: As :func:`decode_rgb`, or it is of another size, has no whole numbers, or no
+            scale.
+    """
+    units = one_channel_of(STRICT, where, shape, content, DEPTH_MODES)
+    assert units is not None
+    if np.isnan(depth_scale):
+        allowed = "depth_scale (mm a unit) beside the image's cam_K"
+        STRICT.report(where, "image", "no depth_scale", allowed)
+    return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
+
+
+def decode_mask(
+    content: bytes, where: str, shape: tuple[int, int]
+) -> Bool[np.ndarray, "height width"]:
+    """Read a mask of an image of ``shape`` (height, width); every pixel but 0 is the object's.
+
+    Raises:
+        UserError: As :func:`decode_rgb`, or it is of another size or has several channels.
+    """
+    mask = one_channel_of(STRICT, where, shape, content)
+    assert mask is not None
+    return np.asarray(mask != 0)
+
+
+def one_channel_of(
+    problems: Problems,
+    path: Path | str,
+    shape: tuple[int, int] | None,
+    content: bytes | None = None,
+    modes: tuple[str, ...] = (),
+) -> NDArray[Any] | None:
+    """Read a depth image or a mask as it is, None where that is impossible.
+
+    Args:
+        problems: Takes what is wrong.
+        path: The file.
+        shape: The colour image's (height, width); None for any.
+        content: Its bytes, where they do not lie on the disk by themselves.
+        modes: Pillow's names of the pixels it may have; none for any with one channel.
+    """
+    image = picture(problems, path, content)
+    if image is None:
+        return None
+    if len(image.getbands()) > 1 or (modes and image.mode not in modes):
+        allowed = "one channel of 16-bit whole numbers" if modes else "one channel"
+        problems.report(path, "channels", f"pixels of type {image.mode}", allowed)
+        return None
+    return one_channel(problems, path, np.asarray(image), shape)
 
 
 def encode_png(pixels: NDArray[Any]) -> bytes:
@@ -53,84 +130,6 @@ def depth_units(
     return np.where(units <= _MAX_UNITS, units, 0).astype(np.uint16), scale
 
 
-def decode_rgb(content: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Read a colour or grey image as RGB; an alpha channel is dropped.
-
-    Args:
-        content: The file.
-        where: Its name, for the error.
-
-    Raises:
-        UserError: It is none of :data:`FORMATS`, damaged, too large, or not of 8 bits.
-    """
-    image = _decode(content, where)
-    if image.mode not in ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr"):
-        raise _bad(where, f"pixels of type {image.mode}", "colour or grey of 8 bits")
-    return np.array(image.convert("RGB"))
-
-
-def decode_depth(
-    content: bytes, where: str, depth_scale: float, shape: tuple[int, int]
-) -> Float[np.ndarray, "height width"]:
-    """Read a depth image as metres, float32, 0 where unknown.
-
-    Args:
-        content: The file.
-        where: Its name, for the error.
-        depth_scale: Millimetres a unit; NaN where it is not stated.
-        shape: (height, width) of the colour image.
-
-    Raises:
-        UserError: It is none of :data:`FORMATS`, damaged, of another size, has no whole numbers, or
-            no scale.
-    """
-    image = _decode(content, where)
-    if image.mode not in _DEPTH_MODES:
-        raise _bad(where, f"pixels of type {image.mode}", "one channel of 16-bit whole numbers")
-    if np.isnan(depth_scale):
-        raise _bad(where, "no depth_scale", "depth_scale (mm a unit) beside the image's cam_K")
-    _check_shape(image, where, shape)
-    return (np.asarray(image, np.float64) * (depth_scale / 1000)).astype(np.float32)
-
-
-def decode_mask(
-    content: bytes, where: str, shape: tuple[int, int]
-) -> Bool[np.ndarray, "height width"]:
-    """Read a mask; every pixel but 0 belongs to the object.
-
-    Args:
-        content: The file.
-        where: Its name, for the error.
-        shape: (height, width) of the colour image.
-
-    Raises:
-        UserError: It is none of :data:`FORMATS`, damaged, of another size or has several channels.
-    """
-    image = _decode(content, where)
-    if len(image.getbands()) != 1:
-        raise _bad(where, f"pixels of type {image.mode}", "one channel")
-    _check_shape(image, where, shape)
-    return np.asarray(np.asarray(image) != 0)
-
-
-def _check_shape(image: Image.Image, where: str, shape: tuple[int, int]) -> None:
-    if (image.height, image.width) != shape:
-        allowed = f"{shape[1]}×{shape[0]}, the colour image's size"
-        raise _bad(where, f"{image.width}×{image.height} pixels", allowed)
-
-
-def _decode(content: bytes, where: str) -> Image.Image:
-    allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
-    try:
-        return whole_picture(content, FORMATS)
-    except ValueError as error:
-        raise _bad(where, f"{len(content)} bytes: {error}", allowed) from error
-
-
-def _bad(where: str, got: str, allowed: str) -> UserError:
-    return UserError(f"image {where}: {got}", allowed, "copy or download the file again")
-
-
 def encode_runs(mask: Bool[np.ndarray, "height width"]) -> dict[str, list[int]]:
     """Return a mask as run lengths, the first of which counts zeros."""
     pixels = mask.ravel(order="F")
@@ -140,32 +139,33 @@ def encode_runs(mask: Bool[np.ndarray, "height width"]) -> dict[str, list[int]]:
 
 
 def decode_runs(
-    record: object, shape: tuple[int, int], where: str
-) -> Bool[np.ndarray, "height width"]:
-    """Read a mask of an image of ``shape`` (height, width).
+    record: object,
+    shape: tuple[int, int],
+    path: Path | str,
+    where: str = "",
+    problems: Problems = STRICT,
+) -> Bool[np.ndarray, "height width"] | None:
+    """Read a mask of an image of ``shape`` (height, width), None where that is impossible.
+
+    It must have that size, so a file cannot ask for more memory, and its runs must fill it.
 
     Args:
         record: A plain JSON value that anybody may have written.
-        shape: What its size must be: so a file cannot ask for more memory.
-        where: Its place, for the error.
-
-    Raises:
-        UserError: The record lacks a field, has another size, or its runs do not fill the image.
+        shape: The image's (height, width).
+        path: The file.
+        where: The mask's place in it.
+        problems: Takes what is wrong.
     """
-    fields: dict[str, Any] = record if isinstance(record, dict) else {}
+    fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")
-    if size != list(shape):
-        raise _bad_bop_masks(where, f"size {size!r:.40}", f"[{shape[0]}, {shape[1]}], the image's")
     whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
-    if not whole or counts is None or sum(counts) != shape[0] * shape[1]:
-        raise _bad_bop_masks(
-            where,
-            f"counts {counts!r:.40}",
-            f"a list of run lengths that add up to {shape[0] * shape[1]} pixels",
-        )
-    pixels = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
-    return np.asarray(pixels.reshape(shape, order="F"))
-
-
-def _bad_bop_masks(where: str, got: str, allowed: str) -> UserError:
-    return UserError(f"{where}: {got}", allowed, "write the mask again")
+    if size != list(shape):
+        got, allowed = f"size {size!r:.40}", f"[{shape[0]}, {shape[1]}], the image's"
+    elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
+        got = f"counts {counts!r:.40}"
+        allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"
+    else:
+        pixels = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+        return np.asarray(pixels.reshape(shape, order="F"))
+    problems.report(path, where, got, allowed)
+    return None

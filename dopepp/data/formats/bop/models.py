@@ -1,4 +1,4 @@
-"""BOP's object models: ``models/obj_000001.ply`` and ``models_info.json``, millimetres.
+"""BOP's object models, read and written: ``obj_000001.ply`` and ``models_info.json``, millimetres.
 
 ``models_info.json`` carries, beside BOP's own keys, the part's ``name``, which other tools ignore;
 an object without one is called after its file, ``obj_000001``.
@@ -6,6 +6,7 @@ an object without one is called after its file, ``obj_000001``.
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import re
@@ -15,14 +16,27 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.core.json import read_json
-from dopepp.data.formats.bop.records import MM, numbers
-from dopepp.geometry.rotation import is_rotation
+from dopepp.core.files import write_whole
+from dopepp.data.formats.bop.images import encode_png
+from dopepp.data.formats.bop.records import MM
+from dopepp.data.formats.bop.scene import is_number
+from dopepp.data.formats.problems import (
+    STRICT,
+    Problems,
+    attempt,
+    entries,
+    load_object,
+    mapping,
+    numbers,
+    scalar,
+)
+from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import MAX_SYMMETRIES, Part, check_name, make_part
+from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +44,8 @@ MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 """Where data sets keep their models, the full ones first."""
 
 INFO_FILE: Final = "models_info.json"
+
+_ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
 _DIAMETER_TOLERANCE: Final = 0.01
 """Share by which a stated diameter may differ from the mesh's: decimated models differ by less."""
@@ -103,34 +119,6 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     return numbered
 
 
-def read_models(root: Path) -> dict[int, ModelInfo]:
-    """Return the objects of ``models_info.json`` by number; none where there is no such file.
-
-    Raises:
-        UserError: The file is damaged, or two objects share a name.
-    """
-    paths = [root / folder / INFO_FILE for folder in MODEL_FOLDERS]
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        return {}
-    return parse_models(path, read_json(path))
-
-
-def parse_models(path: Path, records: object) -> dict[int, ModelInfo]:
-    """Return the objects of what a ``models_info.json`` holds, by number.
-
-    Raises:
-        UserError: It holds something else, or two objects share a name.
-    """
-    if not isinstance(records, dict) or not all(re.fullmatch(r"[0-9]{1,9}", k) for k in records):
-        raise _bad(f"{path}", 'objects by number: {"1": {"diameter": …}, …}')
-    infos = {int(key): _info(path, key, record) for key, record in records.items()}
-    names = [info.name for info in infos.values()]
-    if len(infos) < len(records) or len(set(names)) < len(names):
-        raise _bad(f"{path} with two objects of one number or name", "each once")
-    return dict(sorted(infos.items()))
-
-
 def _part(info: ModelInfo) -> Part:
     part = make_part(
         info.name,
@@ -147,32 +135,83 @@ def _part(info: ModelInfo) -> Part:
     return part
 
 
-def _info(path: Path, key: str, record: object) -> ModelInfo:
-    where = f"{path}: object {key}"
+def read_models(root: Path) -> dict[int, ModelInfo]:
+    """Return the objects of ``models_info.json`` by number; none where there is no such file.
+
+    Raises:
+        UserError: The file is damaged, or two objects share a name.
+    """
+    path = info_path(root)
+    if path is None:
+        return {}
+    return parse_models(path, load_object(STRICT, path, _ALLOWED))
+
+
+def info_path(root: Path) -> Path | None:
+    """Return where a data set's ``models_info.json`` is, None where there is none."""
+    paths = (root / folder / INFO_FILE for folder in MODEL_FOLDERS)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
+    """Return the objects of what a ``models_info.json`` holds, by number.
+
+    Args:
+        path: The file.
+        records: What it holds.
+        problems: Takes what is wrong, e.g. two objects of one name.
+    """
+    if not isinstance(records, dict):
+        problems.report(path, "top level", f"{records!r:.60}", _ALLOWED)
+    infos: dict[int, ModelInfo] = {}
+    names: set[str] = set()
+    for key, record in mapping(records).items():
+        if not is_number(key) or int(key) in infos:
+            problems.report(path, f"{key!r:.40}", "no object's number, or one twice", _ALLOWED)
+            continue
+        info = _info(path, key, record, problems)
+        if info.name in names:
+            problems.report(path, f"{key}.name", f"{info.name!r:.60} twice", "each name once")
+        names.add(info.name)
+        infos[int(key)] = info
+    return dict(sorted(infos.items()))
+
+
+def _info(path: Path, key: str, record: object, problems: Problems) -> ModelInfo:
     if not isinstance(record, dict):
-        raise _bad(where, "an object with diameter and symmetries")
+        problems.report(path, key, f"{record!r:.60}", "an object with diameter and symmetries")
+    fields = mapping(record)
     model = f"obj_{int(key):06d}"
     diameter = math.nan
-    if "diameter" in record:
-        diameter = float(numbers([record["diameter"]], 1, f"{where}: diameter")[0]) / MM
+    if "diameter" in fields:
+        diameter = scalar(problems, path, f"{key}.diameter", fields["diameter"]) / MM
         if diameter <= 0:
-            raise _bad(f"{where}: diameter of {diameter} m", "millimetres above 0")
+            got = f"{fields['diameter']!r:.40}"
+            problems.report(path, f"{key}.diameter", got, "millimetres above 0")
+            diameter = math.nan
+    name = attempt(problems, path, f"{key}.name", lambda: check_name(fields.get("name", model)))
     return ModelInfo(
-        check_name(record.get("name", model)),
+        name or model,
         path.parent / f"{model}.ply",
         diameter,
-        _discrete(record.get("symmetries_discrete"), where),
-        _continuous(record.get("symmetries_continuous"), where),
+        _discrete(problems, path, f"{key}.symmetries_discrete", fields),
+        _continuous(problems, path, f"{key}.symmetries_continuous", fields),
     )
 
 
-def _discrete(value: object, where: str) -> Float[np.ndarray, "symmetries 4 4"] | None:
-    where = f"{where}: symmetries_discrete"
+def _discrete(
+    problems: Problems, path: Path, where: str, fields: Mapping[str, object]
+) -> Float[np.ndarray, "symmetries 4 4"] | None:
     transforms = []
-    for row in _rows(value, where):
-        matrix = numbers(row, 16, where).reshape(4, 4)
-        if not is_rotation(matrix[:3, :3]) or (matrix[3] != [0, 0, 0, 1]).any():
-            raise _bad(where, "rigid transforms [R t; 0 0 0 1], row by row")
+    for place, row in enumerate(_rows(problems, path, where, fields.get("symmetries_discrete"))):
+        matrix = numbers(problems, path, f"{where}[{place}]", row, 4, 4)
+        problem = rotation_problem(matrix[:3, :3])
+        if problem is not None or (matrix[3] != [0, 0, 0, 1]).any():
+            got = problem or f"a last row of {matrix[3].tolist()}"
+            if np.isfinite(matrix).all():
+                allowed = "rigid transforms [R t; 0 0 0 1], row by row"
+                problems.report(path, f"{where}[{place}]", got, allowed)
+            continue
         matrix[:3, 3] /= MM
         if not np.allclose(matrix, np.eye(4), atol=1e-9):
             transforms.append(matrix)
@@ -180,29 +219,128 @@ def _discrete(value: object, where: str) -> Float[np.ndarray, "symmetries 4 4"] 
 
 
 def _continuous(
-    value: object, where: str
+    problems: Problems, path: Path, where: str, fields: Mapping[str, object]
 ) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-    where = f"{where}: symmetries_continuous"
     pairs = []
-    for row in _rows(value, where):
-        fields: Mapping[str, object] = row if isinstance(row, dict) else {}
+    rows = _rows(problems, path, where, fields.get("symmetries_continuous"))
+    for place, row in enumerate(entries(problems, path, where, rows)):
+        start = f"{where}[{place}]"
         axis, offset = (
-            numbers(fields.get("axis"), 3, where),
-            numbers(fields.get("offset"), 3, where),
+            numbers(problems, path, f"{start}.{name}", row.get(name), 3)
+            for name in ("axis", "offset")
         )
         if not axis.any():
-            raise _bad(where, "an axis other than 0")
+            problems.report(path, f"{start}.axis", "zero", "an axis other than 0")
         pairs.append((tuple(axis.tolist()), tuple((offset / MM).tolist())))
     return tuple(pairs)
 
 
-def _rows(value: object, where: str) -> list[Any]:
+def _rows(problems: Problems, path: Path, where: str, value: object) -> list[Any]:
     if value is None:
         return []
-    if not isinstance(value, list) or len(value) > MAX_SYMMETRIES:
-        raise _bad(where, f"a list of at most {MAX_SYMMETRIES}")
-    return value
+    if isinstance(value, list) and len(value) <= MAX_SYMMETRIES:
+        return value
+    problems.report(path, where, f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
+    return []
 
 
-def _bad(got: str, allowed: str) -> UserError:
-    return UserError(got, allowed, "correct the file or download it again")
+def write_models(root: Path, parts: Sequence[Part]) -> None:
+    """Write the parts as objects 1, 2, …; ``models_info.json`` last, as the sign that all is there.
+
+    Raises:
+        UserError: A part has no mesh, or the folder holds models of other parts.
+    """
+    meshes = [part.mesh for part in parts]
+    for part in parts:
+        if part.mesh is None:
+            raise UserError(
+                f"part {part.name} without a mesh", "parts that were read from a mesh file",
+                "give the part's mesh file",
+            )  # fmt: skip
+    folder = root / MODEL_FOLDERS[0]
+    entries = {str(number): model_info(part) for number, part in enumerate(parts, start=1)}
+    content = (json.dumps(entries, indent=2, ensure_ascii=False) + "\n").encode()
+    path = folder / INFO_FILE
+    if path.exists():
+        if path.read_bytes() != content:
+            raise UserError(
+                f"{path}, written for other parts", f"a folder for {[p.name for p in parts]}",
+                "choose an empty folder",
+            )  # fmt: skip
+        return
+    for number, mesh in enumerate(meshes, start=1):
+        assert mesh is not None
+        texture = f"obj_{number:06d}.png" if mesh.texture is not None else None
+        write_whole(folder / f"obj_{number:06d}.ply", ply_bytes(mesh, texture))
+        if texture is not None and mesh.texture is not None:
+            write_whole(folder / texture, encode_png(mesh.texture))
+    write_whole(path, content)
+
+
+def model_info(part: Part) -> dict[str, object]:
+    """Return a part's entry in ``models_info.json``: millimetres, transforms row by row."""
+    lower = part.cuboid[:8].min(axis=0) * MM
+    size = part.cuboid[:8].max(axis=0) * MM - lower
+    record: dict[str, object] = {"name": part.name, "diameter": part.diameter * MM}
+    for axis, first, extent in zip("xyz", lower.tolist(), size.tolist(), strict=True):
+        record |= {f"min_{axis}": first, f"size_{axis}": extent}
+    if part.symmetries_discrete is not None and len(part.symmetries_discrete):
+        scaled = part.symmetries_discrete * np.array([1, 1, 1, MM])[None, None]
+        scaled[:, 3, 3] = 1
+        record["symmetries_discrete"] = scaled.reshape(-1, 16).tolist()
+    if part.symmetries_continuous:
+        record["symmetries_continuous"] = [
+            {"axis": list(axis), "offset": [value * MM for value in offset]}
+            for axis, offset in part.symmetries_continuous
+        ]
+    return record
+
+
+def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
+    """Return a mesh as binary PLY.
+
+    Args:
+        mesh: Metres.
+        texture_name: File name of its texture, written beside the PLY; None without one.
+    """
+    textured = texture_name is not None and mesh.uv is not None
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    columns = [mesh.vertices * MM, vertex_normals(mesh.vertices, mesh.faces)]
+    if textured:
+        names += ["texture_u", "texture_v"]
+        columns.append(np.asarray(mesh.uv))
+    vertices = np.hstack(columns).astype("<f4")
+    faces: NDArray[Any] = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *([f"comment TextureFile {texture_name}"] if textured else []),
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in names),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Return unit normals, weighted by the angles of the faces around a vertex as BOP's are.
+
+    Source: Thürmer and Wüthrich, "Computing vertex normals from polygonal facets", 1998.
+    """
+    corners = vertices[faces]
+    edges = corners[:, [1, 2, 0]] - corners
+    across = np.cross(edges[:, 0], edges[:, 1])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), np.finfo(float).tiny)
+    angles = np.arccos(np.clip(-(unit * unit[:, [2, 0, 1]]).sum(axis=2), -1, 1))
+    normals = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], angles[:, corner, None] * across)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.maximum(lengths, 1e-12))

@@ -1,19 +1,22 @@
 """BOP's annotations as checked arrays: camera, poses, visible fractions; millimetres to metres.
 
-The same records stand in ``scene_*.json`` (by image) and in a shard's ``KEY.*.json``.
+The same records stand in ``scene_*.json`` (by image) and in a shard's ``KEY.*.json``. What is wrong
+with one goes to the :class:`~dopepp.data.formats.problems.Problems` and leaves NaN in the arrays.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dopepp.core.errors import UserError
+from dopepp.data.formats.problems import FARTHEST, STRICT, Problems, mapping, numbers
+from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.data.sample import Instance, hull_areas
 from dopepp.geometry.camera import project, project_keypoints, transform
 from dopepp.parts.part import Part
@@ -26,13 +29,10 @@ ESTIMATED: Final = (
 )
 """How :func:`make_instance` gets a visible fraction that the annotation does not state."""
 
-_FARTHEST: Final = 1e6
-"""Metres; squares of such distances stay finite."""
+Record = Mapping[str, Any]
 
-_ROTATION_TOLERANCE: Final = 1e-3
-
-Place = Callable[[int], str]
-"""Says where the record of a number stands: file and image, for the error."""
+Place = Callable[[str, int], tuple[Path | str, str]]
+"""From ``camera``, ``gt`` or ``gt_info`` and a record's number to (file, start of the field)."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class BopPoses:
     """The posed objects of one or more images.
 
     Attributes:
-        obj_ids: BOP's object numbers.
-        T_cam_obj: Rigid transforms, metres.
+        obj_ids: BOP's object numbers; −1 where damaged.
+        T_cam_obj: Rigid transforms, metres; with NaN where damaged.
         visible_fractions: As stated, NaN where they are not.
     """
 
@@ -51,52 +51,80 @@ class BopPoses:
 
 
 def read_cameras(
-    records: Sequence[object], place: Place
+    records: Sequence[object], place: Place, problems: Problems = STRICT
 ) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]]:
     """Return every image's K in pixels and its ``depth_scale`` (mm a unit; NaN where not stated).
 
-    Raises:
-        UserError: A record is no camera, or a scale is not above 0.
+    A record that is no camera, and a scale that is not above 0, is a problem.
     """
-    K = _column(records, "cam_K", 9, place).reshape(-1, 3, 3)
-    stated = [i for i, r in enumerate(records) if isinstance(r, dict) and "depth_scale" in r]
+    K = _column(records, "cam_K", 9, place, "camera", problems).reshape(-1, 3, 3)
+    stated = [n for n, record in enumerate(records) if "depth_scale" in mapping(record)]
     scales = np.full(len(records), math.nan)
     scales[stated] = _column(
-        [records[i] for i in stated], "depth_scale", 1, lambda i: place(stated[i])
-    )[:, 0]
+        [records[n] for n in stated], "depth_scale", 1,
+        lambda what, n: place(what, stated[n]), "camera", problems,
+    )[:, 0]  # fmt: skip
     for number in np.flatnonzero(scales <= 0):
-        raise _bad(f"{place(int(number))}: depth_scale {scales[number]}", "millimetres above 0")
+        path, start = place("camera", int(number))
+        problems.report(path, f"{start}.depth_scale", f"{scales[number]:g}", "millimetres above 0")
     return K, scales
 
 
-def read_poses(truths: Sequence[object], infos: Sequence[object] | None, place: Place) -> BopPoses:
+def pair_infos(
+    truths: Sequence[Record], infos: Sequence[Record], path: Path | str, where: str,
+    problems: Problems = STRICT,
+) -> list[Record | None]:  # fmt: skip
+    """Return one ``gt_info`` record for each of an image's objects, None where there is none."""
+    if len(infos) != len(truths):
+        allowed = f"{len(truths)}, as many as have a pose"
+        problems.report(path, where, f"{len(infos)} objects", allowed)
+    return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
+
+
+def read_poses(
+    truths: Sequence[Record],
+    infos: Sequence[Record | None],
+    place: Place,
+    problems: Problems = STRICT,
+) -> BopPoses:
     """Return the objects of ``gt`` and ``gt_info`` records.
+
+    A field that is missing or of another shape, a matrix that is no rotation, and a fraction that
+    is not in [0, 1] is a problem.
 
     Args:
         truths: Records with ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
         infos: As many records with ``visib_fract``; None where there are none.
-        place: Says where the record of a number stands.
-
-    Raises:
-        UserError: A field is missing or has another type or shape, a rotation is none, or a
-            fraction is not in [0, 1].
+        place: Says where a record stands.
+        problems: Takes what is wrong.
     """
-    rotations = _column(truths, "cam_R_m2c", 9, place).reshape(-1, 3, 3)
-    translations = _column(truths, "cam_t_m2c", 3, place) / MM
-    ids = _column(truths, "obj_id", 1, place)[:, 0]
-    for number in np.flatnonzero(~_are_rotations(rotations)):
-        raise _bad(f"{place(int(number))}: cam_R_m2c", "a rotation matrix, row by row")
-    for number in np.flatnonzero((np.abs(translations) > _FARTHEST).any(axis=1)):
-        raise _bad(f"{place(int(number))}: cam_t_m2c {translations[number]} m", "millimetres")
-    for number in np.flatnonzero((ids != np.rint(ids)) | (ids < 0) | (ids > 1e9)):
-        raise _bad(f"{place(int(number))}: obj_id {ids[number]}", "an object's number")
+
+    def report(number: int, field: str, got: str, allowed: str, what: str = "gt") -> None:
+        path, start = place(what, number)
+        problems.report(path, f"{start}.{field}", got, allowed)
+
+    rotations = _column(truths, "cam_R_m2c", 9, place, "gt", problems).reshape(-1, 3, 3)
     poses = np.tile(np.eye(4), (len(truths), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, translations
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = _column(truths, "cam_t_m2c", 3, place, "gt", problems) / MM
+    ids = _column(truths, "obj_id", 1, place, "gt", problems)[:, 0]
+    for number in np.flatnonzero(~_are_rotations(rotations)).tolist():
+        if problem := rotation_problem(rotations[number]):
+            report(number, "cam_R_m2c", problem, "a rotation matrix, row by row")
+        poses[number, :3, :3] = math.nan
+    for number in np.flatnonzero((ids % 1 != 0) | (ids < 0)).tolist():
+        if math.isfinite(ids[number]):
+            report(number, "obj_id", f"{ids[number]:g}", "an object's number")
+        ids[number] = -1
+    stated = [n for n, info in enumerate(infos) if info is not None]
     fractions = np.full(len(truths), math.nan)
-    if infos is not None:
-        fractions = _column(infos, "visib_fract", 1, place)[:, 0]
-        for number in np.flatnonzero((fractions < 0) | (fractions > 1)):
-            raise _bad(f"{place(int(number))}: visib_fract {fractions[number]}", "0 – 1")
+    fractions[stated] = _column(
+        [infos[n] for n in stated], "visib_fract", 1,
+        lambda what, n: place(what, stated[n]), "gt_info", problems,
+    )[:, 0]  # fmt: skip
+    for number in np.flatnonzero((fractions < 0) | (fractions > 1)).tolist():
+        report(number, "visib_fract", f"{fractions[number]:g}", "0 – 1", "gt_info")
+        fractions[number] = math.nan
     return BopPoses(ids.astype(np.int64), poses, fractions)
 
 
@@ -130,29 +158,10 @@ def make_instance(
     return Instance(part.name, T_cam_obj, keypoints, visible_fraction, mask)
 
 
-def numbers(value: object, count: int, where: str) -> Float[np.ndarray, " count"]:
-    """Return a list of ``count`` plain numbers as an array.
-
-    Raises:
-        UserError: It is anything else.
-    """
-    array = np.array([_float(number) for number in value] if isinstance(value, list) else [])
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise _bad(f"{where}: {value!r:.60}", f"{count} finite numbers")
-    return array
-
-
-def _float(number: Any) -> float:
-    try:
-        return float(number) if type(number) in (int, float) else math.nan
-    except OverflowError:  # an integer above 1e308
-        return math.nan
-
-
 def _column(
-    records: Sequence[object], field: str, count: int, place: Place
+    records: Sequence[object], field: str, count: int, place: Place, what: str, problems: Problems
 ) -> Float[np.ndarray, "records count"]:
-    """Return a field of all records; one by one only to find the one that is wrong.
+    """Return a field of all records; one by one only to find those that are wrong.
 
     Nested lists of the right size, ``[[…], […], […]]`` for a matrix, are taken as other tools do.
     """
@@ -164,20 +173,19 @@ def _column(
     except (IndexError, KeyError, TypeError, ValueError):
         table = np.empty((0, 0), object)
     if table.shape == (len(records), count) and table.dtype.kind in "iuf":
-        return table.astype(np.float64)
+        table = table.astype(np.float64)
+        if (np.abs(table) <= FARTHEST).all():
+            return table
     rows = []
     for number, record in enumerate(records):
-        value = record.get(field) if isinstance(record, dict) else None
-        value = [value] if count == 1 else value
-        rows.append(numbers(value, count, f"{place(number)}: {field}"))
+        path, start = place(what, number)
+        value = mapping(record).get(field)
+        rows.append(numbers(problems, path, f"{start}.{field}", value, count))
     return np.array(rows)
 
 
 def _are_rotations(matrices: Float[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:
-    with np.errstate(over="ignore", invalid="ignore"):
+    """Tell as :func:`~dopepp.geometry.rotation.is_rotation` does, of all at once."""
+    with np.errstate(invalid="ignore"):  # of NaN
         error = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        return np.asarray((error <= _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
-
-
-def _bad(got: str, allowed: str) -> UserError:
-    return UserError(got, allowed, "correct the annotation or download it again")
+        return np.asarray((error <= 1e-3) & (np.linalg.det(matrices) > 0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,14 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from dopepp.core.errors import UserError
-from dopepp.core.json import read_json
-from dopepp.data.formats.bop.records import BopPoses, read_cameras, read_poses
+from dopepp.data.formats.bop.records import (
+    BopPoses,
+    Record,
+    pair_infos,
+    read_cameras,
+    read_poses,
+)
+from dopepp.data.formats.problems import STRICT, Problems, entries, load_object
 
 _log = logging.getLogger(__name__)
 
@@ -23,8 +27,22 @@ MAX_SCENE_BYTES: Final = 128_000_000
 
 IMAGE_FOLDERS: Final = ("rgb", "gray")
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
-_MAX_ID: Final = 10**9
+
+@dataclass(frozen=True)
+class SceneRecords:
+    """What a scene's JSON files hold, by image.
+
+    Attributes:
+        cameras: ``scene_camera.json``.
+        truths: ``scene_gt.json``: one record per object.
+        infos: ``scene_gt_info.json``: one for each of them, None where it is missing.
+    """
+
+    cameras: Mapping[int, object]
+    truths: Mapping[int, list[Record]]
+    infos: Mapping[int, list[Record | None]]
 
 
 @dataclass(frozen=True)
@@ -62,7 +80,7 @@ class SceneFolder:
 
 def scene_folders(split_dir: Path) -> list[Path]:
     """Return a split's scenes by number: the folders that are called by one."""
-    numbered = [path for path in split_dir.iterdir() if _is_number(path.name) and path.is_dir()]
+    numbered = [path for path in split_dir.iterdir() if is_number(path.name) and path.is_dir()]
     return sorted(numbered, key=lambda path: (int(path.name), path.name))
 
 
@@ -77,34 +95,36 @@ def read_scene(folder: Path, wanted: set[int]) -> SceneFolder:
     Raises:
         UserError: A file is missing or damaged, or a record is impossible.
     """
-    path = folder / "scene_camera.json"
-    cameras = _by_image(path)
+    records = read_records(folder)
+    cameras, truths, infos = records.cameras, records.truths, records.infos
     images = sorted(cameras)
-    K, scales = read_cameras([cameras[i] for i in images], lambda n: f"{path}: image {images[n]}")
-    truths, infos = _objects(folder, "scene_gt.json"), _objects(folder, "scene_gt_info.json")
-    _check_counts(folder, truths, infos)
     if without := truths.keys() - cameras.keys():
         _log.warning(
             "%s: %d images have ground truth and no camera, and are left out; first: %d",
             folder, len(without), min(without),
         )  # fmt: skip
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
+
+    def place(what: str, number: int) -> tuple[Path, str]:
+        row, n = (number, None) if what == "camera" else owners[number]
+        field = f"{images[row]}" if n is None else f"{images[row]}[{n}]"
+        return folder / f"scene_{what}.json", field
+
+    K, scales = read_cameras([cameras[i] for i in images], place)
     poses = read_poses(
         [truths[images[row]][n] for row, n in owners],
-        [infos[images[row]][n] for row, n in owners] if infos else None,
-        lambda k: (
-            f"{folder / 'scene_gt.json'} (or _info): image {images[owners[k][0]]}, "
-            f"object {owners[k][1]}"
-        ),
+        [infos[images[row]][n] if infos else None for row, n in owners],
+        place,
     )
     table = np.array(owners, np.int64).reshape(-1, 2)
     is_wanted = np.isin(poses.obj_ids, sorted(wanted))
     is_behind = poses.T_cam_obj[:, 2, 3] <= 0
     keep = is_wanted & ~is_behind
+    files = image_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
     return SceneFolder(
         folder,
         np.array(images, np.int64),
-        _image_files(folder, images),
+        [files[i].relative_to(folder).as_posix() if i in files else "" for i in images],
         K,
         scales,
         np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
@@ -115,68 +135,62 @@ def read_scene(folder: Path, wanted: set[int]) -> SceneFolder:
     )
 
 
-def _objects(folder: Path, name: str) -> Mapping[int, list[Any]]:
+def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
+    """Read a scene's JSON files; the two with ground truth may be missing."""
+    cameras = _by_image(folder / "scene_camera.json", problems)
+    truths, infos = (_objects(folder / f"scene_{n}.json", problems) for n in ("gt", "gt_info"))
+    path = folder / "scene_gt_info.json"
+    paired: dict[int, list[Record | None]] = {}
+    for image, objects in truths.items() if infos else ():
+        if image not in infos:
+            problems.report(path, f"{image}", "missing", f"{len(objects)} objects")
+        paired[image] = (
+            pair_infos(objects, infos[image], path, f"{image}", problems)
+            if image in infos
+            else [None] * len(objects)
+        )
+    for image in sorted(infos.keys() - truths.keys()):
+        paired[image] = []
+    return SceneRecords(cameras, truths, paired)
+
+
+def _objects(path: Path, problems: Problems) -> dict[int, list[Any]]:
     """Return each image's list of records; nothing where there is no such file."""
-    path = folder / name
-    if not path.exists():
-        return {}
-    by_image = _by_image(path)
-    for image, records in by_image.items():
-        if not isinstance(records, list):
-            raise _bad(f"{path}: image {image}", "a list of objects")
-    return by_image
+    by_image = _by_image(path, problems) if path.exists() else {}
+    return {image: entries(problems, path, f"{image}", rows) for image, rows in by_image.items()}
 
 
-def _by_image(path: Path) -> dict[int, Any]:
-    records = read_json(path, MAX_SCENE_BYTES)
-    if not isinstance(records, dict):
-        raise _bad(f"{path}", 'images by number: {"0": …, "1": …}')
+def _by_image(path: Path, problems: Problems) -> dict[int, Any]:
+    allowed = 'images by number: {"0": …, "1": …}'
     by_image: dict[int, Any] = {}
-    for key, record in records.items():
-        number = int(key) if _is_number(key) else -1
-        if number < 0 or number in by_image:
-            raise _bad(f"{path}: image {key!r:.40}", f"each number 0 – {_MAX_ID - 1} once")
-        by_image[number] = record
+    for key, record in (load_object(problems, path, allowed, MAX_SCENE_BYTES) or {}).items():
+        if not is_number(key):
+            problems.report(path, f"{key!r:.40}", "no image's number", allowed)
+        elif int(key) in by_image:
+            problems.report(path, f"{key!r:.40}", f"image {int(key)} twice", "each once")
+        else:
+            by_image[int(key)] = record
     return by_image
 
 
-def _check_counts(
-    folder: Path, truths: Mapping[int, list[Any]], infos: Mapping[int, list[Any]]
-) -> None:
-    if not infos:
-        return
-    for image, records in truths.items():
-        stated = len(infos[image]) if image in infos else math.nan
-        if stated != len(records):
-            raise _bad(
-                f"{folder / 'scene_gt_info.json'}: image {image} with {stated} objects",
-                f"{len(records)}, as many as in scene_gt.json",
-            )
-
-
-def _image_files(folder: Path, images: list[int]) -> list[str]:
-    """Find every image in ``rgb`` or ``gray``; folders are listed once, no image is opened."""
-    found: dict[int, str] = {}
-    for name in IMAGE_FOLDERS:
-        if not (folder / name).is_dir():
+def image_files(
+    scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], problems: Problems = STRICT
+) -> dict[int, Path]:
+    """Return the images of the first of some folders that is there, by number, all unread."""
+    folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder is not None else ():
+        if not is_number(path.stem) or path.suffix.lower() not in suffixes:
             continue
-        for path in (folder / name).iterdir():
-            if not (_is_number(path.stem) and path.suffix.lower() in IMAGE_SUFFIXES):
-                continue
-            if int(path.stem) in found:
-                raise _bad(
-                    f"{folder}: image {int(path.stem)} as {found[int(path.stem)]} and "
-                    f"{name}/{path.name}",
-                    "one file an image",
-                )
-            found[int(path.stem)] = f"{name}/{path.name}"
-        break
-    return [found.get(image, "") for image in images]
+        number = int(path.stem)
+        if number in found:
+            got = f"image {number} twice, also as {found[number].name}"
+            problems.report(path, "file", got, "one file an image")
+        else:
+            found[number] = path
+    return found
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Tell whether a key or a name is an image's, an object's or a scene's number."""
     return text.isascii() and text.isdecimal() and len(text) < 10
-
-
-def _bad(got: str, allowed: str) -> UserError:
-    return UserError(got, allowed, "correct the file or download it again")

@@ -12,7 +12,6 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,11 +21,18 @@ from dopepp.core.json import read_json
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import ESTIMATED, make_instance
-from dopepp.data.formats.bop.scene import SceneFolder, read_scene, scene_folders
+from dopepp.data.formats.bop.scene import (
+    DEPTH_SUFFIXES,
+    SceneFolder,
+    read_scene,
+    scene_folders,
+)
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import read_content
 from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
 
 
 def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
@@ -70,11 +76,6 @@ def read_targets(path: Path) -> set[tuple[int, int]]:
             )  # fmt: skip
         images.add((pair[0], pair[1]))
     return images
-
-
-_log = logging.getLogger(__name__)
-
-_DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
 
 class BopSource:
@@ -198,7 +199,7 @@ class BopSource:
         """Read the depth image; None in a scene without any."""
         if not (scene.folder / "depth").is_dir():
             return None
-        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in _DEPTH_SUFFIXES]
+        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in DEPTH_SUFFIXES]
         path = next((path for path in paths if path.exists()), paths[0])
         scale = float(scene.depth_scales[row])
         return decode_depth(read_content(path), str(path), scale, shape)

@@ -3,114 +3,29 @@
 ``train_pbr/000012/`` holds images 12,000 – 12,999: rgb, depth, mask and mask_visib as PNG, and
 ``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. An image's records lie in the
 scene's hidden folder ``.items`` until the scene is finalized.
-
-One finalizer at a time, and a hidden folder for the items that are not finalized yet.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
+from dopepp.data.formats import STAGING, finalizing, stage, staged_items
 from dopepp.data.formats.bop.images import encode_png
 from dopepp.data.formats.bop.labels import Labels, make_labels
-from dopepp.data.formats.bop.model_writer import write_models
-from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS
+from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS, write_models
 from dopepp.data.formats.bop.scene import MAX_SCENE_BYTES
 from dopepp.data.sample import Sample
 from dopepp.parts.part import Part
 from dopepp.virtual.surface import Surface, make_surface
-
-STAGING: Final = ".items"
-"""Folder of staged items; readers pass over hidden names."""
-
-T = TypeVar("T")
-
-_LOCK: Final = "lock"
-_ATTEMPTS: Final = 100
-
-
-def stage(path: Path, content: bytes) -> None:
-    """Write a staged item, also if a finalizer removes the empty folder in the same moment."""
-    retry(lambda: write_whole(path, content))
-
-
-def staged_items(staging: Path, suffix: str) -> list[Path]:
-    """Return the staged items in order, none if a finalizer removes the folder meanwhile."""
-    try:
-        return sorted(staging.glob(f"[0-9]*{suffix}"))
-    except FileNotFoundError:
-        return []
-
-
-@contextmanager
-def finalizing(staging: Path) -> Iterator[None]:
-    """Hold a folder of staged items; it goes in the end if nothing is left in it.
-
-    A killed process holds nothing: the system releases its lock. Two that both merge and then
-    remove staged items would otherwise lose what one of them had not seen.
-    """
-    path = staging / _LOCK
-    with _locked(path):
-        yield
-        if not any(entry.name != _LOCK for entry in staging.iterdir()):
-            path.unlink()
-            try:
-                staging.rmdir()
-            except OSError:  # another process has staged an item in this moment
-                return
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    while True:
-        descriptor = retry(lambda: _open(path))
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # Whoever held it before may have removed the file: then the next one makes another.
-            if _is_same(descriptor, path):
-                yield
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _open(path: Path) -> int:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return os.open(path, os.O_RDWR | os.O_CREAT)
-
-
-def retry(act: Callable[[], T]) -> T:
-    """Return what ``act`` does in a folder that it makes and a finalizer may remove at any moment.
-
-    Removed before it is used, the folder is not found; removed between ``mkdir`` and its look at
-    what is in the way, it "exists". What stays in the way is raised in the end.
-    """
-    for _ in range(_ATTEMPTS - 1):
-        try:
-            return act()
-        except (FileNotFoundError, FileExistsError):
-            continue
-    return act()
-
-
-def _is_same(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
-
 
 IMAGES_A_SCENE: Final = 1000
 """As in BOP's own rendered training sets."""

@@ -1,66 +1,26 @@
 """Hold the fields of one NDDS object against each other and against the image.
 
-What may differ between NDDS data sets but not within one, counted object by object.
+Tolerances beside those of :mod:`~dopepp.data.formats.tolerances`: a stated projection lies within
+2 px and 2 % of the cuboid's longer side of where K puts the 3-D point; edges of a cuboid are
+perpendicular and equal within 2 %, and its class's within 5 %; an orientation agrees with the
+cuboid's within 2 degrees.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Bool, Float
 
-from dopepp.data.formats.ndds.check_fields import (
-    EDGE_SHARE,
-    ObjectFields,
-    box_axes,
-    quarter_turn_distance,
-    size_problem,
-    text,
-)
-from dopepp.data.formats.problems import CheckReport
+from dopepp.data.formats.ndds.fields import NddsObject
+from dopepp.data.formats.problems import CheckReport, mapping, numbers
 from dopepp.data.formats.tolerances import Box, box_problem, translation_problem
 from dopepp.geometry.camera import project
-from dopepp.geometry.rotation import is_rotation
-
-DOCUMENTED: Final = {
-    "quaternion_xyzw": "x, y, z, w",
-    "bounding_box": "row, column",
-    "camera axes": "OpenCV",
-}
-"""NDDS's own habits."""
-
-_MAX_MINORITY: Final = 1000
-"""Objects of each habit that are remembered, in case they turn out to be the minority."""
-
-
-class Conventions:
-    """Collects habits; a data set's common one is noted, another one is a defect."""
-
-    def __init__(self, report: CheckReport) -> None:
-        self._report = report
-        self._votes: dict[str, Counter[str]] = {}
-        self._places: dict[tuple[str, str], list[tuple[Path, str]]] = {}
-
-    def vote(self, habit: str, value: str, path: Path, where: str) -> None:
-        """Count one object's habit."""
-        self._votes.setdefault(habit, Counter())[value] += 1
-        places = self._places.setdefault((habit, value), [])
-        if len(places) < _MAX_MINORITY:
-            places.append((path, where))
-
-    def conclude(self) -> None:
-        """Note each habit that is not NDDS's own, and report the objects that have another."""
-        for habit, votes in self._votes.items():
-            (common, number), *rest = votes.most_common()
-            if common != DOCUMENTED[habit]:
-                self._report.note(f"{habit}: {common} ({number:,} objects)")
-            for value, _ in rest:
-                for path, where in self._places[habit, value]:
-                    self._report.add(path, where, f"{value}; {number:,} objects have {common}")
-
+from dopepp.geometry.rotation import is_rotation, quaternion_to_matrix, rotation_angle
 
 PROJECTION_PX: Final = 2.0
 PROJECTION_SHARE: Final = 0.02
@@ -72,178 +32,348 @@ ORIENTATION_RAD: Final = np.deg2rad(2.0)
 MATRIX_TOLERANCE: Final = 5e-3
 """Of ``pose_transform`` from a rotation: FAT rounds to four digits."""
 
+NORM_TOLERANCE: Final = 0.01
+"""Of a quaternion's norm from 1: FAT rounds to four digits."""
+
+EDGE_SHARE: Final = 0.02
+"""Of the longest edge: by how much edges may be unequal, slanted, or thin to have no direction."""
+
+SIZE_SHARE: Final = 0.05
+"""By how much edges may differ from the class's ``cuboid_dimensions``."""
+
+_EDGES: Final = np.array(
+    [
+        [(1, 0), (2, 3), (5, 4), (6, 7)],
+        [(0, 3), (1, 2), (4, 7), (5, 6)],
+        [(4, 0), (5, 1), (6, 2), (7, 3)],
+    ]
+)
+"""Corner pairs of the edges along x, y and z, from the negative to the positive end."""
+
 _OPENGL: Final = np.diag([1.0, -1.0, -1.0])
+
+_DOCUMENTED: Final = {
+    "quaternion_xyzw": "x, y, z, w",
+    "bounding_box": "row, column",
+    "camera axes": "OpenCV",
+}
+"""What NDDS itself does."""
+
+_MAX_MINORITY: Final = 1000
+"""Objects of each way that are remembered, in case they turn out to be the minority."""
+
+
+class Majority:
+    """Which of several ways a data set does something: what most objects do is noted, not wrong."""
+
+    def __init__(self, report: CheckReport) -> None:
+        self._report = report
+        self._votes: dict[str, Counter[str]] = {}
+        self._places: dict[tuple[str, str], list[tuple[Path, str]]] = {}
+
+    def vote(self, subject: str, way: str, path: Path, where: str) -> None:
+        """Count which way one object does it."""
+        self._votes.setdefault(subject, Counter())[way] += 1
+        places = self._places.setdefault((subject, way), [])
+        if len(places) < _MAX_MINORITY:
+            places.append((path, where))
+
+    def conclude(self) -> None:
+        """Note each way that is not NDDS's own, and report the objects that have another."""
+        for subject, votes in self._votes.items():
+            (common, number), *rest = votes.most_common()
+            if common != _DOCUMENTED[subject]:
+                self._report.note(f"{subject}: {common} ({number:,} objects)")
+            for way, _ in rest:
+                for path, where in self._places[subject, way]:
+                    self._report.report(path, where, f"{way}; {number:,} objects have {common}")
 
 
 class ObjectCheck:
     """One object; lengths are in the file's unit, whatever it is.
 
     Args:
-        fields: Its fields.
+        report: Takes the defects.
         path: The annotation.
-        habits: Collects what the data set does one way or the other.
+        one: The object as the reader understands it.
+        item: The object as it is in the file.
+        majority: Collects what the data set does one way or the other.
     """
 
-    def __init__(self, fields: ObjectFields, path: Path, habits: Conventions) -> None:
-        self._fields, self._path, self._habits = fields, path, habits
+    def __init__(
+        self,
+        report: CheckReport,
+        path: Path,
+        one: NddsObject,
+        item: Mapping[str, Any],
+        majority: Majority,
+    ) -> None:
+        self._report, self._path, self._item, self._majority = report, path, item, majority
+        self._field, self._visibility = one.field, one.visibility
+        self._location, self._quaternion = _known(one.location), _known(one.quaternion)
+        self._projected, self._cuboid = _known(one.corners_px), _known(one.cuboid)
+        self._centroid = _known(one.centroid)
+        name = "projected_cuboid_centroid"
+        self._projected_centroid = self._numbers(name, item.get(name), 2)
 
     def check(
         self,
-        K: NDArray[np.float64] | None,
-        size: tuple[int, int] | None,
-        mask: NDArray[np.bool_] | None,
-        sides: NDArray[np.float64] | None,
+        K: Float[np.ndarray, "3 3"] | None,
+        shape: tuple[int, int] | None,
+        mask: Bool[np.ndarray, "height width"] | None,
+        sides: Float[np.ndarray, "3"] | None,
     ) -> None:
         """Check pose, cuboid, projections and boxes.
 
         Args:
             K: Camera matrix, None where it is not known.
-            size: (width, height) of the image, None where it cannot be read.
+            shape: (height, width) of the image, None where it cannot be read.
             mask: The object's pixels, None where they are not known.
             sides: Its class's ``cuboid_dimensions``, None where they are not known.
         """
-        fields = self._fields
-        if fields.cuboid is not None:
-            problem = None if sides is None else size_problem(fields.cuboid, sides)
+        rotations = self._rotations()
+        if self._cuboid is not None and not _is_box(self._cuboid):
+            self._add("cuboid", "no box in NDDS order: edges not parallel, equal or perpendicular")
+            self._cuboid = None
+        if self._cuboid is not None:
+            problem = None if sides is None else _size_problem(self._cuboid, sides)
             if problem is not None:
-                fields.add(f"cuboid.{problem[0]}", problem[1])
-            self._check_orientation(fields.cuboid)
-        self._check_transforms()
+                self._add(f"cuboid.{problem[0]}", problem[1])
+            self._check_orientation(self._cuboid, rotations)
+        self._check_transforms(rotations)
+        # The file itself may say that nobody sees the object, or not know.
+        is_hidden = self._visibility is not None and self._visibility <= 0
         seen = None if mask is None else Box.of_mask(mask)
-        if seen is not None and not fields.is_hidden:
-            self._check_bounding_box(seen)
-        if fields.location is None or fields.is_hidden:
+        self._check_bounding_box(None if is_hidden else seen)
+        if self._location is None or is_hidden:
             return
-        axes = self._camera_axes(fields.location, K)
-        if self._is_place_possible(fields.location, axes) and K is not None:
-            fraction = None if mask is None else fields.visibility
-            self._check_image(axes, K, size, seen, fraction)
+        axes = self._camera_axes(self._location, K)
+        if self._is_place_possible(self._location, axes) and K is not None:
+            fraction = None if mask is None else self._visibility
+            self._check_image(axes, K, shape, seen, fraction)
 
-    def _check_orientation(self, cuboid: NDArray[np.float64]) -> None:
+    def _add(self, field: str, got: str) -> None:
+        self._report.report(self._path, f"{self._field}.{field}", got)
+
+    def _numbers(self, field: str, value: object, *shape: int) -> Float[np.ndarray, "..."] | None:
+        """Read a field that no source needs; None where it is missing or damaged."""
+        if value is None:
+            return None
+        return _known(numbers(self._report, self._path, f"{self._field}.{field}", value, *shape))
+
+    def _rotations(self) -> dict[str, Float[np.ndarray, "3 3"]]:
+        """Return the rotation by either order of ``quaternion_xyzw``, none where it is damaged."""
+        stored = self._quaternion
+        if stored is None:
+            return {}
+        norm = float(np.linalg.norm(stored))
+        if abs(norm - 1) > NORM_TOLERANCE:
+            got = f"no rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
+            self._add("quaternion_xyzw", got)
+            return {}
+        return {
+            "x, y, z, w": quaternion_to_matrix(np.roll(stored, 1)),
+            "w, x, y, z": quaternion_to_matrix(stored),
+        }
+
+    def _check_orientation(
+        self,
+        cuboid: Float[np.ndarray, "8 3"],
+        rotations: Mapping[str, Float[np.ndarray, "3 3"]],
+    ) -> None:
         """Hold the quaternion against the cuboid: equal up to quarter turns, in either order."""
-        axes, rotations = box_axes(cuboid), self._fields.rotations
-        if axes is None or rotations is None:
+        axes = _box_axes(cuboid)
+        if axes is None or not rotations:
             return
         fits = {
-            order: quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
+            order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
             for order, rotation in rotations.items()
         }
         self._judge("quaternion_xyzw", fits, "not the cuboid's orientation in either order")
 
-    def _judge(self, habit: str, fits: dict[str, bool], problem: str) -> None:
-        """Count which of two habits a field has, where it can be told; neither is a defect."""
+    def _judge(self, field: str, fits: dict[str, bool], problem: str) -> None:
+        """Count which of two ways a field has, where it can be told; neither is a defect."""
         if not any(fits.values()):
-            self._fields.add(habit, problem)
+            self._add(field, problem)
         elif not all(fits.values()):
-            value = next(value for value, fit in fits.items() if fit)
-            self._habits.vote(habit, value, self._path, self._fields.place(habit))
+            way = next(way for way, fit in fits.items() if fit)
+            self._majority.vote(field, way, self._path, f"{self._field}.{field}")
 
-    def _check_transforms(self) -> None:
+    def _check_transforms(self, rotations: Mapping[str, Float[np.ndarray, "3 3"]]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
-        fields = self._fields
-        for name, matrix in fields.transforms.items():
+        for name in ("pose_transform", "pose_transform_permuted"):
+            matrix = self._numbers(name, self._item.get(name), 4, 4)
+            if matrix is None:
+                continue
             linear = matrix[:3, :3]
             upright = linear * np.sign(np.linalg.det(linear))
             if not is_rotation(upright, MATRIX_TOLERANCE):
-                fields.add(name, f"no rotation (mirrored or not) within {MATRIX_TOLERANCE}")
+                self._add(name, f"no rotation (mirrored or not) within {MATRIX_TOLERANCE}")
                 continue
-            candidates = [
-                quarter_turn_distance(rotation.T @ turned)
-                for rotation in (fields.rotations or {}).values()
+            distances = [
+                _quarter_turn_distance(rotation.T @ turned)
+                for rotation in rotations.values()
                 for turned in (upright, upright.T)
             ]
-            if candidates and min(candidates) > ORIENTATION_RAD:
-                fields.add(name, "another rotation than quaternion_xyzw, in either order")
-            if fields.location is not None:
+            if distances and min(distances) > ORIENTATION_RAD:
+                self._add(name, "another rotation than quaternion_xyzw, in either order")
+            if self._location is not None:
                 places = matrix[3, :3], matrix[:3, 3]
-                scale = max(1.0, float(np.abs(fields.location).max()))
-                if min(np.abs(p - fields.location).max() for p in places) > EDGE_SHARE * scale:
-                    message = f"translation {text(places[0])}; location {text(fields.location)}"
-                    fields.add(name, message)
+                scale = max(1.0, float(np.abs(self._location).max()))
+                if min(np.abs(p - self._location).max() for p in places) > EDGE_SHARE * scale:
+                    got = f"translation {_text(places[0])}; location {_text(self._location)}"
+                    self._add(name, got)
 
-    def _check_bounding_box(self, seen: Box) -> None:
+    def _check_bounding_box(self, seen: Box | None) -> None:
         """Hold the stated box, which may be the whole object's, against what is seen."""
-        if self._fields.bounding_box is None:
+        stated = mapping(self._item.get("bounding_box"))
+        if not stated:
             return
-        (a, b), (c, d) = (corner.tolist() for corner in self._fields.bounding_box)
-        boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
-        fits = {order: box.holds(seen, PROJECTION_PX) for order, box in boxes.items()}
-        problem = f"{boxes['row, column']} does not hold the mask's {seen}"
-        self._judge("bounding_box", fits, problem)
+        first, last = (
+            _known(numbers(self._report, self._path, f"{self._field}.bounding_box.{name}",
+                           stated.get(name), 2))
+            for name in ("top_left", "bottom_right")
+        )  # fmt: skip
+        if first is None or last is None:
+            return
+        if (first > last).any():
+            got = f"top_left {first.tolist()}, bottom_right {last.tolist()}"
+            self._add("bounding_box", got)
+        elif seen is not None:
+            (a, b), (c, d) = first.tolist(), last.tolist()
+            boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
+            fits = {order: box.holds(seen, PROJECTION_PX) for order, box in boxes.items()}
+            problem = f"{boxes['row, column']} does not hold the mask's {seen}"
+            self._judge("bounding_box", fits, problem)
 
     def _camera_axes(
-        self, location: NDArray[np.float64], K: NDArray[np.float64] | None
-    ) -> NDArray[np.float64]:
+        self, location: Float[np.ndarray, "3"], K: Float[np.ndarray, "3 3"] | None
+    ) -> Float[np.ndarray, "3 3"]:
         """Return the file's camera axes as a matrix into OpenCV's.
 
         A point behind an OpenCV camera is before an OpenGL one if it then projects to where the
         file says.
         """
-        fields, is_opengl = self._fields, False
-        is_before = fields.cuboid is not None and fields.cuboid[:, 2].mean() > 0
-        if location[2] < 0 and not is_before and fields.projected is not None and K is not None:
-            middle, slack = project(_OPENGL @ location, K), np.ptp(fields.projected, axis=0)
-            low = fields.projected.min(axis=0) - slack
-            high = fields.projected.max(axis=0) + slack
+        projected, is_opengl = self._projected, False
+        is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
+        if location[2] < 0 and not is_before and projected is not None and K is not None:
+            middle, slack = project(_OPENGL @ location, K), np.ptp(projected, axis=0)
+            low, high = projected.min(axis=0) - slack, projected.max(axis=0) + slack
             is_opengl = bool(((low <= middle) & (middle <= high)).all())
-        value = "OpenGL" if is_opengl else "OpenCV"
-        self._habits.vote("camera axes", value, self._path, fields.place("location"))
+        way = "OpenGL" if is_opengl else "OpenCV"
+        self._majority.vote("camera axes", way, self._path, f"{self._field}.location")
         return _OPENGL if is_opengl else np.eye(3)
 
-    def _is_place_possible(self, location: NDArray[np.float64], axes: NDArray[np.float64]) -> bool:
+    def _is_place_possible(
+        self, location: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
+    ) -> bool:
         """Check location, centroid and unit; tell whether projections can mean anything."""
-        fields, cuboid = self._fields, self._fields.cuboid
+        cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
         problem = translation_problem(axes @ location, diagonal)
         if problem is not None:
-            fields.add(f"location.{problem[0]}", problem[1])
+            self._add(f"location.{problem[0]}", problem[1])
             return False
         if cuboid is None or diagonal is None:
             return True
         middle = cuboid.mean(axis=0)
-        centroid = fields.centroid
         if centroid is not None and np.linalg.norm(centroid - middle) > EDGE_SHARE * diagonal:
-            fields.add("cuboid_centroid", f"{text(centroid)}; the cuboid's is {text(middle)}")
+            self._add("cuboid_centroid", f"{_text(centroid)}; the cuboid's is {_text(middle)}")
         if np.linalg.norm(location - middle) <= 2 * diagonal:
             return True
-        message = f"{text(location)}, far from its cuboid at {text(middle)}: in another unit?"
-        fields.add("location.unit", message)
+        got = f"{_text(location)}, far from its cuboid at {_text(middle)}: in another unit?"
+        self._add("location.unit", got)
         return False
 
     def _check_image(
         self,
-        axes: NDArray[np.float64],
-        K: NDArray[np.float64],
-        size: tuple[int, int] | None,
+        axes: Float[np.ndarray, "3 3"],
+        K: Float[np.ndarray, "3 3"],
+        shape: tuple[int, int] | None,
         seen: Box | None,
         fraction: float | None,
     ) -> None:
         """Hold projections and what is seen against the cuboid, or against each other."""
-        fields = self._fields
-        if fields.cuboid is not None:
-            points = fields.cuboid @ axes.T
+        if self._cuboid is not None:
+            points = self._cuboid @ axes.T
             self._check_projections(points, K)
-        elif fields.projected is not None:
+        elif self._projected is not None:
             # Points at depth 1 that project onto what the file states.
-            rays = np.column_stack([fields.projected, np.ones(len(fields.projected))])
+            rays = np.column_stack([self._projected, np.ones(len(self._projected))])
             points = rays @ np.linalg.inv(K).T
         else:
             return
-        problem = box_problem(points, K, seen, fraction, size)
+        problem = box_problem(points, K, seen, fraction, shape)
         if problem is not None:
-            fields.add("box", problem)
+            self._add("box", problem)
 
-    def _check_projections(self, cuboid: NDArray[np.float64], K: NDArray[np.float64]) -> None:
+    def _check_projections(
+        self, cuboid: Float[np.ndarray, "8 3"], K: Float[np.ndarray, "3 3"]
+    ) -> None:
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # of what reaches behind the camera, projections mean nothing
         allowed = PROJECTION_PX + PROJECTION_SHARE * float(np.ptp(expected, axis=0).max())
         pairs = (
-            ("projected_cuboid", self._fields.projected, expected[:8]),
-            ("projected_cuboid_centroid", self._fields.projected_centroid, expected[8:]),
+            ("projected_cuboid", self._projected, expected[:8]),
+            ("projected_cuboid_centroid", self._projected_centroid, expected[8:]),
         )
         for name, stated, true in pairs:
             distance = 0.0 if stated is None else np.linalg.norm(stated - true, axis=-1).max()
             if distance > allowed:
-                message = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
-                self._fields.add(name, message)
+                got = f"{distance:.3g} px from the cuboid's image (allowed {allowed:.2g} px)"
+                self._add(name, got)
+
+
+def _known(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
+    """Return a field's numbers, None where it is missing or damaged."""
+    return values if values is not None and np.isfinite(values).all() else None
+
+
+def _is_box(corners: Float[np.ndarray, "8 3"]) -> bool:
+    """Tell whether eight points are the corners of a box in NDDS order."""
+    edges = corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]
+    means = edges.mean(axis=1)
+    lengths = np.linalg.norm(means, axis=1)
+    if np.abs(edges - means[:, None]).max() > EDGE_SHARE * lengths.max():
+        return False
+    axes = _box_axes(corners)
+    return axes is None or bool(np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE)
+
+
+def _box_axes(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "3 3"] | None:
+    """Return the directions of a box's edges as columns; None for one that is flat."""
+    means = (corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]).mean(axis=1)
+    lengths = np.linalg.norm(means, axis=1)
+    if lengths.min() <= EDGE_SHARE * lengths.max():
+        return None
+    return np.asarray((means / lengths[:, None]).T)
+
+
+def _size_problem(
+    corners: Float[np.ndarray, "8 3"], sides: Float[np.ndarray, "3"]
+) -> tuple[str, str] | None:
+    """Say as (kind, message) how a box differs from its class's sides, None where it does not."""
+    edges = np.linalg.norm(corners[_EDGES[:, 0, 1]] - corners[_EDGES[:, 0, 0]], axis=1)
+    if np.abs(edges - sides).max() <= SIZE_SHARE * sides.max():
+        return None
+    power = np.log10(max(edges.max(), 1e-12) / sides.max())
+    in_another_unit = abs(round(power)) >= 1 and abs(power - round(power)) < SIZE_SHARE
+    message = f"edges {_text(edges)}; its class has cuboid_dimensions {_text(sides)}"
+    return ("unit" if in_another_unit else "size"), message
+
+
+def _quarter_turn_distance(rotation: Float[np.ndarray, "3 3"]) -> float:
+    """Return the angle to the nearest orthogonal matrix that maps axes onto axes, mirrored or not.
+
+    Frames of one object differ by such matrices between tools.
+    """
+    nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
+    if abs(np.linalg.det(nearest)) != 1:
+        return np.inf
+    return float(rotation_angle(nearest.T @ rotation))
+
+
+def _text(values: Float[np.ndarray, " n"]) -> str:
+    """Return numbers with four digits."""
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -23,7 +23,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ndds.fields import NddsObject, bad
+from dopepp.data.formats.ndds.fields import NddsObject
+from dopepp.data.formats.problems import STRICT
 from dopepp.geometry.camera import make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import quaternion_to_matrix
@@ -50,7 +51,7 @@ _OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Convention:
+class PoseConvention:
     """One way to write poses; the defaults are NDDS's own."""
 
     quaternion: Quaternion = "xyzw"
@@ -66,8 +67,8 @@ class Convention:
         )
 
 
-CONVENTIONS: Final = tuple(
-    Convention(quaternion, unit, camera, frame)
+POSE_CONVENTIONS: Final = tuple(
+    PoseConvention(quaternion, unit, camera, frame)
     for frame in FRAMES
     for camera in CAMERAS
     for unit in METRES
@@ -95,7 +96,7 @@ class Observation:
     fixed: Float[np.ndarray, "4 4"] | None
     path: Path
 
-    def T_cam_obj(self, convention: Convention) -> Float[np.ndarray, "4 4"] | None:  # noqa: N802
+    def T_cam_obj(self, convention: PoseConvention) -> Float[np.ndarray, "4 4"] | None:  # noqa: N802
         """Return the pose of the part's mesh, metres, or None where the convention cannot apply."""
         fixed = convention.frame.startswith("fixed")
         if fixed and self.fixed is None:
@@ -114,14 +115,14 @@ class Observation:
         axes = _OPENGL if convention.camera == "opengl" else np.eye(3)
         return make_transform(axes @ rotation, axes @ location)
 
-    def predicted_px(self, convention: Convention) -> Float[np.ndarray, "8 2"] | None:
+    def predicted_px(self, convention: PoseConvention) -> Float[np.ndarray, "8 2"] | None:
         """Return where the convention puts the file's corners, NaN behind the camera."""
         T_cam_obj = self.T_cam_obj(convention)
         if T_cam_obj is None:
             return None
         return project(transform(T_cam_obj, self._corners(convention)), self.K)
 
-    def error_px(self, convention: Convention) -> float:
+    def error_px(self, convention: PoseConvention) -> float:
         """Return the median distance from ``projected_cuboid``, infinite behind the camera."""
         predicted = self.predicted_px(convention)
         if predicted is None or self.item.corners_px is None:
@@ -129,7 +130,7 @@ class Observation:
         distances = np.linalg.norm(predicted - self.item.corners_px, axis=1)
         return float(np.median(np.nan_to_num(distances, nan=np.inf)))
 
-    def _corners(self, convention: Convention) -> NDArray[np.float64]:
+    def _corners(self, convention: PoseConvention) -> NDArray[np.float64]:
         """Return the corners the file lists, in its order, in the mesh frame, metres."""
         if convention.frame == "mesh, front x":
             return self._front_corners
@@ -184,10 +185,10 @@ class Finding:
         num_instances: How many instances were compared.
     """
 
-    convention: Convention
+    convention: PoseConvention
     error_px: float
     rival_px: float
-    undecided: tuple[Convention, ...]
+    undecided: tuple[PoseConvention, ...]
     num_instances: int
 
     def __str__(self) -> str:
@@ -215,13 +216,13 @@ def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     """
     errors = {
         convention: _most([one.error_px(convention) for one in observations])
-        for convention in CONVENTIONS
+        for convention in POSE_CONVENTIONS
     }
     ranked = sorted(errors, key=lambda one: errors[one])
     least = errors[ranked[0]]
     if not least <= MAX_ERROR_PX:
         raise _undecidable(where, "no known convention fits", ranked[:6], errors)
-    best = next(one for one in CONVENTIONS if errors[one] <= least + _ROUNDING_PX)
+    best = next(one for one in POSE_CONVENTIONS if errors[one] <= least + _ROUNDING_PX)
     rivals = [one for one in ranked if one != best]
     alike = tuple(one for one in rivals if _same_poses(observations, best, one))
     others = [one for one in rivals if one not in alike]
@@ -232,7 +233,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     return Finding(best, errors[best], rival, undecided, len(observations))
 
 
-def check_observation(one: Observation, convention: Convention) -> Float[np.ndarray, "4 4"]:
+def check_observation(one: Observation, convention: PoseConvention) -> Float[np.ndarray, "4 4"]:
     """Return an instance's pose after holding it against its own ``projected_cuboid``.
 
     Raises:
@@ -242,10 +243,10 @@ def check_observation(one: Observation, convention: Convention) -> Float[np.ndar
     T_cam_obj, field = one.T_cam_obj(convention), one.item.field
     if T_cam_obj is None:
         got = f"no fixed_model_transform of {one.item.label} in the object settings"
-        raise bad(one.path, f"{field}.class", got, f"one as for the others ({convention})")
+        STRICT.report(one.path, f"{field}.class", got, f"one as for the others ({convention})")
     if T_cam_obj[2, 3] <= 0:
         got = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
-        raise bad(one.path, f"{field}.location", got, f"one before it ({convention})")
+        STRICT.report(one.path, f"{field}.location", got, f"one before it ({convention})")
     predicted = one.predicted_px(convention)
     # Projections of what nobody sees or what reaches behind the camera mean nothing.
     if predicted is None or not np.isfinite(predicted).all() or one.item.visibility == 0:
@@ -253,11 +254,11 @@ def check_observation(one: Observation, convention: Convention) -> Float[np.ndar
     error, extent = one.error_px(convention), float(np.ptp(predicted, axis=0).max())
     if one.item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
         got = f"{error:.3g} px from where the pose puts the cuboid of {one.part.name}"
-        raise bad(one.path, f"{field}.projected_cuboid", got, f"the data set's {convention}")
+        STRICT.report(one.path, f"{field}.projected_cuboid", got, f"the data set's {convention}")
     return T_cam_obj
 
 
-def _same_poses(observations: Sequence[Observation], a: Convention, b: Convention) -> bool:
+def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
     """Tell whether two conventions put most instances' cuboids at the same place in space."""
     distances = []
     for one in observations:
@@ -275,7 +276,7 @@ def _most(values: Sequence[float]) -> float:
 
 
 def _undecidable(
-    where: str, why: str, shown: Sequence[Convention], errors: dict[Convention, float]
+    where: str, why: str, shown: Sequence[PoseConvention], errors: dict[PoseConvention, float]
 ) -> UserError:
     figures = "; ".join(f"{errors[one]:.3g} px: {one}" for one in shown)
     return UserError(

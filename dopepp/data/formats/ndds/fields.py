@@ -1,4 +1,7 @@
-"""The fields of an NDDS annotation, read strictly: what is there has its shape and its range."""
+"""The fields of an NDDS annotation: what is there has its shape and its range.
+
+What is wrong with one goes to the :class:`~dopepp.data.formats.problems.Problems`.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,29 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dopepp.core.errors import UserError
-from dopepp.core.json import read_json
+from dopepp.data.formats.problems import (
+    STRICT,
+    Problems,
+    entries,
+    load_object,
+    mapping,
+    numbers,
+)
 from dopepp.geometry.camera import camera_matrix
 
 MAX_ITEM_BYTES: Final = 16_000_000
 """Of one image's annotation; a hundred objects take 0.5 MB."""
 
-FARTHEST: Final = 1e9
-"""No coordinate is larger in any unit, and squares of such numbers stay exact enough."""
+_NORM_TOLERANCE: Final = 0.1
+"""Of a quaternion's norm from 1."""
+
+Objects = list[tuple[str, Mapping[str, Any], str]]
+"""(field, object, class) of every object of an annotation."""
 
 
 @dataclass(frozen=True)
 class NddsObject:
-    """One object as an annotation states it, units and orders still unknown.
+    """One object as an annotation states it, units and orders still unknown; NaN where damaged.
 
     Attributes:
         field: Where it stands, e.g. ``objects[2]``.
@@ -32,8 +44,9 @@ class NddsObject:
         location: Three numbers.
         quaternion: The four numbers under ``quaternion_xyzw``, in whatever order.
         corners_px: ``projected_cuboid`` without its centroid; None where it is not given.
+        cuboid: The same corners in space; None where they are not given.
         centroid: ``cuboid_centroid`` or, without one, the mean of ``cuboid``; None without both.
-        visibility: As given; None where it is not.
+        visibility: In [0, 1], or −1 for unknown; None where it is not given.
         segmentation_id: Value of its pixels in ``STEM.seg.png``; None where it is not given.
     """
 
@@ -42,130 +55,88 @@ class NddsObject:
     location: Float[np.ndarray, "3"]
     quaternion: Float[np.ndarray, "4"]
     corners_px: Float[np.ndarray, "8 2"] | None
+    cuboid: Float[np.ndarray, "8 3"] | None
     centroid: Float[np.ndarray, "3"] | None
     visibility: float | None
     segmentation_id: int | None
 
 
-def read_record(path: Path) -> Mapping[str, Any]:
-    """Read a JSON file whose top level is an object.
-
-    Raises:
-        UserError: As :func:`~dopepp.core.json.read_json`, or it is something else.
-    """
-    record = read_json(path, MAX_ITEM_BYTES)
-    if not isinstance(record, dict):
-        raise bad(path, "top level", type(record).__name__, "a JSON object { }")
-    return record
+def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
+    """Read an annotation or a settings file, None where that is impossible."""
+    return load_object(problems, path, max_bytes=MAX_ITEM_BYTES)
 
 
-def objects_of(record: Mapping[str, Any], path: Path) -> list[tuple[str, Mapping[str, Any], str]]:
-    """Return (field, object, class) of every object of an annotation.
-
-    Raises:
-        UserError: ``objects`` is missing or no list, or an object has no class.
-    """
-    objects = record.get("objects")
-    if not isinstance(objects, list):
-        raise bad(path, "objects", type(objects).__name__, "a list of objects")
-    found: list[tuple[str, Mapping[str, Any], str]] = []
-    for number, item in enumerate(objects):
-        field = f"objects[{number}]"
-        if not isinstance(item, dict) or not isinstance(item.get("class"), str):
-            raise bad(path, f"{field}.class", repr(item)[:80], "an object with a class name")
-        found.append((field, item, item["class"]))
+def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
+    """Return the objects of an annotation; each needs a class."""
+    found: Objects = []
+    for number, item in enumerate(entries(problems, path, "objects", record.get("objects"))):
+        field, label = f"objects[{number}]", item.get("class")
+        if not isinstance(label, str):
+            problems.report(path, f"{field}.class", f"{label!r:.60}", "a name")
+        found.append((field, item, label if isinstance(label, str) else ""))
     return found
 
 
-def parse_object(item: Mapping[str, Any], field: str, path: Path) -> NddsObject:
-    """Read the fields of one object.
+def parse_object(
+    item: Mapping[str, Any], field: str, path: Path, problems: Problems = STRICT
+) -> NddsObject:
+    """Read the fields of one object; it needs a location and a quaternion."""
 
-    Raises:
-        UserError: Location or quaternion are missing, or a field has the wrong shape.
-    """
+    def take(name: str, *shape: int) -> NDArray[np.float64]:
+        return numbers(problems, path, f"{field}.{name}", item.get(name), *shape)
 
-    def numbers(name: str, *shape: int) -> NDArray[np.float64] | None:
-        value = item.get(name)
-        return None if value is None else array(value, shape, path, f"{field}.{name}")
-
-    location, quaternion = numbers("location", 3), numbers("quaternion_xyzw", 4)
-    if location is None or quaternion is None:
-        missing = "location" if location is None else "quaternion_xyzw"
-        raise bad(path, f"{field}.{missing}", "nothing", "the object's pose")
-    if not 0.9 < np.linalg.norm(quaternion) < 1.1:
-        got = quaternion.tolist()
-        raise bad(path, f"{field}.quaternion_xyzw", repr(got), "a quaternion of norm 1")
-    centroid, cuboid = numbers("cuboid_centroid", 3), numbers("cuboid", -1, 3)
-    if centroid is None and cuboid is not None and len(cuboid) in (8, 9):
-        centroid = cuboid[:8].mean(axis=0)
-    visibility, segmentation = item.get("visibility"), item.get("segmentation_id")
+    quaternion = take("quaternion_xyzw", 4)
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > _NORM_TOLERANCE:
+        got = f"no rotation: norm {norm:.4g}"
+        problems.report(path, f"{field}.quaternion_xyzw", got, "a quaternion of norm 1")
+        quaternion = np.full(4, np.nan)
+    corners_px, cuboid = (
+        take(name, len(item[name]) if _has_centroid(item[name]) else 8, axes)[:8]
+        if item.get(name) not in (None, [])
+        else None
+        for name, axes in (("projected_cuboid", 2), ("cuboid", 3))
+    )
+    centroid = None if cuboid is None else cuboid.mean(axis=0)
+    if item.get("cuboid_centroid") is not None:
+        centroid = take("cuboid_centroid", 3)
+    visibility = None if item.get("visibility") is None else float(take("visibility", 1)[0])
+    if visibility is not None and (visibility > 1 or (visibility < 0 and visibility != -1)):
+        got = f"{visibility:g}"
+        problems.report(path, f"{field}.visibility", got, "0 … 1, or −1 for unknown")
+        visibility = None
+    number = item.get("segmentation_id")
     return NddsObject(
         field,
-        item["class"],
-        location,
+        str(item.get("class", "")),
+        take("location", 3),
         quaternion,
-        _corners(numbers("projected_cuboid", -1, 2), path, field),
+        corners_px,
+        cuboid,
         centroid,
-        None if visibility is None else _number(visibility, path, f"{field}.visibility"),
-        segmentation if isinstance(segmentation, int) and segmentation > 0 else None,
+        visibility,
+        number if isinstance(number, int) and number > 0 else None,
     )
 
 
-def _corners(
-    points: NDArray[np.float64] | None, path: Path, field: str
-) -> NDArray[np.float64] | None:
-    """Drop the centroid that some writers append as the ninth point."""
-    if points is None or not len(points):
-        return None
-    if len(points) not in (8, 9):
-        raise bad(path, f"{field}.projected_cuboid", f"{len(points)} points", "8 or 9 points")
-    return points[:8]
+def _has_centroid(points: object) -> bool:
+    """Tell whether a writer has appended the centroid as the ninth point."""
+    return isinstance(points, list) and len(points) == 9
 
 
-def array(value: object, shape: tuple[int, ...], path: Path, field: str) -> NDArray[np.float64]:
-    """Return nested lists of numbers as an array; −1 in ``shape`` stands for any length.
-
-    Raises:
-        UserError: It is something else, or a number is beyond all reason.
-    """
-    try:
-        numbers = np.array(value)
-    except ValueError:
-        numbers = np.empty(0, object)
-    fits = numbers.ndim == len(shape) and all(
-        wanted in (-1, length) for wanted, length in zip(shape, numbers.shape, strict=True)
-    )
-    # A file's [] has one axis only, whatever it would have held.
-    empty = numbers.size == 0 and numbers.dtype.kind == "f" and shape[0] == -1
-    if empty:
-        return np.empty((0, *shape[1:]))
-    if not fits or numbers.dtype.kind not in "iuf" or np.abs(numbers).max() > FARTHEST:
-        text = "×".join("N" if length < 0 else str(length) for length in shape)
-        raise bad(path, field, f"{value!r:.80}", f"{text} numbers up to {FARTHEST:.0e}")
-    return numbers.astype(np.float64)
-
-
-def _number(value: object, path: Path, field: str) -> float:
-    return float(array([value], (1,), path, field)[0])
-
-
-def intrinsics(values: Mapping[str, Any], path: Path, field: str) -> Float[np.ndarray, "3 3"]:
-    """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels.
-
-    Raises:
-        UserError: One is missing or no number.
-    """
+def intrinsics(
+    values: Mapping[str, Any], path: Path, field: str, problems: Problems = STRICT
+) -> Float[np.ndarray, "3 3"]:
+    """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
     listed = [values.get(name) for name in ("fx", "fy", "cx", "cy")]
-    return camera_matrix(*array(listed, (4,), path, field))
+    return camera_matrix(*numbers(problems, path, field, listed, 4))
 
 
 def stated(record: Mapping[str, Any], name: str) -> object:
     """Return what an annotation states about itself (our writer's ``conventions``), else None."""
-    conventions = record.get("conventions")
-    return conventions.get(name) if isinstance(conventions, dict) else None
+    return mapping(record.get("conventions")).get(name)
 
 
-def bad(path: Path, field: str, got: str, allowed: str) -> UserError:
-    """Return the error of one field of a file."""
-    fix = "correct the file, or run `dopepp check` on the folder"
-    return UserError(f"{path}: {field}: {got}", allowed, fix)
+def has_own_ids(record: Mapping[str, Any]) -> bool:
+    """Tell whether an annotation states that labels in ``.seg.png`` are objects', not classes'."""
+    return stated(record, "segmentation") == "segmentation_id"

@@ -1,6 +1,4 @@
-"""The depth and segmentation images of an NDDS item, as far as their values are known.
-
-The files of an NDDS or FAT data set: which belong together, and what its settings hold.
+"""The files of an NDDS or FAT data set: which belong together, and what they hold.
 
 An item is ``STEM.json`` with its image ``STEM.png`` or ``STEM.jpg`` beside it; ``STEM`` is
 ``000000`` (NDDS) or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
@@ -12,15 +10,22 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from dopepp.data.formats.ndds.fields import bad, intrinsics, objects_of, read_record, stated
+from dopepp.data.formats.ndds.fields import (
+    Objects,
+    intrinsics,
+    read_record,
+    stated,
+)
+from dopepp.data.formats.problems import STRICT, Problems, one_channel, read_map
 from dopepp.drawing.pictures import read_image
 
 OBJECT_SETTINGS: Final = "_object_settings.json"
@@ -58,44 +63,64 @@ def image_of(annotation: Path) -> Path | None:
 
 
 class Settings:
-    """The settings files of a data set, each read once and only when it is needed."""
+    """The settings files of a data set, each read once and only when it is needed.
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    Args:
+        root: The data set's folder.
+        problems: Takes what is wrong with them.
+    """
+
+    def __init__(self, root: Path, problems: Problems = STRICT) -> None:
+        self._root, self._problems = root, problems
         self._files: dict[Path, Mapping[str, Any] | None] = {}
 
-    def _read(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
+    def read(self, path: Path) -> Mapping[str, Any] | None:
+        """Return what a settings file holds, None where there is none or it is damaged."""
+        if path not in self._files:
+            is_there = path.is_file()
+            self._files[path] = read_record(path, self._problems) if is_there else None
+        return self._files[path]
+
+    def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
         """Return the settings of the annotation's folder or else of the data set's, or nothing."""
-        for path in (annotation.with_name(name), self._root / name):
-            if path not in self._files:
-                self._files[path] = read_record(path) if path.is_file() else None
-            content = self._files[path]
+        for path in self._places(annotation, name):
+            content = self.read(path)
             if content is not None:
                 return path, content
         return annotation.with_name(name), {}
 
-    def camera(self, record: Mapping[str, Any], annotation: Path) -> Float[np.ndarray, "3 3"]:
+    def _places(self, annotation: Path, name: str) -> tuple[Path, Path]:
+        return annotation.with_name(name), self._root / name
+
+    def camera(
+        self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
+    ) -> Float[np.ndarray, "3 3"]:
         """Return K: the annotation's own ``camera_data.intrinsics`` or the camera settings'.
 
         Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
-        and ``right``).
-
-        Raises:
-            UserError: Neither file has them, or it is unclear which camera's they are.
+        and ``right``). It is a problem (and NaN) if neither file has them, or if it is unclear
+        which camera's they are.
         """
         data = record.get("camera_data")
         own = data.get("intrinsics") if isinstance(data, dict) else None
         if isinstance(own, dict):
-            return intrinsics(own, annotation, "camera_data.intrinsics")
-        path, settings = self._read(annotation, CAMERA_SETTINGS)
+            return intrinsics(own, annotation, "camera_data.intrinsics", problems)
+        path, settings = self._of(annotation, CAMERA_SETTINGS)
         side = annotation.name.removesuffix(".json").rpartition(".")[2]
         cameras = list(_entries(settings, "camera_settings"))
         cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
         if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
             where = "camera_settings[].intrinsic_settings"
-            return intrinsics(cameras[0]["intrinsic_settings"], path, where)
-        allowed = f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
-        raise bad(annotation, "camera_data.intrinsics", f"{len(cameras)} cameras' to take", allowed)
+            return intrinsics(cameras[0]["intrinsic_settings"], path, where, problems)
+        # A settings file that cannot be read is one problem, not one for every image.
+        places = self._places(annotation, CAMERA_SETTINGS)
+        if not any(place.is_file() and self.read(place) is None for place in places):
+            got = f"{len(cameras)} cameras' to take"
+            allowed = (
+                f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
+            )
+            problems.report(annotation, "camera_data.intrinsics", got, allowed)
+        return np.full((3, 3), np.nan)
 
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
         """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
@@ -134,11 +159,11 @@ class Settings:
 
     def classes(self, annotation: Path) -> set[str] | None:
         """Return the names of the exported classes, None where no settings name them."""
-        listed = self._read(annotation, OBJECT_SETTINGS)[1].get("exported_object_classes")
+        listed = self._of(annotation, OBJECT_SETTINGS)[1].get("exported_object_classes")
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
     def _objects(self, annotation: Path, label: str) -> Iterator[Mapping[str, Any]]:
-        settings = self._read(annotation, OBJECT_SETTINGS)[1]
+        settings = self._of(annotation, OBJECT_SETTINGS)[1]
         for entry in _entries(settings, "exported_objects"):
             if entry.get("class") == label:
                 yield entry
@@ -174,30 +199,43 @@ def read_depth(
     return read_map(path, shape).astype(np.float32) * np.float32(unit)
 
 
+def read_labels(annotation: Path, shape: tuple[int, int]) -> NDArray[Any] | None:
+    """Read ``STEM.seg.png``; None where there is none, or colours, which no file explains.
+
+    Raises:
+        UserError: The image is damaged, or of another size than ``shape`` (height, width).
+    """
+    path = companion(annotation, ".seg.png")
+    image = read_image(path) if path.is_file() else None
+    return (
+        one_channel(STRICT, path, image, shape) if image is not None and image.ndim == 2 else None
+    )
+
+
 class Masks:
-    """The masks of one image; ``STEM.seg.png`` is read when the first one is asked for.
+    """The masks of one image; its labels are read when the first one is asked for.
 
     Args:
-        record: The annotation.
-        annotation: Its path.
+        objects: The annotation's, as :func:`~dopepp.data.formats.ndds.fields.objects_of` has them.
+        has_own_ids: Whether labels are known to be ``segmentation_id``, never a class's.
+        annotation: The annotation.
         settings: The data set's settings.
-        shape: (height, width) of the image.
+        read: Reads the labels, None where there are none to be understood.
     """
 
     def __init__(
         self,
-        record: Mapping[str, Any],
+        objects: Objects,
+        has_own_ids: bool,
         annotation: Path,
         settings: Settings,
-        shape: tuple[int, int],
+        read: Callable[[], NDArray[Any] | None],
     ) -> None:
-        self._shape, self._annotation, self._settings = shape, annotation, settings
-        self._labels: NDArray[Any] | None = None
-        self._has_own_ids = stated(record, "segmentation") == "segmentation_id"
-        listed = objects_of(record, annotation)
-        ids = [item.get("segmentation_id") for _, item, _ in listed]
+        self._has_own_ids, self._annotation = has_own_ids, annotation
+        self._settings, self._read = settings, cache(read)
+        ids = [item.get("segmentation_id") for _, item, _ in objects]
         self._ids = Counter(value for value in ids if isinstance(value, int))
-        self._class_ids = Counter(settings.class_id(annotation, name) for _, _, name in listed)
+        self._class_ids = Counter(settings.class_id(annotation, name) for _, _, name in objects)
 
     def of(
         self, segmentation_id: int | None, label: str
@@ -217,22 +255,5 @@ class Masks:
             value = class_id
         else:
             return None
-        path = companion(self._annotation, ".seg.png")
-        if self._labels is None and path.is_file():
-            image = read_image(path)
-            # Colours stand for objects in a way that no file states.
-            self._labels = read_map(path, self._shape) if image.ndim == 2 else None
-        return None if self._labels is None else np.asarray(self._labels == value)
-
-
-def read_map(path: Path, shape: tuple[int, int]) -> Integer[np.ndarray, "height width"]:
-    """Read an image with one channel.
-
-    Raises:
-        UserError: It is damaged, has several channels or another (height, width).
-    """
-    image = read_image(path)
-    if image.shape != shape:
-        got = "×".join(map(str, image.shape))
-        raise bad(path, "size", got, f"one channel of {shape[0]}×{shape[1]} (height×width)")
-    return image
+        labels = self._read()
+        return None if labels is None else np.asarray(labels == value)

@@ -26,8 +26,22 @@ from dopepp.data.formats.ndds.conventions import (
     check_observation,
     find_convention,
 )
-from dopepp.data.formats.ndds.fields import bad, objects_of, parse_object, read_record, stated
-from dopepp.data.formats.ndds.files import Masks, Settings, find_items, image_of, read_depth
+from dopepp.data.formats.ndds.fields import (
+    has_own_ids,
+    objects_of,
+    parse_object,
+    read_record,
+    stated,
+)
+from dopepp.data.formats.ndds.files import (
+    Masks,
+    Settings,
+    find_items,
+    image_of,
+    read_depth,
+    read_labels,
+)
+from dopepp.data.formats.problems import STRICT
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
 from dopepp.drawing.pictures import read_rgb
 from dopepp.geometry.camera import check_camera, project_keypoints
@@ -96,7 +110,7 @@ class NddsSource:
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
         for path in _spread(items):
-            record = read_record(path)
+            record = self._record(path)
             others.update(name for _, _, name in objects_of(record, path) if not self._part(name))
             for one in self._observations(record, path):
                 if one.item.corners_px is not None:
@@ -113,6 +127,9 @@ class NddsSource:
             )
         # What nobody sees may be behind the camera, where projections mean nothing.
         return find_convention(seen or hidden, str(self.folder))
+
+    def _record(self, path: Path) -> Mapping[str, Any]:
+        return read_record(path) or {}
 
     def _part(self, label: str) -> Part | None:
         """Return the part of a class name; FAT's suffix is dropped where it hides a part's name."""
@@ -144,12 +161,15 @@ class NddsSource:
                 contradicts the data set's convention or stands behind the camera.
         """
         path = self.items[index]
-        record, image_path = read_record(path), image_of(path)
+        record, image_path = self._record(path), image_of(path)
         if image_path is None:
-            raise bad(path, "image", "no file", "a PNG or JPEG beside it")
+            STRICT.report(path, "image", "no file", "a PNG or JPEG beside it")
         image = read_rgb(image_path)
         shape: tuple[int, int] = image.shape[:2]
-        masks = Masks(record, path, self._settings, shape)
+        masks = Masks(
+            objects_of(record, path), has_own_ids(record), path, self._settings,
+            lambda: read_labels(path, shape),
+        )  # fmt: skip
         K = check_camera(self._settings.camera(record, path), shape[::-1], str(path))
         counts_truncation = stated(record, "visibility_counts_truncation") is True
         instances = []
@@ -178,8 +198,6 @@ class NddsSource:
         fraction = one.item.visibility
         if fraction is None or fraction == -1:
             fraction, counts_truncation = 1.0, False
-        if not 0 <= fraction <= 1:
-            raise bad(one.path, f"{one.item.field}.visibility", f"{fraction:g}", "0 … 1, or −1")
         if not counts_truncation:
             inside, whole = hull_areas(keypoints[:8], shape)
             fraction *= min(1.0, inside / whole) if whole > 0 else 0.0
@@ -190,7 +208,7 @@ class NddsSource:
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
-            for _, _, name in objects_of(read_record(path), path)
+            for _, _, name in objects_of(self._record(path), path)
         )
 
     def describe(self) -> list[SourceInfo]:
@@ -215,7 +233,7 @@ class NddsSource:
         kept: Counter[str] = Counter()
         left_out: Counter[str] = Counter()
         for path in self.items:
-            record = read_record(path)
+            record = self._record(path)
             names = [name for _, _, name in objects_of(record, path)]
             left_out.update(name for name in names if self._part(name) is None)
             for one in self._observations(record, path):

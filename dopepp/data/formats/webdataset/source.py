@@ -20,11 +20,15 @@ from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import (
     ESTIMATED,
     BopPoses,
+    Place,
+    Record,
     make_instance,
+    pair_infos,
     read_cameras,
     read_poses,
 )
 from dopepp.data.formats.bop.source import share
+from dopepp.data.formats.problems import STRICT, entries, mapping
 from dopepp.data.formats.webdataset.shards import find_shards
 from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard
 from dopepp.data.sample import Sample, SourceInfo
@@ -89,12 +93,12 @@ class WebdatasetSource:
             UserError: A member is damaged, sizes differ, or a pose or K is impossible.
         """
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
-        where = f"{shard.path}: {shard.keys[image]}"
+        where = f"{shard.path}/{shard.keys[image]}"
         content = shard.read(image, "image")
         assert content is not None  # the index holds no image without
         picture = decode_rgb(content, where)
         shape: tuple[int, int] = picture.shape[:2]
-        K, scales = read_cameras([_json(shard, image, "camera")], lambda _: f"{where}.camera.json")
+        K, scales = read_cameras([_json(shard, image, "camera")], _place(where))
         camera = check_camera(K[0], (shape[1], shape[0]), where)
         masks = _json(shard, image, "mask_visib")
         poses = self._poses(shard, image)
@@ -102,19 +106,11 @@ class WebdatasetSource:
         for number in self._chosen(poses):
             mask = None
             if masks is not None:
-                place = f"{where}.mask_visib.json: {number}"
-                record = masks.get(str(number)) if isinstance(masks, dict) else None
-                mask = decode_runs(record, shape, place)
-            instances.append(
-                make_instance(
-                    self._parts[int(poses.obj_ids[number])],
-                    poses.T_cam_obj[number],
-                    camera,
-                    float(poses.visible_fractions[number]),
-                    mask,
-                    shape,
-                )
-            )
+                record = mapping(masks).get(f"{number}")
+                mask = decode_runs(record, shape, f"{where}.mask_visib.json", f"{number}")
+            part = self._parts[int(poses.obj_ids[number])]
+            T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
+            instances.append(make_instance(part, T, camera, fraction, mask, shape))
         encoded = shard.read(image, "depth") if self._read_depth else None
         depth = None
         if encoded is not None:
@@ -123,17 +119,17 @@ class WebdatasetSource:
 
     def _poses(self, shard: ShardIndex, image: int) -> BopPoses:
         """Read an image's ground truth; empty where it has none."""
-        where = f"{shard.path}: {shard.keys[image]}"
-        truths, infos = _json(shard, image, "gt"), _json(shard, image, "gt_info")
-        truths = [] if truths is None else truths
-        if not isinstance(truths, list) or not isinstance(infos, list | None):
-            raise _bad(f"{where}.gt.json or .gt_info.json", "lists of objects")
-        if infos is not None and len(infos) != len(truths):
-            raise _bad(
-                f"{where}.gt_info.json with {len(infos)} objects",
-                f"{len(truths)}, as many as in gt.json",
-            )
-        return read_poses(truths, infos, lambda n: f"{where}.gt.json (or gt_info): object {n}")
+        where = f"{shard.path}/{shard.keys[image]}"
+        records = {
+            name: entries(STRICT, f"{where}.{name}.json", "", found)
+            for name in ("gt", "gt_info")
+            if (found := _json(shard, image, name)) is not None
+        }
+        truths = records.get("gt", [])
+        infos: list[Record | None] = [None] * len(truths)
+        if "gt_info" in records:
+            infos = pair_infos(truths, records["gt_info"], f"{where}.gt_info.json", "")
+        return read_poses(truths, infos, _place(where))
 
     def _chosen(self, poses: BopPoses) -> list[int]:
         """Return the numbers of the objects of interest before the camera."""
@@ -169,12 +165,16 @@ class WebdatasetSource:
         return [SourceInfo(self.name, len(self), identity)]
 
 
+def _place(where: str) -> Place:
+    return lambda what, n: (f"{where}.{what}.json", "" if what == "camera" else f"[{n}]")
+
+
 def _json(shard: ShardIndex, image: int, field: str) -> Any:
     """Parse a JSON member; None where the image has none."""
     content = shard.read(image, field)
     if content is None:
         return None
-    where = f"{shard.path}: {shard.keys[image]}.{field}.json"
+    where = f"{shard.path}/{shard.keys[image]}.{field}.json"
     if len(content) > MAX_BYTES:
         raise _bad(f"{where} of {len(content) / 1e6:.0f} MB", f"at most {MAX_BYTES / 1e6:.0f} MB")
     return parse_json(content, where)

@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from dopepp.core.errors import UserError
+from dopepp.data.archive import Bounded
+from dopepp.data.formats.problems import STRICT, Problems
 
 FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
 """What is read of an image."""
@@ -26,12 +28,15 @@ MAX_MEMBER_BYTES: Final = 256_000_000
 MAX_MEMBERS: Final = 1_000_000
 """Of a shard; one of BOP's has 1,000 images of seven members each."""
 
+KEY_FILE: Final = "key_to_shard.json"
+"""Beside the shards: in which of them a key is."""
+
 _IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
 _DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
-_HEADER_BYTES: Final = 1_000_000
-"""No header is longer; long names and their like are read whole by ``tarfile``."""
-
-_BLOCK: Final = tarfile.BLOCKSIZE
+_ALLOWED: Final = (
+    f"a whole uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
+    f"{MAX_MEMBER_BYTES / 1e6:.0f} MB, with rgb (or gray) and camera.json for every key"
+)
 
 
 class TarMember(NamedTuple):
@@ -78,10 +83,14 @@ def read_span(path: Path, offset: int, size: int) -> bytes:
             file.seek(offset)
             content = file.read(size)
     except OSError as error:
-        raise _bad(path, str(error.strerror)) from error
+        raise _gone(path, str(error.strerror)) from error
     if len(content) < size:
-        raise _bad(path, f"cut short within the member at byte {offset}")
+        raise _gone(path, f"cut short within the member at byte {offset}")
     return content
+
+
+def _gone(path: Path, got: str) -> UserError:
+    return UserError(f"shard {path}: {got}", _ALLOWED, "copy, unzip or download the shard again")
 
 
 def index_shard(path: Path) -> ShardIndex:
@@ -94,7 +103,7 @@ def index_shard(path: Path) -> ShardIndex:
     rows: dict[str, int] = {}
     found: list[tuple[int, int, int, int]] = []
     for member in members(path):
-        field = _field(member.extension)
+        field = field_of(member.extension)
         if field is not None:
             row = rows.setdefault(member.key, len(rows))
             found.append((row, FIELDS.index(field), member.offset, member.size))
@@ -105,98 +114,99 @@ def index_shard(path: Path) -> ShardIndex:
     filled = np.bincount(table[:, 0] * len(FIELDS) + table[:, 1], minlength=spans[..., 0].size)
     for place in np.flatnonzero(filled > 1).tolist():
         key, field = keys[place // len(FIELDS)], FIELDS[place % len(FIELDS)]
-        raise _bad(path, f"{key} with two members for its {field}")
+        got = f"{key} with two members for its {field}"
+        STRICT.report(path, "archive", got, _ALLOWED)
     for name in ("image", "camera"):
         for row in np.flatnonzero(spans[:, FIELDS.index(name), 0] < 0).tolist():
-            raise _bad(path, f"{keys[row]} without {'rgb or gray' if name == 'image' else name}")
+            got = f"{keys[row]} without {'rgb or gray' if name == 'image' else name}"
+            STRICT.report(path, "archive", got, _ALLOWED)
     return ShardIndex(path, keys, spans)
 
 
-def members(path: Path) -> Iterator[TarMember]:
+def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
     """Yield the files of a shard; folders and WebDataset's own ``__meta__`` are passed over.
 
-    Raises:
-        UserError: The file is no uncompressed tar archive or is cut short, or a member is no plain
-            file, leads out of the archive, has no extension, comes twice or is too large.
+    What cannot be taken is a problem and passed over: an archive that is compressed, cut short or
+    damaged, and a member that is no plain file, leads out of the archive, has no extension, comes
+    twice or is too large.
     """
     try:
         with path.open("rb") as file:
             if file.read(2) == b"\x1f\x8b":
-                raise _bad(path, "a compressed archive, in which no member can be found")
+                got = "a compressed archive, in which no member can be found"
+                problems.report(path, "archive", got, _ALLOWED)
+                return
             size = file.seek(0, io.SEEK_END)
             file.seek(0)
-            yield from _walk(path, file, size)
+            yield from _walk(path, file, size, problems)
     except UserError:
         raise
     except OSError as error:
-        raise _bad(path, str(error.strerror or error)) from error
+        problems.report(path, "archive", str(error.strerror or error), _ALLOWED)
     except (tarfile.TarError, ValueError, OverflowError) as error:
-        raise _bad(path, f"damaged: {error}") from error
+        problems.report(path, "archive", f"damaged: {error}", _ALLOWED)
 
 
-def _walk(path: Path, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
+def _walk(
+    path: Path, file: io.BufferedReader, size: int, problems: Problems
+) -> Iterator[TarMember]:
     names: set[str] = set()
-    with tarfile.open(fileobj=_Bounded(file), mode="r:") as archive:  # type: ignore[call-overload]
+    with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
         while (info := archive.next()) is not None:
-            archive.members = []  # it keeps every header it has read
-            member = _member(path, info, size)
-            if member is None:
+            archive.members = []  # type: ignore[attr-defined]  # it keeps every header it has read
+            if _is_passed_over(info):
                 continue
-            if info.name in names or len(names) == MAX_MEMBERS:
-                raise _bad(path, f"member {info.name!r:.80} twice, or over {MAX_MEMBERS:,} members")
+            if len(names) == MAX_MEMBERS:
+                got = f"over {MAX_MEMBERS:,} members"
+                problems.report(path, "archive", got, _ALLOWED)
+                return
+            got = "twice" if info.name in names else _refusal(info, size)
+            if got:
+                problems.report(path, "archive", f"member {info.name!r:.80} {got}", _ALLOWED)
+                continue
             names.add(info.name)
-            yield member
+            name = PurePosixPath(info.name)
+            key, _, extension = name.name.partition(".")
+            start = str(name.with_name(key))
+            yield TarMember(start, extension.lower(), info.offset_data, info.size)
         end = archive.offset
     # tarfile takes a damaged header after the first, and the end of the file, for the archive's.
     file.seek(end)
-    if file.read(_BLOCK) != bytes(_BLOCK):
-        raise _bad(path, f"cut short or damaged at byte {end}")
+    if file.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+        problems.report(path, "archive", f"cut short or damaged at byte {end}", _ALLOWED)
 
 
-def _member(path: Path, info: tarfile.TarInfo, archive_size: int) -> TarMember | None:
+def _is_passed_over(info: tarfile.TarInfo) -> bool:
+    name = PurePosixPath(info.name).name
+    is_meta = name.startswith("__") and name.endswith("__")
+    return (info.isdir() or is_meta) and not _leads_out(info)
+
+
+def _leads_out(info: tarfile.TarInfo) -> bool:
     name = PurePosixPath(info.name)
-    if name.is_absolute() or ".." in name.parts or "\\" in info.name or not info.name.isprintable():
-        raise _bad(path, f"member {info.name!r:.80}, which leads out of the archive")
-    if info.isdir() or (name.name.startswith("__") and name.name.endswith("__")):
-        return None
+    odd = "\\" in info.name or not info.name.isprintable()
+    return name.is_absolute() or ".." in name.parts or odd
+
+
+def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
+    """Say why a member is not taken; nothing where it is."""
+    key, dot, _ = PurePosixPath(info.name).name.partition(".")
+    if _leads_out(info):
+        return "which leads out of the archive"
     if not info.isreg() or info.issparse():
-        raise _bad(path, f"member {info.name!r:.80}, which is a link, a device or has holes")
+        return "which is a link, a device or has holes"
     if not 0 <= info.size <= MAX_MEMBER_BYTES:
-        raise _bad(path, f"member {info.name!r:.80} of {info.size / 1e6:,.0f} MB")
+        return f"of {info.size / 1e6:,.0f} MB"
     if info.offset_data + info.size > archive_size:
-        raise _bad(path, f"cut short within member {info.name!r:.80}")
-    key, dot, extension = name.name.partition(".")
-    if not key or not dot:
-        raise _bad(path, f"member {info.name!r:.80}, which is no KEY.EXTENSION")
-    return TarMember(str(name.with_name(key)), extension.lower(), info.offset_data, info.size)
+        return "within which the archive is cut short"
+    return "" if key and dot else "which is no KEY.EXTENSION"
 
 
-def _field(extension: str) -> str | None:
+def field_of(extension: str) -> str | None:
+    """Return which of :data:`FIELDS` a member's extension stands for, None for another."""
     if _IMAGE.fullmatch(extension):
         return "image"
     if _DEPTH.fullmatch(extension):
         return "depth"
     field = extension.removesuffix(".json")
     return field if field in FIELDS and field != extension else None
-
-
-class _Bounded:
-    """A file of which only headers are read: a longer one would fill the memory."""
-
-    def __init__(self, file: io.BufferedReader) -> None:
-        self._file = file
-        self.seek, self.tell = file.seek, file.tell
-
-    def read(self, size: int = -1) -> bytes:
-        if not 0 <= size <= _HEADER_BYTES:
-            raise ValueError(f"a header of {size} bytes")
-        return self._file.read(size)
-
-
-def _bad(path: Path, got: str) -> UserError:
-    return UserError(
-        f"shard {path}: {got}",
-        f"a whole uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
-        f"{MAX_MEMBER_BYTES / 1e6:.0f} MB, with rgb (or gray) and camera.json for every key",
-        "copy, unzip or download the shard again",
-    )

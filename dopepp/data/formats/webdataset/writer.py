@@ -19,12 +19,11 @@ from typing import Final
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path, write_whole
 from dopepp.core.json import read_json
+from dopepp.data.formats import STAGING, finalizing, stage, staged_items
 from dopepp.data.formats.bop.images import encode_png, encode_runs
-from dopepp.data.formats.bop.writer import STAGING, BopFolder, finalizing, stage, staged_items
-from dopepp.data.formats.webdataset.tar import members, read_span
+from dopepp.data.formats.bop.writer import BopFolder
+from dopepp.data.formats.webdataset.tar import KEY_FILE, members, read_span
 from dopepp.data.sample import Sample
-
-KEY_FILE: Final = "key_to_shard.json"
 
 _OWNER: Final = "dopepp"
 """A fixed owner and a modification time of 0 make the same images the same bytes."""

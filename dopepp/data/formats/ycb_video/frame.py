@@ -1,9 +1,4 @@
-"""The files of one YCB-Video frame: colour, label, depth and ``meta.mat``, checked together.
-
-YCB-Video's folder: its two subsets, its class list and its image sets.
-
-YCB-Video's ``meta.mat``: the objects of a frame with their poses, K and depth unit, checked.
-"""
+"""YCB-Video's folder and the files of one frame: colour, label, depth and ``meta.mat``."""
 
 from __future__ import annotations
 
@@ -18,9 +13,10 @@ from jaxtyping import Float, Integer, UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.problems import STRICT, Problems, numbers, read_map, scalar
+from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.drawing.pictures import read_image
 from dopepp.geometry.camera import camera_matrix, check_camera, make_transform
-from dopepp.geometry.rotation import is_rotation
 
 Subset = Literal["real", "synthetic"]
 FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
@@ -68,7 +64,11 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
 
 
 _HEADER_BYTES: Final = 128
+_MAX_META_BYTES: Final = 256_000_000
 _FIELDS: Final = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
+_ALLOWED: Final = (
+    "a complete MAT-5 file with cls_indexes (N), poses (3, 4, N) before the camera and factor_depth"
+)
 
 
 @dataclass(frozen=True)
@@ -76,54 +76,71 @@ class FrameMeta:
     """Ground truth of a frame.
 
     Attributes:
-        poses: T_cam_obj of every object, by class index (from 1), metres.
+        poses: T_cam_obj of every object, by class index (from 1), metres; with NaN where damaged.
+        columns: Where each of them stands in the file's ``poses``.
         K: Camera matrix in pixels, None where the file has none.
         factor_depth: Depth image values per metre.
     """
 
     poses: Mapping[int, Float[np.ndarray, "4 4"]]
+    columns: Mapping[int, int]
     K: Float[np.ndarray, "3 3"] | None
     factor_depth: float
 
 
-def read_meta(path: Path) -> FrameMeta:
+def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     """Read a ``meta.mat``.
 
-    Raises:
-        UserError: The file is missing, cut short or lacks a field, or a pose is not finite, no
-            rotation, or behind the camera.
+    A file that is missing, cut short or lacks a field, and a pose that is not finite, no rotation,
+    or behind the camera, is a problem.
     """
-    fields = _load(path)
-    try:
-        classes = np.asarray(fields["cls_indexes"], np.int64).ravel()
-        poses = np.asarray(fields["poses"], np.float64).reshape(3, 4, -1)
-        factor_depth = float(np.asarray(fields["factor_depth"]).item())
-    except (KeyError, ValueError) as error:
-        raise _bad(path, f"a field it lacks or that has another shape ({error})") from error
-    if poses.shape[2] != len(classes) or len(set(classes.tolist())) != len(classes):
-        raise _bad(path, f"{poses.shape[2]} poses for the classes {classes.tolist()}")
-    if not (np.isfinite(factor_depth) and factor_depth > 0):
-        raise _bad(path, f"factor_depth {factor_depth}")
+    fields = _load(path, problems)
+    if fields is None:
+        return FrameMeta({}, {}, None, np.nan)
+    for name in ("cls_indexes", "poses", "factor_depth"):
+        if name not in fields:
+            problems.report(path, name, "missing", _ALLOWED)
+    factor_depth = np.nan
+    if "factor_depth" in fields:
+        factor_depth = scalar(problems, path, "factor_depth", fields["factor_depth"])
+    if factor_depth <= 0:
+        problems.report(path, "factor_depth", f"{factor_depth:g}", "above 0")
     K = fields.get("intrinsic_matrix")
+    poses: dict[int, Float[np.ndarray, "4 4"]] = {}
+    columns: dict[int, int] = {}
+    for column, (index, pose) in enumerate(_columns(path, fields, problems)):
+        if index in poses:
+            problems.report(path, f"cls_indexes[{column}]", f"class {index} twice", "each once")
+            continue
+        poses[index] = _pose(pose, path, f"poses[{column}]", problems)
+        columns[index] = column
     return FrameMeta(
-        {int(c): _pose(poses[..., i], path, int(c)) for i, c in enumerate(classes)},
-        None if K is None else np.asarray(K, np.float64),
+        poses,
+        columns,
+        None if K is None else numbers(problems, path, "intrinsic_matrix", K, 3, 3),
         factor_depth,
     )
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def _load(path: Path, problems: Problems) -> dict[str, NDArray[Any]] | None:
     try:
-        content = path.read_bytes()
+        size = path.stat().st_size
+        content = path.read_bytes() if size <= _MAX_META_BYTES else None
     except OSError as error:
-        raise _bad(path, str(error.strerror)) from error
+        problems.report(path, "file", str(error.strerror), _ALLOWED)
+        return None
+    if content is None:
+        allowed = f"at most {_MAX_META_BYTES:,}"
+        problems.report(path, "file", f"{size:,} bytes", allowed)
+        return None
     if not _is_complete(content):
-        raise _bad(path, f"a file cut short after {len(content)} bytes")
+        problems.report(path, "file", f"cut short after {size} bytes", _ALLOWED)
     try:
         # vertmap and the like are megabytes that nobody needs.
         return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # SciPy lets through whatever a damaged byte happens to cause
-        raise _bad(path, f"a damaged file ({error})") from error
+        problems.report(path, "file", f"damaged ({error})", _ALLOWED)
+        return None
 
 
 def _is_complete(content: bytes) -> bool:
@@ -138,23 +155,39 @@ def _is_complete(content: bytes) -> bool:
     return start == len(content) > _HEADER_BYTES
 
 
-def _pose(pose: Float[np.ndarray, "3 4"], path: Path, class_index: int) -> Float[np.ndarray, "4 4"]:
-    if not np.isfinite(pose).all() or not is_rotation(pose[:, :3]):
-        raise _bad(path, f"a pose of class {class_index} that is no rigid transform")
+def _columns(
+    path: Path, fields: Mapping[str, NDArray[Any]], problems: Problems
+) -> list[tuple[int, NDArray[Any]]]:
+    """Return each object's class index and 3×4 pose, none where the two fields do not match."""
+    if "cls_indexes" not in fields or "poses" not in fields:
+        return []
+    stored = np.asarray(fields["cls_indexes"])
+    indices = numbers(problems, path, "cls_indexes", stored, stored.size)
+    odd = indices[indices % 1 != 0]
+    if np.isfinite(odd).any():
+        problems.report(path, "cls_indexes", f"{odd.tolist()!r:.60}", "whole numbers")
+    stack = np.asarray(fields["poses"])
+    stack = stack[..., None] if stack.shape == (3, 4) else stack  # MATLAB drops a last axis of 1
+    if stack.shape != (3, 4, len(indices)):
+        got = f"shape {stack.shape} for {len(indices)} classes"
+        problems.report(path, "poses", got, "(3, 4, N)")
+    elif not len(odd):
+        return [(int(index), stack[..., n]) for n, index in enumerate(indices)]
+    return []
+
+
+def _pose(
+    value: NDArray[Any], path: Path, where: str, problems: Problems
+) -> Float[np.ndarray, "4 4"]:
+    pose = numbers(problems, path, where, value, 3, 4)
+    if problem := rotation_problem(pose[:, :3]):
+        problems.report(path, f"{where}.R", problem, "a rigid transform")
+        pose[:, :3] = np.nan
     if pose[2, 3] <= 0:
-        raise _bad(
-            path, f"a pose of class {class_index} behind the camera (z = {pose[2, 3]:.3g} m)"
-        )
+        got = f"behind the camera (z = {pose[2, 3]:.3g} m)"
+        problems.report(path, f"{where}.z", got, "above 0")
+        pose[:, 3] = np.nan
     return make_transform(pose[:, :3], pose[:, 3])
-
-
-def _bad(path: Path, got: str) -> UserError:
-    return UserError(
-        f"{path}: {got}",
-        "a complete MAT-5 file with cls_indexes (N), poses (3, 4, N) before the camera and "
-        "factor_depth",
-        "copy or download the file again",
-    )
 
 
 _FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
@@ -196,11 +229,11 @@ def read_frame(root: Path, subset: Subset, frame: str, with_depth: bool) -> YcbF
     meta = read_meta(Path(start + "meta.mat"))
     depth = None
     if with_depth:
-        depth = _read_map(Path(start + "depth.png"), shape) / np.float32(meta.factor_depth)
+        depth = read_map(Path(start + "depth.png"), shape) / np.float32(meta.factor_depth)
     K = _camera(subset, frame) if meta.K is None else meta.K
     return YcbFrame(
         image,
-        _read_map(Path(start + "label.png"), shape),
+        read_map(Path(start + "label.png"), shape),
         depth,
         check_camera(K, (shape[1], shape[0]), start + "meta.mat"),
         meta.poses,
@@ -214,23 +247,6 @@ def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width cha
             f"image {path} of shape {image.shape}, {image.dtype}",
             f"8 bits and {3 + alpha} channels",
             "copy or download the file again",
-        )
-    return image
-
-
-def _read_map(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
-    """Read an image with one channel and the colour image's (height, width)."""
-    image = read_image(path)
-    if image.ndim != 2:
-        raise UserError(
-            f"image {path} of shape {image.shape}", "one channel", "copy or download it again"
-        )
-    if image.shape != shape:
-        raise UserError(
-            f"{path} of {image.shape[1]}×{image.shape[0]} for a colour image of "
-            f"{shape[1]}×{shape[0]}",
-            "images of one frame of the same size",
-            "copy or download the frame again",
         )
     return image
 

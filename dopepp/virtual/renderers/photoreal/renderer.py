@@ -1,17 +1,16 @@
-"""The photoreal renderer: path tracing by Mitsuba 3 and denoising (extra ``photoreal``).
+"""The photoreal renderer: path tracing by Mitsuba 3, denoised by Intel's Open Image Denoise.
 
 Objects stand in the light that the rasteriser gives them, but lamps have a size, light goes from
 object to object, and surfaces mirror their surroundings. The picture is laid over the background
-in linear light; what objects do to the light on a supporting plane is in ``photoreal_table``.
+in linear light; what objects do to the light on a supporting plane is in ``table``.
 
 The same scene gives the same bytes on the same machine, whatever the number of threads. Workers
-must be spawned, or forked before the first image. ``photoreal_variant`` lists the environment
-variables that choose Mitsuba's variant and the number of threads.
+must be spawned, or forked before the first image. ``variant`` lists the environment variables that
+choose Mitsuba's variant and the number of threads.
 
-Denoising of path-traced pictures by Intel's Open Image Denoise, as pyoidn packs it.
-
-The library's C interface is called directly: the package itself imports torch wherever that is
-installed, which takes seconds and memory that rendering does without.
+Importing this needs the extra ``photoreal``. pyoidn's C interface is called directly: the package
+itself imports torch wherever that is installed, which takes seconds and memory that rendering does
+without.
 """
 
 from __future__ import annotations
@@ -25,8 +24,10 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from dopepp.core.errors import require
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, make_shapes, make_surroundings
 from dopepp.virtual.renderers.photoreal.table import (
+    Area,
     TableTop,
     View,
     Window,
@@ -36,84 +37,14 @@ from dopepp.virtual.renderers.photoreal.table import (
     shadowed,
     split_light,
 )
-from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads, require
-from dopepp.virtual.renderers.raster.light import CODE_STEPS, TONE_CURVE
-from dopepp.virtual.renderers.raster.plane import inverse_depth_of, plane_depth
-from dopepp.virtual.renderers.raster.projection import project_object
+from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads
 from dopepp.virtual.renderers.raster.rasteriser import visible_fractions
-from dopepp.virtual.scene import NEAR, Rendered, Scene
+from dopepp.virtual.renderers.raster.visibility import backdrop, box_around, project_object
+from dopepp.virtual.scene import Rendered, Scene
+from dopepp.virtual.tone import CODE_STEPS, TONE_CURVE
 
-_CPU_DEVICE: Final = 1
-_FLOAT3: Final = 3
-"""Values of ``OIDN_DEVICE_TYPE_CPU`` and ``OIDN_FORMAT_FLOAT3``."""
-
-
-def denoise(
-    colour: Float32[np.ndarray, "height width 3"],
-    albedo: Float32[np.ndarray, "height width 3"],
-    normal: Float32[np.ndarray, "height width 3"],
-) -> Float32[np.ndarray, "height width 3"]:
-    """Return a picture in linear light without its noise.
-
-    Args:
-        colour: Noisy radiance, any range.
-        albedo: Share of light that the surface scatters, [0, 1].
-        normal: Unit normal, any frame; 0 on the background.
-
-    Raises:
-        RuntimeError: The library reports an error.
-        UserError: pyoidn is not installed.
-    """
-    interface, device = _device()
-    ffi, library = interface.oidn_ffi, interface.oidn_Capi
-    height, width = colour.shape[:2]
-    output = np.empty((height, width, 3), np.float32)
-    images = {"color": colour, "albedo": albedo, "normal": normal, "output": output}
-    held = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
-    image_filter = library.oidnNewFilter(device, b"RT")
-    for name, image in held.items():
-        pointer = ffi.cast("void *", ffi.from_buffer(image))
-        library.oidnSetSharedFilterImage(
-            image_filter, name.encode(), pointer, _FLOAT3, width, height, 0, 0, 0
-        )
-    library.oidnSetFilterBool(image_filter, b"hdr", True)
-    library.oidnCommitFilter(image_filter)
-    library.oidnExecuteFilter(image_filter)
-    library.oidnReleaseFilter(image_filter)
-    _check(interface, device)
-    return held["output"]
-
-
-@cache
-def _device() -> tuple[Any, Any]:
-    """Return pyoidn's C interface and a device, made once a process."""
-    require("pyoidn")
-    package = find_spec("pyoidn")
-    assert package is not None
-    assert package.origin is not None
-    spec = spec_from_file_location("pyoidn_capi", Path(package.origin).with_name("capi.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    interface = module_from_spec(spec)
-    spec.loader.exec_module(interface)
-    library = interface.oidn_Capi
-    device = library.oidnNewDevice(_CPU_DEVICE)
-    library.oidnSetDeviceInt(device, b"numThreads", num_threads())
-    # Pinned threads of several workers would share cores while others idle.
-    library.oidnSetDeviceBool(device, b"setAffinity", False)
-    library.oidnCommitDevice(device)
-    _check(interface, device)
-    return interface, device
-
-
-def _check(interface: Any, device: Any) -> None:
-    message = interface.oidn_ffi.new("const char **")
-    if interface.oidn_Capi.oidnGetDeviceError(device, message):
-        text = interface.oidn_ffi.string(message[0]).decode(errors="replace")
-        raise RuntimeError(f"Open Image Denoise: {text}")
-
-
-require("mitsuba", "pyoidn")
+require("mitsuba", "renderer 'photoreal'", "photoreal")
+require("pyoidn", "renderer 'photoreal'", "photoreal")
 
 SAMPLES_PER_PIXEL: Final = 16
 
@@ -138,19 +69,18 @@ _RADIANCE_OF_CODE: Final = np.interp(
 _COVERAGE: Final = {"type": "depth"}
 """The fourth channel of any integrator is the share of rays that hit something."""
 
+_CPU_DEVICE: Final = 1
+_FLOAT3: Final = 3
+"""Values of ``OIDN_DEVICE_TYPE_CPU`` and ``OIDN_FORMAT_FLOAT3``."""
+
 
 def render(scene: Scene) -> Rendered:
     """Render a scene; one without objects is its background.
 
     Raises:
-        UserError: Mitsuba cannot run in this process (see ``photoreal_variant``).
+        UserError: Mitsuba cannot run in this process (see ``variant``).
     """
-    width, height = scene.size
-    image = scene.background.copy()
-    instances = np.full((height, width), -1, np.int16)
-    depth = np.zeros((height, width), np.float32)
-    if scene.plane is not None:
-        plane_depth(inverse_depth_of(scene.plane, scene.K), NEAR, depth)
+    image, depth, instances = backdrop(scene)
     fractions = visible_fractions(scene)
     window = _objects_window(scene)
     if window is None and (scene.plane is None or not scene.objects):
@@ -171,15 +101,13 @@ def render(scene: Scene) -> Rendered:
 
 def _objects_window(scene: Scene) -> Window | None:
     """Return the part of the image that objects may touch; None if they touch none."""
-    boxes = [project_object(item, scene.K).box(scene.size) for item in scene.objects]
-    windows = [box for box in boxes if box is not None]
-    if not windows:
+    box = box_around(project_object(item, scene.K).box(scene.size) for item in scene.objects)
+    if box is None:
         return None
-    left, top, right, bottom = zip(*windows, strict=True)
-    width, height = scene.size
+    left, top, right, bottom = box
     return (
-        max(min(left) - _MARGIN_PX, 0), max(min(top) - _MARGIN_PX, 0),
-        min(max(right) + _MARGIN_PX, width), min(max(bottom) + _MARGIN_PX, height),
+        max(left - _MARGIN_PX, 0), max(top - _MARGIN_PX, 0),
+        min(right + _MARGIN_PX, scene.size[0]), min(bottom + _MARGIN_PX, scene.size[1]),
     )  # fmt: skip
 
 
@@ -243,18 +171,12 @@ def _trace(
 
 
 def _picture(
-    mi: Any,
-    world: dict[str, Any],
-    view: View,
-    integrator: dict[str, Any],
-    samples: int,
-    seed: int,
+    mi: Any, world: dict[str, Any], view: View, integrator: dict[str, Any], samples: int, seed: int
 ) -> Float32[np.ndarray, "height width channels"]:
     """Return what an integrator measures in every pixel of a view."""
     # Loaded in parallel, objects come in random order, and every order is compiled anew.
     loaded = mi.load_dict(
-        {**world, "sensor": view.sensor(mi, samples), "integrator": integrator},
-        parallel=False,
+        {**world, "sensor": view.sensor(mi, samples), "integrator": integrator}, parallel=False
     )
     return np.array(mi.render(loaded, seed=seed), np.float32)
 
@@ -277,6 +199,69 @@ def _over(
     return np.where(alpha > 0, (TONE_CURVE[steps] + 0.5).astype(np.uint8), behind)
 
 
-def _slices(window: Window) -> tuple[slice, slice]:
+def _slices(window: Window) -> Area:
     left, top, right, bottom = window
     return slice(top, bottom), slice(left, right)
+
+
+def denoise(
+    colour: Float32[np.ndarray, "height width 3"],
+    albedo: Float32[np.ndarray, "height width 3"],
+    normal: Float32[np.ndarray, "height width 3"],
+) -> Float32[np.ndarray, "height width 3"]:
+    """Return a picture in linear light without its noise.
+
+    Args:
+        colour: Noisy radiance, any range.
+        albedo: Share of light that the surface scatters, [0, 1].
+        normal: Unit normal, any frame; 0 on the background.
+
+    Raises:
+        RuntimeError: The library reports an error.
+    """
+    interface, device = _device()
+    ffi, library = interface.oidn_ffi, interface.oidn_Capi
+    height, width = colour.shape[:2]
+    output = np.empty((height, width, 3), np.float32)
+    images = {"color": colour, "albedo": albedo, "normal": normal, "output": output}
+    held = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
+    image_filter = library.oidnNewFilter(device, b"RT")
+    for name, image in held.items():
+        pointer = ffi.cast("void *", ffi.from_buffer(image))
+        library.oidnSetSharedFilterImage(
+            image_filter, name.encode(), pointer, _FLOAT3, width, height, 0, 0, 0
+        )
+    library.oidnSetFilterBool(image_filter, b"hdr", True)
+    library.oidnCommitFilter(image_filter)
+    library.oidnExecuteFilter(image_filter)
+    library.oidnReleaseFilter(image_filter)
+    _check(interface, device)
+    return held["output"]
+
+
+@cache
+def _device() -> tuple[Any, Any]:
+    """Return pyoidn's C interface and a device, made once a process."""
+    package = find_spec("pyoidn")
+    assert package is not None
+    assert package.origin is not None
+    spec = spec_from_file_location("pyoidn_capi", Path(package.origin).with_name("capi.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    interface = module_from_spec(spec)
+    spec.loader.exec_module(interface)
+    library = interface.oidn_Capi
+    device = library.oidnNewDevice(_CPU_DEVICE)
+    library.oidnSetDeviceInt(device, b"numThreads", num_threads())
+    # Pinned threads of several workers would share cores while others idle.
+    library.oidnSetDeviceBool(device, b"setAffinity", False)
+    library.oidnCommitDevice(device)
+    _check(interface, device)
+    return interface, device
+
+
+def _check(interface: Any, device: Any) -> None:
+    message = interface.oidn_ffi.new("const char **")
+    if interface.oidn_Capi.oidnGetDeviceError(device, message):
+        text = interface.oidn_ffi.string(message[0]).decode(errors="replace")
+        raise RuntimeError(f"Open Image Denoise: {text}")

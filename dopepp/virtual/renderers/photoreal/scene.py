@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from dopepp.geometry.camera import transform
-from dopepp.virtual.renderers.raster.light import SRGB_TO_LINEAR
 from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import Surface
+from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 Sphere = tuple[Float[np.ndarray, "3"], float]
 """Centre and radius, camera frame, metres."""

@@ -1,12 +1,11 @@
-"""What objects do to the light on a supporting plane, whose picture is the background.
-
-A matt disc stands for the plane. Where the path tracer sees it, its light over what it would be
-without objects is the factor for the background: shadows, and light that objects throw on it.
-
-What Mitsuba's camera sees of a part of the image, and what every pixel's centre sees.
+"""What Mitsuba's camera sees of a part of the image, and the table that it sees there.
 
 Mitsuba's camera has square pixels. A view covers a window of the image with square pixels at least
 as fine as the image's; where the camera's pixels are not square, the picture is resampled.
+
+A matt disc stands for a supporting plane, whose picture is the background. Where the path tracer
+sees it, its light over what it would be without objects is the factor for the background: shadows,
+and light that objects throw on it.
 """
 
 from __future__ import annotations
@@ -20,11 +19,31 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
 
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, rgb
-from dopepp.virtual.renderers.raster.light import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.scene import NEAR, Scene
+from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 
 Window = tuple[int, int, int, int]
 """(left, top, right, bottom) in pixels of the image, right and bottom excluded."""
+
+Area = tuple[slice, slice]
+
+_REACH: Final = 6.0
+"""Radius of the disc, in radii of the sphere around all objects."""
+
+_FADE: Final = 0.6
+"""From this share of the disc's radius outwards, its shadows fade away."""
+
+_ALBEDO: Final = (0.05, 0.8)
+"""Bounds of the disc's albedo, which is estimated from the plane's picture and its light."""
+
+_LEAST_LIGHT: Final = 1e-3
+"""Radiance of a white table below which no shadow is cast: there is nothing to take away."""
+
+_SPREAD_PX: Final = 2.0
+"""Width over which a shadow is carried on under an object's rim, pixels."""
+
+_BRIGHTEST: Final = 4.0
+"""Largest factor on the background: light thrown on a table in deep shade."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,27 +173,6 @@ def _cast_scalar(
             distance[index] = hit.t
             numbers[index] = next(k for k, shape in enumerate(shapes) if shape == hit.shape)
     return distance, numbers
-
-
-_REACH: Final = 6.0
-"""Radius of the disc, in radii of the sphere around all objects."""
-
-_FADE: Final = 0.6
-"""From this share of the disc's radius outwards, its shadows fade away."""
-
-_ALBEDO: Final = (0.05, 0.8)
-"""Bounds of the disc's albedo, which is estimated from the plane's picture and its light."""
-
-_LEAST_LIGHT: Final = 1e-3
-"""Radiance of a white table below which no shadow is cast: there is nothing to take away."""
-
-_SPREAD_PX: Final = 2.0
-"""Width over which a shadow is carried on under an object's rim, pixels."""
-
-_BRIGHTEST: Final = 4.0
-"""Largest factor on the background: light thrown on a table in deep shade."""
-
-Area = tuple[slice, slice]
 
 
 class TableTop:

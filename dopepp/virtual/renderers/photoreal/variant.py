@@ -14,21 +14,22 @@ Environment variables:
 
 from __future__ import annotations
 
-import json
+import hashlib
 import logging
 import multiprocessing
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import UserError, require
+from dopepp.core.machine import available_cores, cache_folder
 
 _log = logging.getLogger(__name__)
 
@@ -45,12 +46,10 @@ PLACES: Final = (
 )
 """Where Debian, Fedora, Arch and Homebrew put libLLVM; the environment names one elsewhere."""
 
-_PROBE_SECONDS: Final = 60.0
+_TRIAL_SECONDS: Final = 60.0
 """A library that takes longer is passed over this time, and tried again the next."""
 
-_MAX_CACHE_BYTES: Final = 1_000_000
-
-_PROBE: Final = """
+_TRIAL: Final = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 scene = mi.cornell_box()
@@ -67,7 +66,7 @@ def mitsuba() -> Any:
         UserError: It is not installed, a setting is wrong, or this process was forked from one
             that has rendered, whose threads it lacks.
     """
-    require("mitsuba")
+    require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
     if pid != os.getpid():
         raise UserError(
@@ -76,21 +75,6 @@ def mitsuba() -> Any:
             "start workers with multiprocessing.get_context('spawn')",
         )
     return import_module("mitsuba")
-
-
-def require(*packages: str) -> None:
-    """Check, without importing them, that packages of the extra are installed.
-
-    Raises:
-        UserError: One is missing.
-    """
-    for package in packages:
-        if find_spec(package) is None:
-            raise UserError(
-                f"renderer 'photoreal' without the package {package}",
-                "an installation with the extra photoreal",
-                "pip install 'dopepp[photoreal]'",
-            )
 
 
 def num_threads() -> int:
@@ -104,22 +88,19 @@ def num_threads() -> int:
         if not setting.isdecimal() or int(setting) < 1:
             raise UserError(f"{THREADS_SETTING}={setting!r}", "a number of at least 1", "change it")
         return int(setting)
-    if multiprocessing.parent_process() is not None:
-        return 1
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    return 1 if multiprocessing.parent_process() is not None else available_cores()
 
 
 @cache
 def _start() -> int:
     """Import Mitsuba in the chosen variant; return the process that did."""
     library = _chosen_library()
-    loaded = "drjit" in sys.modules and os.environ.get(LIBRARY_SETTING) != str(library)
-    if library is not None and loaded:
-        _log.warning("Dr.Jit was imported before dopepp could choose its libLLVM: scalar_rgb")
-        library = None
-    if library is not None:
-        os.environ[LIBRARY_SETTING] = str(library)
+    if library is not None and os.environ.get(LIBRARY_SETTING) != str(library):
+        if "drjit" in sys.modules:
+            _log.warning("Dr.Jit was imported before dopepp could choose its libLLVM: scalar_rgb")
+            library = None
+        else:
+            os.environ[LIBRARY_SETTING] = str(library)
     module, drjit = import_module("mitsuba"), import_module("drjit")
     module.set_variant("scalar_rgb" if library is None else "llvm_ad_rgb")
     drjit.set_thread_count(num_threads())
@@ -146,17 +127,14 @@ def _chosen_library() -> Path | None:
 
 
 def candidates() -> list[Path]:
-    """Return the libLLVM files of this machine, the newest version first."""
+    """Return the libLLVM files to try, the newest version first."""
     setting = os.environ.get(LIBRARY_SETTING)
     if setting:
         return [Path(setting)]
     found = {path.resolve() for place in PLACES for path in Path("/").glob(place[1:])}
-    return sorted(found, key=lambda path: (_version(path), path), reverse=True)
-
-
-def _version(library: Path) -> list[int]:
-    """Return the version in a library's name: libLLVM-17.so.1, libLLVM.so.19.1."""
-    return [int(number) for number in re.findall(r"\d+", library.name)]
+    # Their names give the version: libLLVM-17.so.1, libLLVM.so.19.1.
+    numbers = {path: [int(digits) for digits in re.findall(r"\d+", path.name)] for path in found}
+    return sorted(found, key=lambda path: (numbers[path], path), reverse=True)
 
 
 def is_usable(library: Path) -> bool:
@@ -166,54 +144,23 @@ def is_usable(library: Path) -> bool:
     except OSError:
         return False
     key = f"{library} {stat.st_mtime_ns} {stat.st_size} {version('mitsuba')} {version('drjit')}"
-    known = _read_cache()
-    if key not in known:
-        outcome = _probe(library)
-        if outcome is None:
-            return False
-        known[key] = outcome
-        _write_cache(known)
-    return known[key]
-
-
-def _probe(library: Path) -> bool | None:
-    """Render in a process of its own, which may die of it; None if it did not come to an end."""
+    memory = cache_folder() / f"libllvm_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    with suppress(OSError, ValueError, KeyError):  # not tried yet, or the file is damaged
+        return {"works": True, "fails": False}[memory.read_text("utf-8")]
     environment = {**os.environ, LIBRARY_SETTING: str(library)}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True,
-            timeout=_PROBE_SECONDS, check=False,
+            [sys.executable, "-c", _TRIAL], env=environment, capture_output=True, text=True,
+            timeout=_TRIAL_SECONDS, check=False,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
         _log.warning("%s could not be tried: %s", library, error)
-        return None
+        return False
     usable = done.returncode == 0 and "mean" in done.stdout
     _log.info("%s %s with Mitsuba", library, "works" if usable else "does not work")
-    return usable
-
-
-def _cache_path() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "dopepp" / "mitsuba_libllvm.json"
-
-
-def _read_cache() -> dict[str, bool]:
-    """Return what is known of libraries; nothing if the file is missing or damaged."""
     try:
-        with _cache_path().open("rb") as file:
-            known = json.loads(file.read(_MAX_CACHE_BYTES))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    if not isinstance(known, dict):
-        return {}
-    return {key: value for key, value in known.items() if isinstance(value, bool)}
-
-
-def _write_cache(known: dict[str, bool]) -> None:
-    # Imported here because it brings matplotlib along, which rendering does without.
-    from dopepp.core.files import write_whole
-
-    try:
-        write_whole(_cache_path(), json.dumps(known, indent=1).encode())
+        memory.parent.mkdir(parents=True, exist_ok=True)
+        memory.write_text("works" if usable else "fails", "utf-8")
     except OSError as error:
-        _log.warning("%s cannot be written, libLLVM will be tried again: %s", _cache_path(), error)
+        _log.warning("%s cannot be written, libLLVM will be tried again: %s", memory, error)
+    return usable

@@ -1,1 +1,1 @@
-"""The rasteriser: visibility, shadows, fragments, light, picture."""
+"""The rasteriser: visibility, shadows, fragments, light and their sum, the picture."""

@@ -14,13 +14,12 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.visibility import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, scratch
+from dopepp.virtual.renderers.raster.visibility import Projected, Samples
+from dopepp.virtual.scene import Scene, SceneObject
+from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
 _DEPTH_GAP: Final = 0.01
 """Samples of a patch whose depths differ by a larger share are parts that hide one another."""
-
-EdgeFunctions = tuple[float, float, float, float, float, float, float, float, float]
-"""Of a triangle's three edges, the coefficients of x, y and 1 each."""
 
 _ALL_BUT_FIRST: Final = 0b1110
 """Bits of the samples that need not be looked at when all of a pixel are alike."""
@@ -55,44 +54,36 @@ class Fragments:
 
 
 def gather_fragments(
-    window: tuple[int, int, int, int],
-    origin: tuple[int, int],
-    ids: Array,
-    inverse_depth: Array,
-    first_id: int,
-    patches: Array,
-    hom: Array,
-    vertices: Array,
-    faces: Array,
-    normals: Array,
-    rotation: Array,
-    inverse_K: Array,
-) -> Fragments:
-    """Collect an object's fragments; they are valid until the next object's are collected.
+    item: SceneObject, seen: Projected, scene: Scene, samples: Samples, first_id: int
+) -> Fragments | None:
+    """Collect an object's fragments.
 
     Args:
-        window: Pixels to visit as (left, top, right, bottom) of the buffer, right/bottom excluded.
-        origin: Image pixel (x, y) of the buffer's first element.
-        ids: Triangle ids per sample, shape (height, width, S).
-        inverse_depth: 1/m per sample, the same shape.
-        first_id: Id of the object's first triangle.
-        patches: Number of the smooth patch of every triangle, shape (F,).
-        hom: Homogeneous pixels of its vertices, shape (V, 3).
-        vertices: Its vertices in the object frame, metres, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        normals: Object-frame normal of every corner, shape (F, 3, 3), float32.
-        rotation: Object to camera, (3, 3).
-        inverse_K: Inverse camera matrix.
+        item: The object.
+        seen: Its projected vertices.
+        scene: Its camera.
+        samples: What the window's pixels see.
+        first_id: Number of the object's first triangle there.
+
+    Returns:
+        Fragments, which are valid until the next object's are collected; None if it has none.
     """
+    box = seen.box(scene.size)
+    if box is None:
+        return None
+    origin, surface = samples.origin, item.surface
+    window = (box[0] - origin[0], box[1] - origin[1], box[2] - origin[0], box[3] - origin[1])
     # The most there can be; memory that is never touched costs nothing.
-    most = NUM_COLOUR_SAMPLES * (window[2] - window[0]) * (window[3] - window[1])
+    most = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
     pixel, face = scratch("pixel", (most,), np.int32), scratch("face", (most,), np.int32)
     weight, inverse = (scratch(name, (most,), np.float32) for name in ("weight", "inverse"))
     x, y = scratch("x", (most,), np.float32), scratch("y", (most,), np.float32)
     count = _group(
-        window, origin, ids, inverse_depth, first_id, patches, PIXEL_SAMPLES, pixel, weight, face,
-        x, y, inverse,
+        window, origin, samples.ids, samples.inverse_depth, first_id, surface.patches,
+        PIXEL_SAMPLES, pixel, weight, face, x, y, inverse,
     )  # fmt: skip
+    if count == 0:
+        return None
     pixel, weight, face, x, y, inverse = (
         array[:count] for array in (pixel, weight, face, x, y, inverse)
     )
@@ -100,29 +91,20 @@ def gather_fragments(
         scratch(name, (3, count), np.float32) for name in ("share", "position", "normal")
     )
     bulge = scratch("bulge", (count,), np.float32)
+    rotation = np.ascontiguousarray(item.T_cam_obj[:3, :3], np.float64)
     _interpolate(
-        x, y, inverse, hom, vertices, faces, normals, rotation, inverse_K, face, share, position,
-        normal, bulge,
+        x, y, inverse, seen.hom, surface.vertices, surface.faces, surface.normals, rotation,
+        np.linalg.inv(scene.K), face, share, position, normal, bulge,
     )  # fmt: skip
     return Fragments(pixel, weight, face, x, y, share, position, normal, bulge)
 
 
 @compiled()
 def _group(
-    window: tuple[int, int, int, int],
-    origin: tuple[int, int],
-    ids: Array,
-    inverse_depth: Array,
-    first_id: int,
-    patches: Array,
-    samples: Array,
-    pixel: Array,
-    weight: Array,
-    triangle: Array,
-    x: Array,
-    y: Array,
-    depth: Array,
-) -> int:
+    window: tuple[int, int, int, int], origin: tuple[int, int], ids: Array, inverse_depth: Array,
+    first_id: int, patches: Array, samples: Array, pixel: Array, weight: Array, triangle: Array,
+    x: Array, y: Array, depth: Array,
+) -> int:  # fmt: skip
     """Group the samples of every pixel by patch; write pixel, weight, triangle, mean and 1/m."""
     num_faces = patches.shape[0]
     centre = samples.shape[0] - 1
@@ -172,21 +154,10 @@ def _group(
 
 @compiled()
 def _interpolate(
-    columns: Array,
-    rows: Array,
-    depth: Array,
-    hom: Array,
-    vertices: Array,
-    faces: Array,
-    normals: Array,
-    rotation: Array,
-    inverse_K: Array,
-    triangle: Array,
-    share: Array,
-    position: Array,
-    normal: Array,
-    bulge: Array,
-) -> None:
+    columns: Array, rows: Array, depth: Array, hom: Array, vertices: Array, faces: Array,
+    normals: Array, rotation: Array, inverse_K: Array, triangle: Array, share: Array,
+    position: Array, normal: Array, bulge: Array,
+) -> None:  # fmt: skip
     """Write corner weights, positions, normals and bulges; complement back faces."""
     last, scale = -1, 0.0
     a, b, c, e = 0, 0, 0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -251,16 +222,3 @@ def _corner_heights(
         h4 -= ac * normals[2, r]
         h5 -= bc * normals[2, r]
     return h0, h1, h2, h3, h4, h5
-
-
-@compiled(inline="always")
-def edge_functions(hom: Array, a: int, b: int, c: int) -> EdgeFunctions:
-    """Return a triangle's edge functions: its corners' weights at a pixel, up to a factor."""
-    ax, ay, aw = hom[a, 0], hom[a, 1], hom[a, 2]
-    bx, by, bw = hom[b, 0], hom[b, 1], hom[b, 2]
-    cx, cy, cw = hom[c, 0], hom[c, 1], hom[c, 2]
-    return (
-        by * cw - bw * cy, bw * cx - bx * cw, bx * cy - by * cx,
-        cy * aw - cw * ay, cw * ax - cx * aw, cx * ay - cy * ax,
-        ay * bw - aw * by, aw * bx - ax * bw, ax * by - ay * bx,
-    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The supporting plane: its depth, and the shadows that objects cast on its picture.
+"""The shadows that objects cast on the picture of a supporting plane.
 
 The background shows the plane in full light. Where objects keep light from it, the background is
 multiplied by the share of light that is left, of the sky and of every lamp. A plane's points map
@@ -16,11 +16,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.virtual.renderers.raster.light import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
-from dopepp.virtual.renderers.raster.projection import Box
+from dopepp.geometry.camera import transform
+from dopepp.virtual.renderers.raster.light import ambient_row
 from dopepp.virtual.renderers.raster.shadow import ShadowMap, hidden_sky
-from dopepp.virtual.renderers.raster.visibility import NUM_COLOUR_SAMPLES, scratch
+from dopepp.virtual.renderers.raster.visibility import Box, Samples, inverse_depth_of
 from dopepp.virtual.scene import NEAR, Plane, Scene
+from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 
 _LAMP_ANGLE: Final = 0.04
 """Diameter of a lamp as seen from the plane, radians; it makes a high object's shadow soft."""
@@ -37,59 +39,16 @@ _VISIBLE: Final = np.float32(0.005)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-def inverse_depth_of(plane: Plane, K: Array) -> Float[np.ndarray, "3"]:
-    """Return (a, b, c) with 1/z = a u + b v + c on the plane; positive in front of the camera."""
-    return np.asarray(np.linalg.solve(K.T, np.array(plane.normal, np.float64)) / plane.offset)
-
-
-@compiled()
-def clear_to_plane(
-    inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
-) -> None:
-    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen."""
-    height, width, num_samples = inverse_depth.shape
-    row = inverse_depth.reshape(height, width * num_samples)
-    steps = np.empty(width * num_samples, np.float32)
-    for i in range(width):
-        for s in range(num_samples):
-            steps[i * num_samples + s] = (
-                inverse[0] * (origin[0] + i + samples[s, 0]) + inverse[1] * samples[s, 1]
-            )
-    nearest = np.float32(1.0 / near)
-    for j in range(height):
-        start = np.float32(inverse[1] * (origin[1] + j) + inverse[2])
-        for k in range(steps.shape[0]):
-            value = start + steps[k]
-            row[j, k] = value if np.float32(0) < value <= nearest else np.float32(0)
-
-
-@compiled()
-def plane_depth(inverse: Array, near: float, depth: Array) -> None:
-    """Write the plane's depth at every pixel centre, metres; 0 where it is not seen."""
-    for j in range(depth.shape[0]):
-        for i in range(depth.shape[1]):
-            value = inverse[0] * i + inverse[1] * j + inverse[2]
-            depth[j, i] = 1.0 / value if 0.0 < value * near <= 1.0 else 0.0
-
-
 def darken_plane(
-    scene: Scene,
-    plane: Plane,
-    lights: Sequence[tuple[Array, ShadowMap]],
-    ambient: Array,
-    origin: tuple[int, int],
-    ids: Array,
-    image: Array,
+    scene: Scene, plane: Plane, lights: Sequence[ShadowMap], samples: Samples, image: Array
 ) -> None:
     """Darken the plane's picture where objects keep light from it.
 
     Args:
-        scene: Its camera and objects.
+        scene: Its camera, objects and ambient light.
         plane: The plane.
-        lights: Position (3) and linear RGB at one metre (3) of every light, and its shadow map.
-        ambient: Up direction (3), linear RGB from above (3) and from below (3).
-        origin: Image pixel (x, y) of the first element of ``ids``.
-        ids: Triangle ids per sample; pixels full of objects are left out.
+        lights: Its shadow maps.
+        samples: What the pixels with objects see; those full of objects are left out.
         image: The background, uint8, updated in place.
     """
     frame = _plane_frame(plane)
@@ -107,17 +66,18 @@ def darken_plane(
     to_plane = np.vstack([frame[:2] @ to_point, inverse])
     shades = scratch("shades", (1 + len(lights), box[3] - box[1], box[2] - box[0]), np.float32)
     _warp(hidden, to_cells @ to_plane, box, shades[0])
-    for (_, shadow), shade in zip(lights, shades[1:], strict=True):
+    for shadow, shade in zip(lights, shades[1:], strict=True):
         cast, margin = _cast(plane, shadow)
         to_map = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ shadow.P
         _warp(cast, to_map @ to_point, box, shade)
+    ambient = ambient_row(scene.ambient)
     above = 0.5 + 0.5 * float(np.dot(plane.normal, ambient[:3]))
     _darken(
         box[:2], to_point.astype(np.float32), NEAR, np.array(plane.normal, np.float32), shades,
         np.asarray(above * ambient[3:6] + (1 - above) * ambient[6:], np.float32),
-        np.array([light for light, _ in lights], np.float32).reshape(-1, 6),
-        np.array([shadow.P for _, shadow in lights], np.float32).reshape(-1, 3, 4),
-        SRGB_TO_LINEAR, LINEAR_TO_SRGB, CODE_STEPS, origin, ids, image,
+        np.array([shadow.light for shadow in lights], np.float32).reshape(-1, 6),
+        np.array([shadow.P for shadow in lights], np.float32).reshape(-1, 3, 4),
+        SRGB_TO_LINEAR, LINEAR_TO_SRGB, CODE_STEPS, samples.origin, samples.ids, image,
     )  # fmt: skip
 
 
@@ -174,21 +134,18 @@ def _shadowed_box(
     frame: Float[np.ndarray, "3 4"],
     grid: Float[np.ndarray, "3"],
     cells: tuple[int, ...],
-    lights: Sequence[tuple[Array, ShadowMap]],
+    lights: Sequence[ShadowMap],
 ) -> Box | None:
     """Bound the pixels of the plane that may be darker; None if there are none."""
     size = scene.size
     right, bottom = grid[0] + cells[1] * grid[2], grid[1] + cells[0] * grid[2]
     corners = np.array([(x, y, 0.0) for x in (grid[0], right) for y in (grid[1], bottom)])
     spots = [(corners - frame[:, 3]) @ frame[:, :3]]
-    for light, _ in lights:
+    for lamp in (shadow.light[:3] for shadow in lights):
+        lamp_height = lamp @ frame[2, :3] + frame[2, 3]
         for item in scene.objects:
-            hull = item.surface.hull @ item.T_cam_obj[:3, :3].T + item.T_cam_obj[:3, 3]
-            lamp = light[:3]
-            height, lamp_height = (
-                hull @ frame[2, :3] + frame[2, 3],
-                lamp @ frame[2, :3] + frame[2, 3],
-            )
+            hull = transform(item.T_cam_obj, item.surface.hull)
+            height = hull @ frame[2, :3] + frame[2, 3]
             above = height > 0
             if not above.any() or lamp_height <= 0:
                 continue
@@ -209,21 +166,10 @@ def _shadowed_box(
 
 @compiled(fastmath=True)
 def _darken(
-    corner: tuple[int, int],
-    to_point: Array,
-    near: float,
-    normal: Array,
-    shades: Array,
-    sky: Array,
-    lights: Array,
-    P: Array,
-    decode: Array,
-    encode: Array,
-    steps: int,
-    origin: tuple[int, int],
-    ids: Array,
-    image: Array,
-) -> None:
+    corner: tuple[int, int], to_point: Array, near: float, normal: Array, shades: Array, sky: Array,
+    lights: Array, P: Array, decode: Array, encode: Array, steps: int, origin: tuple[int, int],
+    ids: Array, image: Array,
+) -> None:  # fmt: skip
     """Multiply the picture by the share of the plane's light that is left.
 
     Args:

@@ -1,18 +1,16 @@
 """Shading: the light that an object's visible fragments send to the camera.
 
 The steps follow one another over all fragments of an object: what they are (``fragments``), their
-colour (``texture``, ``noise``), their normals (``grooves``), the sky above them (``occlusion``),
-and each light (``lit``, ``reflectance``). To add a material effect, write one more such pass over
-arrays and call it here.
+colour (``surface.texture``, noise), their normals (grooves), the sky above them
+(``surface.occlusion``), and each light (``light``). Every step writes arrays over all fragments.
 
-Layer lines and brushed metal: grooves tilt the normal, or widen the highlight when too fine.
+Grooves are the layer lines of a print and the streaks of brushed metal: their profile is a sine of
+the distance along an axis, mixed with noise for irregular ones. Averaged over a pixel, a sine keeps
+sinc(w) of its amplitude, w being the grooves per pixel; the slope variance that the average takes
+away goes into the roughness (as in Olano and Baker, "LEAN mapping", 2010), so grooves never alias
+and a distant print still has a broad highlight.
 
-A groove's profile is a sine of the distance along the axis, mixed with noise for irregular ones.
-Averaged over a pixel, a sine keeps sinc(w) of its amplitude, w being the grooves per pixel; the
-slope variance that the average takes away goes into the roughness (as in Olano and Baker, "LEAN
-mapping", 2010), so grooves never alias and a distant print still has a broad highlight.
-
-Value noise from a small periodic table: the unevenness of paint, and of brushed streaks.
+To add a material effect, write one more such pass and call it in :func:`shade_object`.
 """
 
 from __future__ import annotations
@@ -26,69 +24,128 @@ import numpy as np
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
 from dopepp.virtual.renderers.raster.light import (
-    CODE_STEPS,
-    SRGB_TO_LINEAR,
-    TONE_CURVE,
-    TONE_LIMIT,
+    ambient_row,
     lit_shares,
     reflect_ambient,
     reflect_light,
 )
-from dopepp.virtual.renderers.raster.occlusion import look_up_sky
-from dopepp.virtual.renderers.raster.picture import add_colour
-from dopepp.virtual.renderers.raster.projection import Projected
 from dopepp.virtual.renderers.raster.shadow import ShadowMap
-from dopepp.virtual.renderers.raster.texture import sample_texture
-from dopepp.virtual.renderers.raster.visibility import scratch
-from dopepp.virtual.scene import Scene, SceneObject
+from dopepp.virtual.renderers.raster.visibility import Projected, Samples
+from dopepp.virtual.scene import Grooves, Scene, SceneObject
+from dopepp.virtual.surface.occlusion import look_up_sky
+from dopepp.virtual.surface.texture import sample_texture
+from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
+from dopepp.virtual.triangles import scratch
+
+_SHARPEST: Final = 0.002
+"""Smallest width of a highlight: one under a point light would be narrower than any pixel."""
+
+_LIFT_TEXELS: Final = 1.5
+"""Lift of a point before it is looked up in a shadow map; √2 keeps a plane from shadowing itself,
+the rest is for rounding."""
 
 _SIDE: Final = 32
 _MASK: Final = _SIDE - 1
 
 # 32³ values of one byte stay in the processor's first cache; the seed only fixes the pattern.
-NOISE: Final = np.random.default_rng(0).integers(-127, 128, (_SIDE, _SIDE, _SIDE)).astype(np.int8)
+_NOISE: Final = np.random.default_rng(0).integers(-127, 128, (_SIDE, _SIDE, _SIDE)).astype(np.int8)
 """Random values on a lattice that repeats every 32 steps, in units of 1/127."""
 
 
-@compiled(fastmath=True)
-def value_noise(noise: Array, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
-    """Return trilinear noise in [-1, 1] of lattice pitch 1 (``noise`` is :data:`NOISE`)."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    x, y, z = x - fx, y - fy, z - fz
-    i0, j0, m0 = int(fx) & _MASK, int(fy) & _MASK, int(fz) & _MASK
-    i1, j1, m1 = (i0 + 1) & _MASK, (j0 + 1) & _MASK, (m0 + 1) & _MASK
-    a = noise[m0, j0, i0] * (1 - x) + noise[m0, j0, i1] * x
-    b = noise[m0, j1, i0] * (1 - x) + noise[m0, j1, i1] * x
-    c = noise[m1, j0, i0] * (1 - x) + noise[m1, j0, i1] * x
-    d = noise[m1, j1, i0] * (1 - x) + noise[m1, j1, i1] * x
-    return ((a * (1 - y) + b * y) * (1 - z) + (c * (1 - y) + d * y) * z) / 127.0
-
-
-@compiled(fastmath=True)
-def streak_noise(noise: Array, x: Scalar) -> Scalar:
-    """Return noise in [-1, 1] along a line; it repeats after 32³ steps."""
-    fx = math.floor(x)
-    share, i = x - fx, int(fx)
-    j = i + 1
-    a = noise[(i >> 10) & _MASK, (i >> 5) & _MASK, i & _MASK]
-    b = noise[(j >> 10) & _MASK, (j >> 5) & _MASK, j & _MASK]
-    return (a * (1 - share) + b * share) / 127.0
-
-
-@compiled(fastmath=True)
-def tint_albedo(
-    noise: Array,
-    position: Array,
-    T_cam_obj: Array,
-    focal: float,
-    amplitude: float,
-    pitch: float,
-    albedo: Array,
+def shade_object(
+    item: SceneObject,
+    seen: Projected,
+    scene: Scene,
+    lights: Sequence[ShadowMap],
+    samples: Samples,
+    first_id: int,
+    colour: Array,
 ) -> None:
+    """Add one object's light to the colour of the pixels that show it.
+
+    Args:
+        item: The object.
+        seen: Its projected vertices.
+        scene: Its camera and ambient light.
+        lights: As of :func:`~dopepp.virtual.renderers.raster.shadow.shadow_maps`.
+        samples: What the window's pixels see.
+        first_id: Number of the object's first triangle there.
+        colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+    """
+    fragments = gather_fragments(item, seen, scene, samples, first_id)
+    if fragments is None:
+        return
+    material, sky = item.material, item.surface.sky
+    position, normal, count = fragments.position, fragments.normal, len(fragments.pixel)
+    albedo = _albedo(item, seen, scene, fragments)
+    alpha = scratch("alpha", (count,), np.float32)
+    alpha.fill(max(material.roughness**2, _SHARPEST))
+    if material.grooves is not None:
+        _cut_grooves(item, material.grooves, scene, fragments, alpha)
+    lit, opened = (scratch(name, (count,), np.float32) for name in ("lit", "sky"))
+    radiance = scratch("radiance", (3, count), np.float32)
+    look_up_sky(fragments.face, fragments.share, sky.steps, sky.firsts, sky.values, opened)
+    reflect_ambient(
+        position, normal, albedo, alpha, opened, ambient_row(scene.ambient), material.metallic,
+        radiance,
+    )  # fmt: skip
+    for shadow in lights:
+        lit_shares(
+            position, normal, fragments.bulge, shadow.light, shadow.inverse_depth, shadow.P,
+            _LIFT_TEXELS * shadow.texel, lit,
+        )  # fmt: skip
+        reflect_light(
+            position, normal, albedo, alpha, lit, shadow.light, material.specular,
+            material.metallic, radiance,
+        )  # fmt: skip
+    _add_colour(
+        fragments.pixel, fragments.weight, radiance, TONE_CURVE, TONE_LIMIT, CODE_STEPS,
+        colour.reshape(-1, 3),
+    )  # fmt: skip
+
+
+def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragments) -> Array:
+    """Return the fragments' albedo: the texture times the material's colour, and its noise."""
+    surface, material = item.surface, item.material
+    albedo = scratch("albedo", (3, len(fragments.pixel)), np.float32)
+    colour = np.array(material.colour, np.float32)[:, None]
+    if surface.texture is None:
+        albedo[:] = colour
+    else:
+        sample_texture(
+            fragments.face, fragments.share, fragments.x, fragments.y, seen.hom, surface.faces,
+            surface.uv, surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR, albedo,
+        )  # fmt: skip
+        albedo *= colour
+    if material.noise > 0.0:
+        _tint_albedo(
+            _NOISE, fragments.position, item.T_cam_obj, float(scene.K[0, 0]), material.noise,
+            material.noise_pitch, albedo,
+        )  # fmt: skip
+    return albedo
+
+
+def _cut_grooves(
+    item: SceneObject, grooves: Grooves, scene: Scene, fragments: Fragments, alpha: Array
+) -> None:
+    """Tilt the fragments' normals along the material's grooves, or widen their highlights."""
+    axis = item.T_cam_obj[:3, :3] @ np.array(grooves.axis, np.float64)
+    _tilt_normals(
+        _NOISE, fragments.position, axis, float(axis @ item.T_cam_obj[:3, 3]),
+        np.array([scene.K[0, 0], scene.K[1, 1]]), grooves.pitch, grooves.slope,
+        grooves.irregularity, fragments.normal, alpha,
+    )  # fmt: skip
+
+
+@compiled(fastmath=True)
+def _tint_albedo(
+    noise: Array, position: Array, T_cam_obj: Array, focal: float, amplitude: float, pitch: float,
+    albedo: Array,
+) -> None:  # fmt: skip
     """Vary the albedo over an object's surface; variation finer than a pixel fades.
 
     Args:
-        noise: :data:`NOISE`.
+        noise: :data:`_NOISE`.
         position: Points in the camera frame, metres, shape (3, n).
         T_cam_obj: Object to camera frame.
         focal: Focal length, pixels.
@@ -104,7 +161,7 @@ def tint_albedo(
         x = position[0, p] - T_cam_obj[0, 3]
         y = position[1, p] - T_cam_obj[1, 3]
         z = position[2, p] - T_cam_obj[2, 3]
-        tint = 1.0 + amplitude * min(fade, 1.0) * value_noise(
+        tint = 1.0 + amplitude * min(fade, 1.0) * _value_noise(
             noise,
             (T_cam_obj[0, 0] * x + T_cam_obj[1, 0] * y + T_cam_obj[2, 0] * z) / pitch,
             (T_cam_obj[0, 1] * x + T_cam_obj[1, 1] * y + T_cam_obj[2, 1] * z) / pitch,
@@ -115,31 +172,14 @@ def tint_albedo(
 
 
 @compiled(fastmath=True)
-def _kept_share(grooves_per_px: float) -> float:
-    """Return the share of a sine's amplitude that survives averaging over a pixel."""
-    if grooves_per_px >= 1.0:
-        return 0.0
-    angle = math.pi * grooves_per_px
-    return math.sin(angle) / angle if angle > 1e-3 else 1.0
-
-
-@compiled(fastmath=True)
-def tilt_normals(
-    noise: Array,
-    position: Array,
-    axis: Array,
-    phase_origin: float,
-    focal: Array,
-    pitch: float,
-    slope: float,
-    irregularity: float,
-    normal: Array,
-    alpha: Array,
-) -> None:
+def _tilt_normals(
+    noise: Array, position: Array, axis: Array, phase_origin: float, focal: Array, pitch: float,
+    slope: float, irregularity: float, normal: Array, alpha: Array,
+) -> None:  # fmt: skip
     """Tilt the normals of grooved points, or widen their highlight where grooves are fine.
 
     Args:
-        noise: :data:`~dopepp.virtual.renderers.raster.shading.NOISE`.
+        noise: :data:`_NOISE`.
         position: Points in the camera frame, metres, shape (3, n).
         axis: Unit vector across the grooves, camera frame.
         phase_origin: ``axis · origin`` of the object's frame, metres.
@@ -167,7 +207,7 @@ def tilt_normals(
             phase = (ax * px + ay * py + az * pz - phase_origin) / pitch
             wave = (1.0 - irregularity) * math.sin(2.0 * math.pi * phase)
             if irregularity > 0.0:
-                wave += irregularity * streak_noise(noise, 2.0 * phase)
+                wave += irregularity * _streak_noise(noise, 2.0 * phase)
             tilt = slope * kept * wave
             nx, ny, nz = nx - tilt * tx, ny - tilt * ty, nz - tilt * tz
             norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
@@ -178,112 +218,59 @@ def tilt_normals(
         alpha[p] = min(math.sqrt(alpha[p] * alpha[p] + 0.5 * lost), 1.0)
 
 
-SHARPEST: Final = 0.002
-"""Smallest width of a highlight: one under a point light would be narrower than any pixel."""
-
-LIFT_TEXELS: Final = 1.5
-"""Lift of a point before it is looked up in a shadow map; √2 keeps a plane from shadowing itself,
-the rest is for rounding."""
-
-
-def ambient_row(scene: Scene) -> Array:
-    """Return the up direction and the light from above and below, for compiled code."""
-    return np.array([*scene.ambient.up, *scene.ambient.above, *scene.ambient.below], np.float32)
+@compiled(fastmath=True)
+def _kept_share(grooves_per_px: float) -> float:
+    """Return the share of a sine's amplitude that survives averaging over a pixel."""
+    if grooves_per_px >= 1.0:
+        return 0.0
+    angle = math.pi * grooves_per_px
+    return math.sin(angle) / angle if angle > 1e-3 else 1.0
 
 
-def shade_object(
-    item: SceneObject,
-    seen: Projected,
-    scene: Scene,
-    lights: Sequence[tuple[Array, ShadowMap]],
-    window: tuple[int, int, int, int],
-    origin: tuple[int, int],
-    ids: Array,
-    inverse_depth: Array,
-    first_id: int,
+@compiled(fastmath=True)
+def _value_noise(noise: Array, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+    """Return trilinear noise in [-1, 1] of lattice pitch 1 (``noise`` is :data:`_NOISE`)."""
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    x, y, z = x - fx, y - fy, z - fz
+    i0, j0, m0 = int(fx) & _MASK, int(fy) & _MASK, int(fz) & _MASK
+    i1, j1, m1 = (i0 + 1) & _MASK, (j0 + 1) & _MASK, (m0 + 1) & _MASK
+    a = noise[m0, j0, i0] * (1 - x) + noise[m0, j0, i1] * x
+    b = noise[m0, j1, i0] * (1 - x) + noise[m0, j1, i1] * x
+    c = noise[m1, j0, i0] * (1 - x) + noise[m1, j0, i1] * x
+    d = noise[m1, j1, i0] * (1 - x) + noise[m1, j1, i1] * x
+    return ((a * (1 - y) + b * y) * (1 - z) + (c * (1 - y) + d * y) * z) / 127.0
+
+
+@compiled(fastmath=True)
+def _streak_noise(noise: Array, x: Scalar) -> Scalar:
+    """Return noise in [-1, 1] along a line; it repeats after 32³ steps."""
+    fx = math.floor(x)
+    share, i = x - fx, int(fx)
+    j = i + 1
+    a = noise[(i >> 10) & _MASK, (i >> 5) & _MASK, i & _MASK]
+    b = noise[(j >> 10) & _MASK, (j >> 5) & _MASK, j & _MASK]
+    return (a * (1 - share) + b * share) / 127.0
+
+
+@compiled(fastmath=True)
+def _add_colour(
+    pixel: Array, weight: Array, radiance: Array, curve: Array, limit: float, steps: int,
     colour: Array,
-) -> None:
-    """Add one object's light to the colour of the pixels that show it.
+) -> None:  # fmt: skip
+    """Add fragments to the sums of their pixels' sRGB values.
+
+    Light is encoded before samples are averaged, so a highlight's edge stays smooth.
 
     Args:
-        item: The object.
-        seen: Its projected vertices.
-        scene: Its camera and ambient light.
-        lights: As of :func:`~dopepp.virtual.renderers.raster.shadow.shadow_maps`.
-        window: Pixels to visit as (left, top, right, bottom) of the buffer, right/bottom excluded.
-        origin: Image pixel (x, y) of the buffer's first element.
-        ids: Triangle ids per sample, shape (height, width, S).
-        inverse_depth: 1/m per sample, the same shape.
-        first_id: Id of the object's first triangle.
-        colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+        pixel: Index of every fragment's pixel, shape (n,).
+        weight: Number of samples it stands for, shape (n,).
+        radiance: Linear RGB, shape (3, n).
+        curve: sRGB value per step of radiance.
+        limit: Radiance at which the curve ends.
+        steps: Steps of the curve per unit.
+        colour: Sums, float32, shape (pixels, 3), updated in place.
     """
-    surface, material = item.surface, item.material
-    rotation = np.ascontiguousarray(item.T_cam_obj[:3, :3], np.float64)
-    fragments = gather_fragments(
-        window, origin, ids, inverse_depth, first_id, surface.patches, seen.hom,
-        surface.vertices, surface.faces, surface.normals, rotation, np.linalg.inv(scene.K),
-    )  # fmt: skip
-    count = len(fragments.pixel)
-    if count == 0:
-        return
-    albedo = _albedo(item, seen, scene, fragments)
-    alpha = scratch("alpha", (count,), np.float32)
-    alpha.fill(max(material.roughness**2, SHARPEST))
-    if material.grooves is not None:
-        _cut_grooves(item, scene, fragments, alpha)
-    sky, lit = scratch("sky", (count,), np.float32), scratch("lit", (count,), np.float32)
-    radiance = scratch("radiance", (3, count), np.float32)
-    look_up_sky(
-        fragments.face, fragments.share, surface.sky.steps, surface.sky.firsts,
-        surface.sky.values, sky,
-    )  # fmt: skip
-    position, normal = fragments.position, fragments.normal
-    reflect_ambient(
-        position, normal, albedo, alpha, sky, ambient_row(scene), material.metallic, radiance
-    )
-    for light, shadow in lights:
-        lit_shares(
-            position, normal, fragments.bulge, light, shadow.inverse_depth, shadow.P,
-            LIFT_TEXELS * shadow.texel, lit,
-        )  # fmt: skip
-        reflect_light(
-            position, normal, albedo, alpha, lit, light, material.specular, material.metallic,
-            radiance,
-        )  # fmt: skip
-    add_colour(
-        fragments.pixel, fragments.weight, radiance, TONE_CURVE, TONE_LIMIT, CODE_STEPS,
-        colour.reshape(-1, 3),
-    )  # fmt: skip
-
-
-def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragments) -> Array:
-    """Return the fragments' albedo: the texture times the material's colour, and its noise."""
-    surface, material = item.surface, item.material
-    albedo = scratch("albedo", (3, len(fragments.pixel)), np.float32)
-    colour = np.array(material.colour, np.float32)[:, None]
-    if surface.texture is None:
-        albedo[:] = colour
-    else:
-        sample_texture(
-            fragments.face, fragments.share, fragments.x, fragments.y, seen.hom, surface.faces,
-            surface.uv, surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR, albedo,
-        )  # fmt: skip
-        albedo *= colour
-    if material.noise > 0.0:
-        tint_albedo(
-            NOISE, fragments.position, item.T_cam_obj, float(scene.K[0, 0]), material.noise,
-            material.noise_pitch, albedo,
-        )  # fmt: skip
-    return albedo
-
-
-def _cut_grooves(item: SceneObject, scene: Scene, fragments: Fragments, alpha: Array) -> None:
-    """Tilt the fragments' normals along the material's grooves, or widen their highlights."""
-    grooves = item.material.grooves
-    assert grooves is not None
-    axis = item.T_cam_obj[:3, :3] @ np.array(grooves.axis, np.float64)
-    tilt_normals(
-        NOISE, fragments.position, axis, float(axis @ item.T_cam_obj[:3, 3]),
-        np.array([scene.K[0, 0], scene.K[1, 1]]), grooves.pitch, grooves.slope,
-        grooves.irregularity, fragments.normal, alpha,
-    )  # fmt: skip
+    for p in range(pixel.shape[0]):
+        for c in range(3):
+            step = int(min(max(radiance[c, p], 0.0), limit) * steps + 0.5)
+            colour[pixel[p], c] += weight[p] * curve[step]

@@ -1,204 +1,206 @@
-"""Compiled visibility: which triangle every sample of a pixel sees.
-
-Visibility uses homogeneous edge functions (Olano and Greer, "Triangle scan conversion using 2D
-homogeneous coordinates", 1997): with the projected vertices ``p = K x_cam`` of a triangle,
-``e_0(x, y) = (p_1 × p_2)·(x, y, 1)`` and its cyclic companions are the perspective-correct
-barycentric coordinates times ``det/z``, so ``1/z = (e_0 + e_1 + e_2)/det`` is linear in the image
-and a triangle that crosses the near plane needs no clipping: samples in front of it are rejected.
-"""
+"""Visibility: what every sample of the image sees, of a scene or of one object alone."""
 
 from __future__ import annotations
 
 import math
-import threading
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from jaxtyping import Float, Float32, Int16, UInt8
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
+from dopepp.virtual.triangles import (
+    CENTRE_SAMPLE,
+    PIXEL_SAMPLES,
+    bounds,
+    project_vertices,
+    rasterise,
+    scratch,
+)
+
+Box = tuple[int, int, int, int]
+"""(left, top, right, bottom) in pixels, right and bottom excluded."""
+
+_REACH: Final = float(np.abs(PIXEL_SAMPLES).max())
 
 
-class _Pool(threading.local):
-    """One thread's memory by name; it grows to the largest image and stays."""
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """An object's vertices as the camera sees them.
 
-    def __init__(self) -> None:
-        self.blocks: dict[str, NDArray[np.uint8]] = {}
+    Attributes:
+        cam: Camera frame, metres, shape (V, 3).
+        hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
+        extent: Smallest and largest pixel coordinates (left, top, right, bottom) of its image;
+            infinite if it crosses the camera plane, left > right if it lies behind.
+    """
+
+    cam: Array
+    hom: Array
+    extent: tuple[float, float, float, float]
+
+    def box(self, size: tuple[int, int]) -> Box | None:
+        """Return the pixels of an image of a size that it may touch; None if there are none."""
+        left, top, right, bottom = self.extent
+        if left > right:
+            return None
+        box = (
+            math.ceil(max(left - _REACH, 0.0)),
+            math.ceil(max(top - _REACH, 0.0)),
+            math.floor(min(right + _REACH, size[0] - 1)) + 1,
+            math.floor(min(bottom + _REACH, size[1] - 1)) + 1,
+        )
+        return box if box[0] < box[2] and box[1] < box[3] else None
+
+    def inside(self, size: tuple[int, int]) -> bool:
+        """Tell whether its whole image lies within the pixel centres of an image of a size."""
+        left, top, right, bottom = self.extent
+        return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
 
 
-_pool = _Pool()
+def project_object(item: SceneObject, K: Array) -> Projected:
+    """Project an object's vertices."""
+    cam, hom = np.empty_like(item.surface.vertices), np.empty_like(item.surface.vertices)
+    project_vertices(item.surface.vertices, item.T_cam_obj, K, cam, hom)
+    return Projected(cam, hom, bounds(hom, NEAR))
 
 
-def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array of any content, valid until this thread asks for the same name again.
+def centres_within(extent: tuple[float, float, float, float]) -> Box:
+    """Return the box of the pixel centres within finite bounds, on a canvas without borders."""
+    left, top, right, bottom = extent
+    return math.ceil(left), math.ceil(top), math.floor(right) + 1, math.floor(bottom) + 1
+
+
+def box_around(boxes: Iterable[Box | None]) -> Box | None:
+    """Return the box around several; None if there is none."""
+    known = [box for box in boxes if box is not None]
+    if not known:
+        return None
+    left, top, right, bottom = zip(*known, strict=True)
+    return min(left), min(top), max(right), max(bottom)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What the samples of a window of the image see.
+
+    Attributes:
+        origin: Image pixel (x, y) of the window's first pixel.
+        inverse_depth: 1/m per sample, 0 where nothing is, float32, shape (height, width, S).
+        ids: Triangle per sample, numbered through all objects, −1 for none, int32, same shape.
+    """
+
+    origin: tuple[int, int]
+    inverse_depth: Array
+    ids: Array
+
+
+def draw_samples(
+    scene: Scene, projected: Sequence[Projected], window: Box, offsets: Array
+) -> Samples:
+    """Draw a scene's plane and objects into the samples of a window.
 
     Args:
-        name: Who uses it for what; two arrays in use at a time need two names.
-        shape: Of the array.
-        dtype: Of its elements.
+        scene: The scene.
+        projected: Its objects.
+        window: The part of the image to draw.
+        offsets: Of a pixel's samples from its centre, shape (S, 2).
+
+    Returns:
+        Samples, which are valid until the next scene's are drawn.
     """
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    block = _pool.blocks.get(name)
-    if block is None or len(block) < size:
-        block = _pool.blocks[name] = np.empty(size, np.uint8)
-    return block[:size].view(dtype).reshape(shape)
+    left, top, right, bottom = window
+    shape = (bottom - top, right - left, len(offsets))
+    inverse_depth = scratch("inverse_depth", shape, np.float32)
+    ids = scratch("ids", shape, np.int32)
+    ids.fill(-1)
+    if scene.plane is None:
+        inverse_depth.fill(0.0)
+    else:
+        inverse = inverse_depth_of(scene.plane, scene.K)
+        _clear_to_plane(inverse, (left, top), offsets, NEAR, inverse_depth)
+    for item, seen, first in zip(scene.objects, projected, first_ids(scene), strict=True):
+        rasterise(
+            seen.hom, item.surface.faces, item.surface.closed, NEAR, (left, top), offsets,
+            inverse_depth, ids, first,
+        )  # fmt: skip
+    return Samples((left, top), inverse_depth, ids)
 
 
-NUM_COLOUR_SAMPLES = 4
-"""The first samples of a pixel make its colour; the last one, its centre, makes the labels."""
+def first_ids(scene: Scene) -> Array:
+    """Return the number of every object's first triangle, int64."""
+    counts = [len(item.surface.faces) for item in scene.objects]
+    return np.concatenate([[0], np.cumsum(counts)])[: len(counts)].astype(np.int64)
 
-PIXEL_SAMPLES = np.array([(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25), (0.0, 0.0)])
-CENTRE_SAMPLE = np.zeros((1, 2))
+
+def draw_alone(
+    item: SceneObject, hom: Array, box: Box
+) -> tuple[Float32[np.ndarray, "height width"], Array]:
+    """Draw an object alone at the pixel centres of a box.
+
+    Args:
+        item: The object.
+        hom: Its homogeneous pixels.
+        box: What to draw; it may reach beyond the image.
+
+    Returns:
+        1/m, 0 beside the object; and the object's triangles, of any value beside it.
+    """
+    left, top, right, bottom = box
+    canvas = np.zeros((max(bottom - top, 0), max(right - left, 0), 1), np.float32)
+    ids = np.empty(canvas.shape, np.int32)
+    surface = item.surface
+    rasterise(hom, surface.faces, surface.closed, NEAR, (left, top), CENTRE_SAMPLE, canvas, ids, 0)
+    return canvas[..., 0], ids[..., 0]
+
+
+def backdrop(
+    scene: Scene,
+) -> tuple[
+    UInt8[np.ndarray, "height width 3"],
+    Float32[np.ndarray, "height width"],
+    Int16[np.ndarray, "height width"],
+]:
+    """Return image, depth and instances of a scene without its objects."""
+    depth = np.zeros(scene.background.shape[:2], np.float32)
+    if scene.plane is not None:
+        _plane_depth(inverse_depth_of(scene.plane, scene.K), NEAR, depth)
+    return scene.background.copy(), depth, np.full(depth.shape, -1, np.int16)
+
+
+def inverse_depth_of(plane: Plane, K: Array) -> Float[np.ndarray, "3"]:
+    """Return (a, b, c) with 1/z = a u + b v + c on the plane; positive in front of the camera."""
+    return np.asarray(np.linalg.solve(K.T, np.array(plane.normal, np.float64)) / plane.offset)
 
 
 @compiled()
-def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, hom: Array) -> None:
-    """Write camera-frame vertices (metres) and their homogeneous pixels ``K x_cam``."""
-    for i in range(vertices.shape[0]):
-        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        for r in range(3):
-            cam[i, r] = (
-                T_cam_obj[r, 0] * x + T_cam_obj[r, 1] * y + T_cam_obj[r, 2] * z + T_cam_obj[r, 3]
-            )
-        hom[i, 0] = K[0, 0] * cam[i, 0] + K[0, 1] * cam[i, 1] + K[0, 2] * cam[i, 2]
-        hom[i, 1] = K[1, 1] * cam[i, 1] + K[1, 2] * cam[i, 2]
-        hom[i, 2] = cam[i, 2]
-
-
-@compiled()
-def bounds(hom: Array, near: float) -> tuple[float, float, float, float]:
-    """Return (left, top, right, bottom) of projected vertices; infinite across the near plane."""
-    left, top, right, bottom = math.inf, math.inf, -math.inf, -math.inf
-    in_front, behind = False, False
-    for i in range(hom.shape[0]):
-        w = hom[i, 2]
-        if w < near:
-            behind = True
-        else:
-            in_front = True
-            u, v = hom[i, 0] / w, hom[i, 1] / w
-            left, right = min(left, u), max(right, u)
-            top, bottom = min(top, v), max(bottom, v)
-    if in_front and behind:
-        return -math.inf, -math.inf, math.inf, math.inf
-    return left, top, right, bottom
-
-
-@compiled(inline="always")
-def _narrow(first: int, last: int, x0: int, slope: float, least: float) -> tuple[int, int]:
-    """Narrow a row's columns to those with ``slope·x >= least``, rounded outwards."""
-    if slope > 0.0:
-        # Beyond the window's columns the integer conversion could overflow.
-        edge = min(least / slope - x0, last + 1.0)
-        first = max(first, math.ceil(edge - 1e-6))
-    elif slope < 0.0:
-        edge = max(least / slope - x0, first - 1.0)
-        last = min(last, math.floor(edge + 1e-6))
-    return first, last
-
-
-@compiled()
-def rasterise(
-    hom: Array,
-    faces: Array,
-    cull: bool,
-    near: float,
-    origin: tuple[int, int],
-    samples: Array,
-    inverse_depth: Array,
-    ids: Array,
-    first_id: int,
+def _clear_to_plane(
+    inverse: Array, origin: tuple[int, int], samples: Array, near: float, inverse_depth: Array
 ) -> None:
-    """Draw triangles into a sample buffer of inverse depth (1/m, 0 = empty) and triangle ids.
-
-    Args:
-        hom: Homogeneous pixel coordinates of the vertices, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        cull: Drop back faces (watertight meshes only).
-        near: Samples closer than this many metres are dropped.
-        origin: Pixel (x, y) of the buffer's first element.
-        samples: Offsets of a pixel's samples from its centre, shape (S, 2), |offset| <= 1/4.
-        inverse_depth: Buffer of shape (height, width, S), float32, updated in place.
-        ids: Buffer of the same shape, int32, updated in place.
-        first_id: Id of the first triangle.
-    """
+    """Fill a sample buffer with the plane's inverse depth; 0 where the plane is not seen."""
     height, width, num_samples = inverse_depth.shape
-    x0, y0 = origin
-    delta = np.empty((num_samples, 4))
-    reach = np.abs(samples).max()
-    nearest = 1.0 / near
-    for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, aw = hom[a, 0], hom[a, 1], hom[a, 2]
-        bx, by, bw = hom[b, 0], hom[b, 1], hom[b, 2]
-        cx, cy, cw = hom[c, 0], hom[c, 1], hom[c, 2]
-        if aw < near and bw < near and cw < near:
-            continue
-        e0x, e0y, e0c = by * cw - bw * cy, bw * cx - bx * cw, bx * cy - by * cx
-        det = ax * e0x + ay * e0y + aw * e0c
-        # Seen from outside, a counter-clockwise triangle has a negative determinant.
-        if det == 0.0 or (cull and det > 0.0):
-            continue
-        left, right, top, bottom = 0, width - 1, 0, height - 1
-        if aw >= near and bw >= near and cw >= near:
-            au, bu, cu = ax / aw, bx / bw, cx / cw
-            av, bv, cv = ay / aw, by / bw, cy / cw
-            low, high = min(au, bu, cu) - x0 - reach, max(au, bu, cu) - x0 + reach
-            if high < 0.0 or low > width - 1:
-                continue
-            left, right = max(left, math.ceil(low)), min(right, math.floor(high))
-            low, high = min(av, bv, cv) - y0 - reach, max(av, bv, cv) - y0 + reach
-            if high < 0.0 or low > height - 1:
-                continue
-            top, bottom = max(top, math.ceil(low)), min(bottom, math.floor(high))
-            if left > right or top > bottom:
-                continue
-        # Scaled by 1/det, inside means all three >= 0 and their sum is 1/z.
-        scale = 1.0 / det
-        e0x, e0y, e0c = e0x * scale, e0y * scale, e0c * scale
-        e1x = (cy * aw - cw * ay) * scale
-        e1y = (cw * ax - cx * aw) * scale
-        e1c = (cx * ay - cy * ax) * scale
-        e2x = (ay * bw - aw * by) * scale
-        e2y = (aw * bx - ax * bw) * scale
-        e2c = (ax * by - ay * bx) * scale
+    row = inverse_depth.reshape(height, width * num_samples)
+    steps = np.empty(width * num_samples, np.float32)
+    for i in range(width):
         for s in range(num_samples):
-            dx, dy = samples[s, 0], samples[s, 1]
-            delta[s, 0] = e0x * dx + e0y * dy
-            delta[s, 1] = e1x * dx + e1y * dy
-            delta[s, 2] = e2x * dx + e2y * dy
-            delta[s, 3] = delta[s, 0] + delta[s, 1] + delta[s, 2]
-        # Slack to the pixel centre's edge functions, so that no sample of the pixel is missed.
-        slack0 = -reach * (abs(e0x) + abs(e0y))
-        slack1 = -reach * (abs(e1x) + abs(e1y))
-        slack2 = -reach * (abs(e2x) + abs(e2y))
-        wide = right - left > 3
-        for j in range(top, bottom + 1):
-            y = float(j + y0)
-            first, last = left, right
-            if wide:
-                # Long slanted triangles fill little of their bounding box: solve for the span.
-                row0, row1, row2 = e0y * y + e0c, e1y * y + e1c, e2y * y + e2c
-                first, last = _narrow(first, last, x0, e0x, slack0 - row0)
-                first, last = _narrow(first, last, x0, e1x, slack1 - row1)
-                first, last = _narrow(first, last, x0, e2x, slack2 - row2)
-            x = float(first + x0)
-            w0 = e0x * x + e0y * y + e0c
-            w1 = e1x * x + e1y * y + e1c
-            w2 = e2x * x + e2y * y + e2c
-            for i in range(first, last + 1):
-                if w0 >= slack0 and w1 >= slack1 and w2 >= slack2:
-                    total = w0 + w1 + w2
-                    for s in range(num_samples):
-                        if (
-                            w0 + delta[s, 0] >= 0.0
-                            and w1 + delta[s, 1] >= 0.0
-                            and w2 + delta[s, 2] >= 0.0
-                        ):
-                            inverse = np.float32(total + delta[s, 3])
-                            if inverse > inverse_depth[j, i, s] and inverse <= nearest:
-                                inverse_depth[j, i, s] = inverse
-                                ids[j, i, s] = first_id + f
-                w0 += e0x
-                w1 += e1x
-                w2 += e2x
+            steps[i * num_samples + s] = (
+                inverse[0] * (origin[0] + i + samples[s, 0]) + inverse[1] * samples[s, 1]
+            )
+    nearest = np.float32(1.0 / near)
+    for j in range(height):
+        start = np.float32(inverse[1] * (origin[1] + j) + inverse[2])
+        for k in range(steps.shape[0]):
+            value = start + steps[k]
+            row[j, k] = value if np.float32(0) < value <= nearest else np.float32(0)
+
+
+@compiled()
+def _plane_depth(inverse: Array, near: float, depth: Array) -> None:
+    """Write the plane's depth at every pixel centre, metres; 0 where it is not seen."""
+    for j in range(depth.shape[0]):
+        for i in range(depth.shape[1]):
+            value = inverse[0] * i + inverse[1] * j + inverse[2]
+            depth[j, i] = 1.0 / value if 0.0 < value * near <= 1.0 else 0.0

@@ -13,10 +13,11 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.labels import make_labels
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
-from dopepp.data.formats.bop.writer import STAGING, BopWriter
+from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints

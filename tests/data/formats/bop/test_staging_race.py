@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dopepp.data.formats.bop.writer import STAGING, finalizing, stage, staged_items
+from dopepp.data.formats import STAGING, finalizing, stage, staged_items
 
 ITEMS = 300
 

@@ -129,7 +129,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "image missing": (lambda r: (r / "000001.png").unlink(), "000001.json: image: missing"),
     "depth cut": (
         lambda r: (r / "000001.depth.png").write_bytes(b"\x89PNG"),
-        "000001.depth.png: image: unreadable",
+        "000001.depth.png: image: of 4 bytes",
     ),
     "depth missing": (
         lambda r: (r / "000001.depth.png").unlink(), "000001.depth.png: file: missing"

@@ -21,9 +21,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.images import decode_runs, encode_runs
 from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.writer import STAGING
 from dopepp.data.formats.webdataset.source import WebdatasetSource
 from dopepp.data.formats.webdataset.tar import FIELDS, index_shard, members
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
@@ -346,9 +346,9 @@ def test_any_damage_is_a_user_error_or_harmless(
     [
         ({"camera_json": {"cam_K": K[:4]}}, r"camera\.json: cam_K"),
         ({"camera_json": []}, r"camera\.json: cam_K"),
-        ({"gt_json": {"a": 1}}, r"lists of objects"),
-        ({"gt_info_json": [{"visib_fract": 1}]}, r"gt_info\.json with 1 objects; allowed: 3"),
-        ({"gt_info_json": [{"visib_fract": "1"}] * 3}, r"object 0: visib_fract"),
+        ({"gt_json": {"a": 1}}, r"gt\.json: .*a list"),
+        ({"gt_info_json": [{"visib_fract": 1}]}, r"gt_info\.json: 1 objects; allowed: 3"),
+        ({"gt_info_json": [{"visib_fract": "1"}] * 3}, r"gt_info\.json: \[0\]\.visib_fract"),
         ({"mask_visib_json": {"0": {}}}, r"mask_visib\.json: 1: size None"),
         ({"mask_visib_json": {"1": {"size": [48, 64], "counts": [1]}}}, r"counts \[1\]"),
     ],

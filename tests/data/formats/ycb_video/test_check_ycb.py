@@ -99,14 +99,14 @@ DAMAGES: dict[str, tuple[Callable[[Any], Any], str]] = {
     "colour missing": (remove("color.png"), "color.png: file: missing"),
     "depth missing": (remove("depth.png"), "depth.png: file: missing"),
     "label missing": (remove("label.png"), "label.png: file: missing"),
-    "meta missing": (remove("meta.mat"), "meta.mat: file: missing"),
+    "meta missing": (remove("meta.mat"), "meta.mat: file: No such file"),
     "meta cut": (cut("meta.mat"), "meta.mat: file: "),
     "meta empty": (
         lambda tree: tree.path(FRAME, "meta.mat").write_bytes(b""), "meta.mat: file: damaged"
     ),
     "label size": (image("label.png", np.zeros((9, 9), np.uint8)), "label.png: size: 9×9"),
     "depth size": (image("depth.png", np.zeros((9, 9), np.uint16)), "depth.png: size: 9×9"),
-    "label colour": (image("label.png", np.zeros((72, 96, 3), np.uint8)), "label.png: channels: 3"),
+    "label colour": (image("label.png", np.zeros((72, 96, 3), np.uint8)), "label.png: channels: "),
     "label of nobody": (
         image("label.png", np.full((72, 96), 3, np.uint8)),
         "label.png: values: classes [3] without a pose",
@@ -194,7 +194,7 @@ def test_unknown_layouts(tmp_path: Path) -> None:
 def test_report_lines_are_capped_and_counted(tmp_path: Path) -> None:
     report = CheckReport(tmp_path, "BOP")
     for number in range(MAX_KEPT + 5):
-        report.add(tmp_path / "a" / f"{number}.json", "0.cam_K", "two\nlines")
+        report.report(tmp_path / "a" / f"{number}.json", "0.cam_K", "two\nlines")
     report.note("worth knowing")
     report.note("worth knowing")
     lines = report.lines(3)

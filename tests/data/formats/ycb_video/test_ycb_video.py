@@ -225,14 +225,23 @@ def _rotated(change: Callable[[np.ndarray], object]) -> np.ndarray:
         ({"poses": None}, "poses"),
         ({"cls_indexes": None}, "cls_indexes"),
         ({"factor_depth": None}, "factor_depth"),
-        ({"factor_depth": 0}, "factor_depth 0"),
-        ({"cls_indexes": [[2], [3]]}, "1 poses for the classes"),
-        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), np.nan))}, "no rigid transform"),
-        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), -1.0))}, "no rigid transform"),
-        ({"poses": _rotated(lambda p: p.__setitem__((0, 0), 2.0))}, "no rigid transform"),
+        ({"factor_depth": 0}, "factor_depth: 0"),
+        ({"cls_indexes": [[2], [3]]}, r"poses: shape \(3, 4, 1\) for 2 classes"),
+        (
+            {"poses": _rotated(lambda p: p.__setitem__((0, 0), np.nan))},
+            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
+        ),
+        (
+            {"poses": _rotated(lambda p: p.__setitem__((0, 0), -1.0))},
+            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
+        ),
+        (
+            {"poses": _rotated(lambda p: p.__setitem__((0, 0), 2.0))},
+            r"poses\[0\].* finite|poses\[0\]\.R: no rotation",
+        ),
         ({"poses": _rotated(lambda p: p.__setitem__((2, 3), -0.3))}, "behind the camera"),
         ({"intrinsic_matrix": camera_matrix(100.0, 100.0, 900.0, 35.5)}, "principal point"),
-        ({"intrinsic_matrix": np.full((3, 3), np.nan)}, "pinhole"),
+        ({"intrinsic_matrix": np.full((3, 3), np.nan)}, "intrinsic_matrix: not finite"),
     ],
 )
 def test_impossible_meta(ycb_tree: Any, box: Part, changes: dict[str, Any], message: str) -> None:
@@ -269,7 +278,7 @@ def test_images_cut_or_of_another_size(ycb_tree: Any, box: Part, what: str) -> N
     path.write_bytes(content)
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(path), image[:-2])
-    with pytest.raises(UserError, match=r"of 96×7[02] for a colour image of 96×7[02]"):
+    with pytest.raises(UserError, match=r"size: 96×7[02] pixels; allowed: 96×7[02]"):
         source.sample(0)
 
 

@@ -1,0 +1,239 @@
+"""The nodes ``data`` and ``virtual``: which images there are, and how renders are made.
+
+A training states both; an evaluation takes its checkpoint's, with what the user gives instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from dopepp.core.errors import UserError
+from dopepp.data.sources.rendered import MAX_ITEMS, Split
+from dopepp.experiment.config.parse import Range, Seed, Share, parse
+
+Cache = Literal["none", "memory", "disk"]
+Count = Annotated[int, Range(1, MAX_ITEMS)]
+
+MAX_WORKERS: Final = 1024
+"""More loader processes than any machine here has cores: a slip of the keyboard."""
+
+_MULTIPLE: Final = 32
+"""What both sides of an input are multiples of, pixels."""
+
+_CLOSED: Final = ("data.masking", "data.augment", "data.image_sets")
+"""Nodes of an evaluation's data in which every option that can be changed is there already."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VirtualConfig:
+    """How renders are made: the node ``virtual``.
+
+    Attributes:
+        preset: Name of the scenes' description (:mod:`dopepp.virtual.presets`); None takes ``ycb``
+            with a ``data.root``, else ``paper``.
+        scene: Fields of the preset that are changed.
+        backgrounds: Folder of photos, ``skimage`` for its own photos; None for procedural pictures.
+        negatives: Parts that are shown but must not be found: built-in names or mesh files.
+        renderer: ``raster``, or ``photoreal``.
+    """
+
+    preset: str | None = None
+    scene: Mapping[str, Any] | None = None
+    backgrounds: str | None = None
+    negatives: tuple[str, ...] = ()
+    renderer: str = "raster"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TestConfig:
+    """The test images: labelled ones where there is a ``data.root``, else renders.
+
+    Attributes:
+        renderer: What draws them; None takes that of ``virtual``. One that is named here makes them
+            renders also with a root.
+        cache: Where renders are kept; ``disk`` keeps them for the next evaluation.
+    """
+
+    renderer: str | None = None
+    cache: Cache = "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataConfig:
+    """Objects and images: the node ``data``, with how its renders are made.
+
+    Attributes:
+        name: Of the choice, for folders and tables.
+        format: Of the labelled images: a key of :data:`~dopepp.experiment.build.splits.FORMATS`.
+        root: Folder of labelled images; None renders all images.
+        objects: Objects of the root to learn; None takes the paper's five of YCB-Video, else all.
+        parts: Built-in names or mesh files, without a root and for NDDS.
+        unit: Of the mesh files: m, cm, mm or inch; None as :mod:`dopepp.parts.mesh` takes them.
+        symmetries: Of the objects: None as the data set states them, else ``none``, ``auto`` or a
+            file (:mod:`dopepp.data.part_symmetries`).
+        real_fraction: Share of labelled images in an epoch.
+        synthetic_fraction: Share of YCB-Video's own synthetic images in what is not labelled.
+        frames: Frames of YCB-Video for training and test alike, instead of image sets.
+        image_sets: What each split takes of the root, by ``train``, ``val`` and ``test``: an image
+            set of YCB-Video, of other formats a folder, which several splits may share.
+        targets: BOP's list of test images to use; None takes all.
+        classes: Class in NDDS files to part, where the names differ.
+        download_dir: Where shards from URLs are kept; None downloads nothing.
+        masking: Node of the random masks; without a target there are none.
+        augment: Node of the photometric augmentation; without a target there is none.
+        virtual: How images are rendered.
+        test: What the test images are.
+        cache: ``memory`` and ``disk`` render each training image once and keep it.
+        cache_dir: Folder of ``disk``; None is the user's own cache.
+        samples_per_epoch: Images of an epoch.
+        num_val: Rendered validation images.
+        num_test: Rendered test images.
+        eval_seed: Of validation and test renders and of shading's patches, so that trainings of
+            several seeds are measured on the same images.
+        input_size: The network's input (width, height), pixels, multiples of 32.
+        batch_size: Images in a step, of each process.
+        num_workers: Processes that load; None takes one a core.
+    """
+
+    name: str
+    format: str
+    root: Path | None
+    objects: tuple[str, ...] | None
+    parts: tuple[str, ...]
+    unit: str | None
+    symmetries: str | None = None
+    real_fraction: Share
+    synthetic_fraction: Share
+    frames: tuple[str, ...] | None
+    image_sets: Mapping[str, str]
+    targets: str | None = None
+    classes: Mapping[str, str] | None = None
+    download_dir: str | None = None
+    masking: Mapping[str, Any] = field(default_factory=dict)
+    augment: Mapping[str, Any] = field(default_factory=dict)
+    virtual: VirtualConfig = VirtualConfig()
+    test: TestConfig = TestConfig()
+    cache: Cache = "none"
+    cache_dir: str | None = None
+    samples_per_epoch: Count
+    num_val: Count
+    num_test: Count
+    eval_seed: Seed
+    input_size: tuple[int, int]
+    batch_size: Count
+    num_workers: Annotated[int, Range(0, MAX_WORKERS)] | None
+
+    @classmethod
+    def of(cls, data: object, virtual: object) -> DataConfig:
+        """Read both nodes; ``virtual`` None is one that says nothing.
+
+        ``data.virtual``, which earlier versions wrote beside ``virtual``, may repeat it.
+
+        Raises:
+            UserError: An option is unknown, missing, of a wrong type or out of range.
+        """
+        if isinstance(data, Mapping):
+            _check_size(data.get("input_size"))
+            data = _without_copy(data, virtual)
+        return parse(cls, data, "data", virtual=parse(VirtualConfig, virtual or {}, "virtual"))
+
+    def is_rendered(self, split: Split) -> bool:
+        """Tell whether a held-out split's images are renders."""
+        return self.root is None or (split == "test" and self.test.renderer is not None)
+
+
+def chosen_data(
+    data: Mapping[str, Any] | None,
+    virtual: Mapping[str, Any] | None,
+    stored: object,
+    source: str,
+) -> DataConfig:
+    """Return the data to evaluate on: the checkpoint's, with what the user gives instead.
+
+    Args:
+        data: Given: whole, or options to change.
+        virtual: Given: whole, or options to change.
+        stored: What the checkpoint was trained on; it may be by anybody.
+        source: The checkpoint's path, for messages.
+
+    Raises:
+        UserError: Neither names the data, or one of them is wrong.
+    """
+    given, base = data or {}, stored if isinstance(stored, dict) else {}
+    whole = "name" in given  # a file of conf/data, not single options
+    if not whole and not isinstance(stored, dict):
+        raise UserError(f"{source}, which names no data", "data=… on the command line", "add it")
+    how = base.get("virtual")
+    try:
+        own = _without_copy(given, virtual)
+        merged = own if whole else _changed(_without_copy(base, how), own, "data")
+        chosen = DataConfig.of(merged, None)
+        if not virtual and how is None and not chosen.is_rendered("test"):
+            return chosen
+        return replace(chosen, virtual=_chosen_virtual(virtual or {}, how, source))
+    except UserError as error:
+        if whole or error.got.startswith(source):
+            raise
+        raise UserError(
+            f"{source}, whose data config has {error.got}",
+            error.allowed,
+            f"{error.fix}, choose the data with data=…, or use a checkpoint written by train.py",
+        ) from error
+
+
+def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the data config that a checkpoint names, None where it names none.
+
+    Args:
+        description: What the checkpoint says about its data. Where it is older than
+            ``data.eval_seed``, held-out images were rendered with the training's own seed.
+    """
+    config = description.get("config")
+    if not isinstance(config, dict):
+        return None
+    return {"eval_seed": description.get("seed", 0), **config}
+
+
+def _check_size(size: object) -> None:
+    sides = size if isinstance(size, list) and len(size) == 2 else [0]
+    if not all(type(side) is int and side > 0 and side % _MULTIPLE == 0 for side in sides):
+        raise UserError(
+            f"data.input_size={size}",
+            f"[width, height], each a multiple of {_MULTIPLE}",
+            "round up; images are letterboxed into it",
+        )
+
+
+def _without_copy(data: Mapping[str, Any], virtual: object) -> dict[str, Any]:
+    """Leave out what the node ``data`` says of ``virtual``; it may not say anything else."""
+    copy = data.get("virtual")
+    if copy is not None and copy != virtual:
+        raise UserError(f"data.virtual={copy!r:.100}", "the node virtual alone", "set virtual.…")
+    return {key: value for key, value in data.items() if key != "virtual"}
+
+
+def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
+    """Return how to render: a whole node as given, or the stored one with options changed."""
+    if not {"renderer", "preset"} <= set(given):  # else a file of conf/virtual
+        if stored is None:
+            raise UserError(
+                f"{source}, which does not say how to render", "virtual=default", "add it"
+            )
+        return parse(VirtualConfig, _changed(stored, given, "virtual"), "virtual")
+    return parse(VirtualConfig, given, "virtual")
+
+
+def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Replace options, one by one also inside nodes."""
+    if not isinstance(base, Mapping):
+        raise UserError(f"{where}={base!r:.100}", "a mapping", "write a whole node")
+    merged = dict(base)
+    for key, value in changes.items():
+        if key not in base and where in _CLOSED:
+            raise UserError(f"{where}.{key}={value}", ", ".join(base), "check the option's name")
+        nested = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
+        merged[key] = _changed(base[key], value, f"{where}.{key}") if nested else value
+    return merged

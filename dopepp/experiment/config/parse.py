@@ -1,0 +1,175 @@
+"""Plain mappings, as Hydra composes them and as files hold them, into frozen dataclasses.
+
+A field's type says what its option may be: numbers have a :class:`Range`, ``Literal`` lists the
+choices, ``X | None`` may be null, a dataclass is a node of its own, ``Mapping[str, Any]`` is a node
+that something else reads, such as a registry. A field without a default must be there; what is no
+field is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from dopepp.core.errors import UserError
+from dopepp.models.registry import TARGET, check_flag, check_integer, check_number
+
+T = TypeVar("T")
+
+_WORDS: Final = {str: "text", int: "an integer", float: "a number", Path: "a path"}
+
+
+@dataclass(frozen=True)
+class Range:
+    """The closed range of a number's field, as in ``Annotated[int, Range(1, 10)]``."""
+
+    lowest: float
+    highest: float
+
+
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+Share = Annotated[float, Range(0, 1)]
+
+
+def parse(kind: type[T], given: object, name: str = "", **known: Any) -> T:
+    """Build a dataclass from a plain mapping.
+
+    Args:
+        kind: The dataclass.
+        given: The mapping.
+        name: The node's dotted name, for messages; empty for the whole config.
+        known: Fields whose values the caller has.
+
+    Raises:
+        UserError: It is no mapping, an option is unknown or missing, or a value is not of its
+            field's type or outside of its range.
+    """
+    own = {one.name: one for one in fields(kind) if one.name not in known}  # type: ignore[arg-type]
+    if not isinstance(given, Mapping):
+        raise UserError(f"{name}={given!r:.100}", f"options: {', '.join(own)}", f"change {name}")
+    prefix = f"{name}." if name else ""
+    for key, value in given.items():
+        if key not in own:
+            raise UserError(
+                f"{prefix}{key}={value!r:.100}", ", ".join(own), "check the option's name"
+            )
+    for key, one in own.items():
+        if key not in given and one.default is MISSING and one.default_factory is MISSING:
+            raise UserError(f"no {prefix}{key}", f"{prefix}{key}=…", "add it")
+    hints = get_type_hints(kind, include_extras=True)
+    values = {key: _value(hints[key], value, f"{prefix}{key}") for key, value in given.items()}
+    return kind(**values, **known)
+
+
+def _value(hint: Any, value: Any, name: str) -> Any:
+    """Return a field's value as its type says."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        bounds = arguments[1]
+        check = check_integer if arguments[0] is int else check_number
+        check(name, value, bounds.lowest, bounds.highest)
+        return value  # as it was written: 1 stays an integer where any number is allowed
+    if origin in (Union, UnionType):  # X | None
+        return None if value is None else _value(arguments[0], value, name)
+    if origin is Literal:
+        if value not in arguments:
+            raise UserError(f"{name}={value!r:.100}", ", ".join(arguments), "choose one of them")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise UserError(f"{name}={value}", "a list, also of a single one", f"{name}=[{value}]")
+        return tuple(_value(arguments[0], one, f"{name}[{i}]") for i, one in enumerate(value))
+    if origin is not None:  # Mapping
+        if not isinstance(value, Mapping):
+            raise UserError(f"{name}={value!r:.100}", "a mapping", f"change {name}")
+        return {key: _value(arguments[1], one, f"{name}.{key}") for key, one in value.items()}
+    if is_dataclass(hint):
+        return parse(hint, value, name)  # type: ignore[arg-type]
+    return value if hint is Any else _plain(hint, value, name)
+
+
+def _plain(kind: type[Any], value: Any, name: str) -> Any:
+    """Return text, a path, a flag or a number without bounds."""
+    if kind is bool:
+        return check_flag(name, value)
+    if kind is float and type(value) in (int, float) and math.isfinite(value):
+        return value
+    if kind is Path and type(value) is str:
+        return Path(value)
+    if type(value) is not kind or kind is float:
+        raise UserError(f"{name}={value!r:.100}", _WORDS[kind], f"change {name}")
+    return value
+
+
+FORMER_TARGETS: Final = {
+    "dopepp.data.augment.Photometric": "dopepp.data.transforms.augment.Photometric",
+    "dopepp.data.masking.RandomMask": "dopepp.data.transforms.masking.RandomMask",
+    **{
+        f"dopepp.training.{former}": f"dopepp.training.{present}"
+        for former, present in (
+            ("auc_curves.AUCCurves", "callbacks.pictures.AUCCurves"),
+            ("belief_maps.BeliefMaps", "callbacks.pictures.BeliefMaps"),
+            ("early_stopping.EarlyStop", "callbacks.pose_metrics.EarlyStop"),
+            ("empty_maps.EmptyMaps", "callbacks.empty_maps.EmptyMaps"),
+            ("finite.FiniteSteps", "callbacks.finite.FiniteSteps"),
+            ("last_checkpoint.LastCheckpoint", "checkpointing.last.LastCheckpoint"),
+            ("overlays.Overlays", "callbacks.pictures.Overlays"),
+            ("pose_metrics.PoseMetricsCallback", "callbacks.pose_metrics.PoseMetricsCallback"),
+            ("throughput.Throughput", "callbacks.throughput.Throughput"),
+            ("trial.TrialReport", "callbacks.trial.TrialReport"),
+        )
+    },
+}
+"""What users' files call classes that have moved since, and where they are."""
+
+
+def with_present_names(node: Any) -> Any:
+    """Return a config, or a node of it, whose targets are where they are now."""
+    if isinstance(node, Mapping):
+        return {
+            key: FORMER_TARGETS.get(value, value)
+            if key == TARGET and isinstance(value, str)
+            else with_present_names(value)
+            for key, value in node.items()
+        }
+    return node
+
+
+def as_written_now(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config of any version's run as this one writes it.
+
+    Classes go by their present names, and ``data`` does not say again what ``virtual`` says.
+    """
+    present: dict[str, Any] = with_present_names(config)
+    data = present.get("data")
+    if isinstance(data, dict):
+        present["data"] = {key: value for key, value in data.items() if key != "virtual"}
+    return present
+
+
+def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the leaves of nested mappings by their dotted names; lists are leaves."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from flat(item, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, value
+
+
+def below(key: str, nodes: Sequence[str]) -> bool:
+    """Tell whether an option is one of some nodes or stands below one."""
+    return any(key == node or key.startswith(f"{node}.") for node in nodes)

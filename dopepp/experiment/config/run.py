@@ -1,0 +1,334 @@
+"""What ``train.py`` and ``evaluate.py`` are asked to do: their whole configs, parsed once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.parse import Range, Seed, parse, with_present_names
+from dopepp.experiment.reports.protocols import Protocols
+from dopepp.experiment.tuning import FalsePositiveTarget
+from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
+from dopepp.training.symmetry import SymmetryOptions
+
+T = TypeVar("T")
+
+Node = Mapping[str, Any]
+"""``{"_target_": …, argument: …}`` for a registry; without a target there is no such thing."""
+
+_MOST: Final = 10**6
+_MAX_EPOCHS: Final = 10**9
+_MAX_WAIT_S: Final = 7 * 24 * 3600
+_MIN_CELLS: Final = 0.1
+"""A peak or disc narrower than this, in cells, is on no cell at all."""
+_MAX_THRESHOLD: Final = 1000
+"""Above any map size in cells, angle in degrees and number of peaks that means something."""
+
+Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
+Threshold = Annotated[float, Range(0, _MAX_THRESHOLD)]
+Rate = Annotated[float, Range(1e-12, 1e3)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """The network and its loss: the node ``model``.
+
+    Attributes:
+        name: What it is called in tables.
+        width: Factor on every channel count, of which the nodes below take their own.
+        backbone: Node of :data:`~dopepp.models.spec.BACKBONES`.
+        attention: Node of :data:`~dopepp.models.spec.ATTENTIONS`.
+        head: Node of :data:`~dopepp.models.spec.HEADS`.
+        loss: Node of :data:`~dopepp.models.spec.LOSSES`.
+    """
+
+    name: str
+    width: Annotated[float, Range(MIN_WIDTH, MAX_WIDTH)]
+    backbone: Node
+    attention: Node
+    head: Node
+    loss: Node
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapsConfig:
+    """The target maps: the node ``maps``.
+
+    Attributes:
+        sigma: Standard deviation of a belief peak, cells.
+        field_radius: Radius of the disc around a corner that carries its vector, cells.
+    """
+
+    sigma: Cells
+    field_radius: Cells
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerConfig:
+    """How and where training runs: the node ``trainer``.
+
+    Attributes:
+        accelerator: Lightning's name, or ``auto``.
+        devices: How many on each machine, a list of them, ``auto`` or -1 for all.
+        num_nodes: Machines.
+        strategy: ``ddp`` for several processes, ``auto``, or another of Lightning's.
+        precision: Lightning's name, or ``auto`` for bf16 where the hardware is fast at it.
+        max_epochs: Epochs to train.
+        max_steps: Steps of the optimiser to train; -1 sets no limit.
+        profiler: ``simple`` or ``pytorch``.
+        ddp_timeout_s: How long a process waits for one that says nothing, seconds.
+        lightning: Further arguments of Lightning's Trainer, which refuses what it does not know.
+    """
+
+    accelerator: str = "auto"
+    devices: Any = 1
+    num_nodes: Any = 1
+    strategy: str = "auto"
+    precision: Any = "auto"
+    max_epochs: Annotated[int, Range(1, _MAX_EPOCHS)]
+    max_steps: Annotated[int, Range(-1, _MAX_EPOCHS)] = -1
+    profiler: Literal["simple", "pytorch"] | None = None
+    ddp_timeout_s: Annotated[float, Range(1, _MAX_WAIT_S)] = 1800.0
+    lightning: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, node: Mapping[str, Any]) -> TrainerConfig:
+        """Read the node.
+
+        Raises:
+            UserError: An option of ours is missing, of a wrong type or out of range.
+        """
+        ours = {one.name for one in fields(cls)} - {"lightning"}
+        return parse(
+            cls,
+            {key: value for key, value in node.items() if key in ours},
+            "trainer",
+            lightning={key: value for key, value in node.items() if key not in ours},
+        )
+
+    @property
+    def num_processes(self) -> int:
+        """Training processes, over all machines.
+
+        Raises:
+            UserError: ``devices`` or ``num_nodes`` means nothing.
+        """
+        # Where torchrun has started this process, the others exist already.
+        world_size = os.environ.get("WORLD_SIZE", "")
+        outside = int(world_size) if world_size.isdecimal() else 1
+        if type(self.num_nodes) is not int or self.num_nodes < 1:
+            raise UserError(
+                f"trainer.num_nodes={self.num_nodes}", "a positive integer", "correct it"
+            )
+        return max(outside, self.num_nodes * self._num_devices())
+
+    def _num_devices(self) -> int:
+        devices = self.devices
+        if isinstance(devices, str) and "," in devices:
+            devices = [piece for piece in devices.split(",") if piece.strip()]
+        if isinstance(devices, str) and devices.lstrip("-").isdecimal():
+            devices = int(devices)
+        if isinstance(devices, list) and devices:
+            return len(devices)
+        if devices == "auto" or (devices == -1 and type(devices) is int):
+            on_cpu = self.accelerator == "cpu" or not torch.cuda.is_available()
+            return 1 if on_cpu else torch.cuda.device_count()
+        if type(devices) is int and devices > 0:
+            return devices
+        raise UserError(
+            f"trainer.devices={self.devices}",
+            "a positive number, a list of devices, auto or -1",
+            "correct it",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostConfig:
+    """``job=cost``: the node ``cost``.
+
+    Attributes:
+        num_frames: Frames that are timed one by one, from picture to poses.
+        batch_size: Images that the network alone is timed with.
+    """
+
+    num_frames: Annotated[int, Range(1, _MOST)]
+    batch_size: Annotated[int, Range(1, _MOST)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningRateConfig:
+    """``job=lr_finder``: the node ``lr_finder``.
+
+    Attributes:
+        min_lr: Of the first step.
+        max_lr: Of the last step; training ends earlier where the loss diverges.
+        num_steps: Steps between them.
+    """
+
+    min_lr: Rate
+    max_lr: Rate
+    num_steps: Annotated[int, Range(10, _MOST)]
+
+    def __post_init__(self) -> None:
+        if self.max_lr <= self.min_lr:
+            raise UserError(
+                f"lr_finder.max_lr={self.max_lr:g}",
+                f"above lr_finder.min_lr={self.min_lr:g}",
+                "widen the range",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementConfig:
+    """What a training and an evaluation have in common: how a network is measured.
+
+    Attributes:
+        plain: The whole config in plain values, as it is shown and written down.
+        protocols: What is measured beside the test set as it is: ``shading``, ``scale_factors``,
+            ``by`` and ``num_bins``.
+        tune: Whether to learn a factor on distances, a score and its threshold first.
+        false_positives: What tuning demands: ``num_empty`` and ``false_positive_rate``.
+        output_dir: Folder of run folders.
+    """
+
+    plain: Mapping[str, Any]
+    protocols: Protocols
+    tune: bool
+    false_positives: FalsePositiveTarget
+    output_dir: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(MeasurementConfig):
+    """``train.py``'s config.
+
+    Attributes:
+        job: What is done with it.
+        cost: Of ``job=cost``.
+        lr_finder: Of ``job=lr_finder``.
+        table: Of a multirun, how its table is laid out
+            (:class:`~dopepp.experiment.reports.paper_table.PaperTable`).
+        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.search`).
+        recipe: Name of the loss, optimiser and schedule that were chosen together.
+        seed: Of initial weights, order and training images.
+        compile: Whether to compile the network with torch.
+        ema: Decay of an exponential moving average of the weights; None for none.
+        keep_checkpoints: Whether they stay when everything has run.
+        resume: Folder of the interrupted run to go on with.
+        resume_anyway: Whether to go on where what the network learns from has changed.
+        init_from: Checkpoint whose weights training begins with.
+        model: The network and its loss.
+        maps: The target maps.
+        recovery: Thresholds from maps to poses, by the names of
+            :class:`~dopepp.recovery.options.RecoveryOptions`.
+        symmetry: How symmetric parts are learnt.
+        data: Objects, images, and how they are rendered.
+        optimizer: Node of an optimiser.
+        scheduler: Node of a schedule; without a target the rate is constant.
+        trainer: How and where training runs.
+        callbacks: Nodes of callbacks by name, in the order in which they are called.
+        logger: Nodes of experiment trackers by name.
+    """
+
+    job: Literal["train", "cost", "lr_finder"]
+    cost: CostConfig
+    lr_finder: LearningRateConfig
+    table: Mapping[str, Any] | None
+    search: Mapping[str, Any] | None = None
+    recipe: str | None = None
+    seed: Seed
+    compile: bool
+    ema: float | None
+    keep_checkpoints: bool
+    resume: str | None
+    resume_anyway: bool
+    init_from: str | None
+    model: ModelConfig
+    maps: MapsConfig
+    recovery: Mapping[str, Threshold]
+    symmetry: SymmetryOptions
+    data: DataConfig
+    optimizer: Node
+    scheduler: Node
+    trainer: TrainerConfig
+    callbacks: Mapping[str, Any]
+    logger: Mapping[str, Any] | None = None
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> RunConfig:
+        """Read a composed and resolved config.
+
+        Raises:
+            UserError: An option is unknown, missing, of a wrong type or out of range.
+        """
+        plain = with_present_names(config)
+        nodes = {
+            "data": DataConfig.of(plain["data"], plain["virtual"]),
+            "trainer": TrainerConfig.of(plain["trainer"]),
+        }
+        return _parsed(cls, plain, ("virtual", *nodes), **nodes)
+
+    def stored_data(self) -> dict[str, Any]:
+        """Return what a checkpoint says of its data: the node ``data`` with ``virtual`` in it."""
+        return {**self.plain["data"], "virtual": self.plain["virtual"]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig(MeasurementConfig):
+    """``evaluate.py``'s config.
+
+    Attributes:
+        ckpt_path: The checkpoint to measure.
+        baseline: A second one, which comes first in tables.
+        results: A BOP challenge CSV of another method's poses.
+        method: That method's name; None takes it from the file's.
+        data: Data to measure on: whole, or options to change in the checkpoint's; see
+            :func:`~dopepp.experiment.config.data.chosen_data`.
+        virtual: How to render, idem.
+        bop_csv: Whether to write every method's poses as such a file.
+        all_measures: Whether to print the symmetric measures of parts without symmetries, too.
+        refine: ``depth`` refines poses where the images have depth.
+        device: torch's name, or ``auto``.
+        num_pictures: Images that are drawn.
+    """
+
+    ckpt_path: str | None
+    baseline: str | None
+    results: str | None
+    method: Any = None
+    data: Mapping[str, Any] | None = None
+    virtual: Mapping[str, Any] | None = None
+    bop_csv: bool
+    all_measures: bool
+    refine: str | None
+    device: Any
+    num_pictures: Annotated[int, Range(0, _MOST)]
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
+        """Read a composed and resolved config.
+
+        Raises:
+            UserError: An option is unknown, missing, of a wrong type or out of range.
+        """
+        return _parsed(cls, with_present_names(config))
+
+
+def _parsed(kind: type[T], plain: Mapping[str, Any], read: Sequence[str] = (), **known: Any) -> T:
+    """Parse a config, of which some nodes have been read, with what a measurement asks for."""
+    silent = {one.name: plain[one.name] for one in fields(FalsePositiveTarget)}
+    done = {*read, *silent, "shading", "scale_factors", "by", "num_bins"}
+    return parse(
+        kind,
+        {key: value for key, value in plain.items() if key not in done},
+        plain=plain,
+        protocols=Protocols.of(plain),
+        false_positives=parse(FalsePositiveTarget, silent),
+        **known,
+    )

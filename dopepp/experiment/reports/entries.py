@@ -1,0 +1,356 @@
+"""What a comparison compares: run folders, and the methods that they are seeds and parts of.
+
+Trainings, evaluations and whole multiruns are read; failed and unfinished runs, too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dopepp.core.errors import UserError
+from dopepp.core.yaml import read_yaml
+from dopepp.experiment.config.parse import as_written_now
+from dopepp.experiment.cost import COST_FILE
+from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.reports.tables import shown_rows
+from dopepp.experiment.runs import record
+
+BASELINE: Final = "dope"
+"""A method of this name stands first, and every other one's Δ is against it."""
+
+_HYDRA: Final = Path(".hydra")
+_TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
+                  Path(record.FAILURE_FILE))  # fmt: skip
+"""A run leaves at least one of these."""
+
+_ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
+"""Options that say where something is, not what is measured."""
+
+_UNKNOWN_MODEL: Final = "run"
+"""What a run is called that left nothing but its folder."""
+
+_LONGEST_NAME: Final = 60
+"""Characters of a name that tables and legends have room for."""
+
+
+@dataclass
+class Run:
+    """A run folder.
+
+    Attributes:
+        folder: The folder.
+        model: The model's name.
+        overrides: What it was overridden with, without options that only name places.
+        report: Its result, None where there is none.
+        failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
+        seed: Of the training; None where unknown.
+        config: The resolved config, empty where there is none.
+        checkpoint: Its best checkpoint, None where unknown.
+        recipe: Everything but seed and parts that decides about the result, as one text; empty
+            where unknown.
+        cost: What its network costs; None where unknown.
+        pruned: Whether it has no result because a search stopped it.
+    """
+
+    folder: Path
+    model: str
+    overrides: list[str]
+    report: Report | None
+    failure: str
+    seed: int | None
+    config: dict[str, Any] = field(default_factory=dict)
+    checkpoint: Path | None = None
+    recipe: str = ""
+    cost: Cost | None = None
+    pruned: bool = False
+
+    @property
+    def place(self) -> str:
+        """The folder's name; of a job, whose name is a number, with its multirun's."""
+        folder = self.folder.resolve()
+        return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
+
+
+@dataclass
+class Entry:
+    """A method in a comparison.
+
+    Attributes:
+        name: Its name.
+        reports: Its results on one test set, one per seed; empty where there is none.
+        seeds: The trainings' seeds, as many; None where unknown.
+        failure: Why there is no result, in one line; empty where only the cost was asked for.
+        pruned: Whether the reason is that a search stopped it, which is no failure.
+        runs: The run folders; empty where reports do not come from any.
+    """
+
+    name: str
+    reports: list[Report] = field(default_factory=list)
+    seeds: list[int | None] = field(default_factory=list)
+    failure: str = ""
+    pruned: bool = False
+    runs: list[Run] = field(default_factory=list)
+
+    @property
+    def test_set(self) -> str:
+        """Fingerprint of the images; empty where it is not known."""
+        return self.reports[0].test_set if self.reports else ""
+
+    @property
+    def objects(self) -> list[str]:
+        """Names of the rows: every object, and the mean where there are several."""
+        return list(shown_rows(self.reports[0].rows)) if self.reports else []
+
+    @property
+    def cost(self) -> Cost:
+        """What the method costs; the time is the mean over seeds."""
+        costs = [report.cost for report in self.reports]
+        costs = costs or [run.cost or Cost() for run in self.runs[:1]]
+        times = [cost.ms_per_frame for cost in costs if cost.ms_per_frame is not None]
+        return replace(costs[0], ms_per_frame=float(np.mean(times)) if times else None)
+
+
+def find_runs(paths: Sequence[Path]) -> list[Run]:
+    """Read run folders, evaluation folders and all jobs of multirun folders, each once.
+
+    Raises:
+        UserError: A path is none of them.
+    """
+    folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
+    return [read_run(folder) for folder in folders.values()]
+
+
+def _folders(path: Path) -> Iterator[Path]:
+    if any((path / trace).exists() for trace in _TRACES):
+        yield path
+        return
+    jobs = [one for one in path.iterdir() if one.name.isdigit()] if path.is_dir() else []
+    if not jobs:
+        raise UserError(
+            f"{path}, which holds no run",
+            "the folder of a training, an evaluation or a multirun",
+            "pass a folder with metrics.json or config.yaml in it",
+        )
+    yield from sorted(jobs, key=lambda one: int(one.name))
+
+
+def read_run(folder: Path) -> Run:
+    """Read one run folder; whatever is missing or damaged in it becomes its failure."""
+    cost, failure, report, pruned = None, "", None, False
+    try:
+        report = _result(folder)
+        cost = _cost(folder) if report is None else report.cost
+    except _FailedError as error:
+        failure, pruned = str(error), isinstance(error, _PrunedError)
+    config = _mapping(folder / record.CONFIG_FILE)
+    checkpoint = folder / record.BEST_CHECKPOINT
+    if report is not None and "checkpoint" in report.details:
+        checkpoint = folder / str(report.details["checkpoint"])
+    training, overrides = config, overrides_of(folder)
+    configs = [config] if config else []
+    if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
+        checkpoint = Path(str(config["ckpt_path"]))
+        trained = checkpoint.parent.parent
+        training = _mapping(trained / record.CONFIG_FILE)
+        overrides = [*overrides_of(trained), *overrides]
+        configs = [config, training] if training else []
+    model = _model(training or _mapping(folder / _HYDRA / "config.yaml"), overrides, report)
+    seed = training.get("seed")
+    seed = seed if isinstance(seed, int) else None
+    recipe = _recipe(configs)
+    return Run(
+        folder, model, overrides, report, failure, seed, config, checkpoint, recipe, cost, pruned
+    )
+
+
+def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report | None) -> str:
+    """Return the model's name, of a run that ended early as far as it is known."""
+    model = config.get("model")
+    if isinstance(model, dict) and "name" in model:
+        return str(model["name"])
+    chosen = [text.partition("=")[2] for text in overrides if text.startswith("model=")]
+    if chosen:
+        return chosen[-1]
+    return _UNKNOWN_MODEL if report is None else report.name
+
+
+def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
+    """Return configs as one text, without seed and parts and without what only names places."""
+    kept = [
+        {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}
+        for config in map(as_written_now, configs)
+    ]
+    for config in kept:
+        if isinstance(config.get("data"), dict):
+            config["data"] = {k: v for k, v in config["data"].items() if k != "parts"}
+    return json.dumps(kept, sort_keys=True, default=str) if kept else ""
+
+
+class _FailedError(Exception):
+    """Why a run has no result, in one line."""
+
+
+class _PrunedError(_FailedError):
+    """When a search stopped it, and why."""
+
+
+def _result(folder: Path) -> Report | None:
+    """Return a run's result; None of a job that was to measure its network's cost alone.
+
+    Raises:
+        _FailedError: It failed, did not finish, or left a damaged file.
+    """
+    failed, metrics = folder / record.FAILURE_FILE, folder / record.METRICS_FILE
+    try:
+        if failed.is_file():
+            raise _FailedError(record.read_json(failed).get("reason", "without a reason"))
+        if (folder / record.PRUNED_FILE).is_file():
+            reason = record.read_json(folder / record.PRUNED_FILE).get("reason", "")
+            raise _PrunedError(reason)
+        if metrics.is_file():
+            return Report.from_record(record.read_json(metrics))
+    except UserError as error:
+        raise _FailedError(str(error)) from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _FailedError(f"{metrics.name} is not of this version: {error!r}") from error
+    if (folder / COST_FILE).is_file():
+        return None
+    unfinished = f"unfinished: it left no {metrics.name}"
+    if (folder / record.LAST_CHECKPOINT).is_file():
+        unfinished += f"; go on with resume={folder}"
+    raise _FailedError(unfinished)
+
+
+def _cost(folder: Path) -> Cost:
+    """Return what a job that measures costs has left."""
+    try:
+        stored = record.read_json(folder / COST_FILE)
+        return Cost(stored["parameters"], stored["gmacs"], stored["ms_per_frame"])
+    except (UserError, KeyError) as error:
+        raise _FailedError(f"{COST_FILE} is not of this version: {error}") from error
+
+
+def overrides_of(folder: Path) -> list[str]:
+    """Return what a run was overridden with, without Hydra's own and what only names places."""
+    listed = _yaml(folder / _HYDRA / "overrides.yaml")
+    texts = [str(text).lstrip("+") for text in listed] if isinstance(listed, list) else []
+    places = tuple(f"{name}=" for name in _ELSEWHERE)
+    return [text for text in texts if not text.startswith(("hydra.", *places))]
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping; empty where there is none."""
+    content = _yaml(path)
+    return content if isinstance(content, dict) else {}
+
+
+def _yaml(path: Path) -> Any:
+    """Read YAML; None where there is no file, or one cut short where the disk was full."""
+    try:
+        return read_yaml(path) if path.is_file() else None
+    except UserError:
+        return None
+
+
+def ordered(entries: Sequence[Entry], baseline: str = BASELINE) -> list[Entry]:
+    """Put the baseline, by its name or the first word of it, before all others."""
+    return sorted(entries, key=lambda e: baseline not in (e.name, e.name.split(" ")[0]))
+
+
+def group(runs: Sequence[Run]) -> list[Entry]:
+    """Put runs that differ in nothing but the seed into one entry, in order of the first one.
+
+    They must have been measured on the same test set. Networks of other parts, trained alike with
+    the same seeds, join the entry: one network a part, as the paper has it. A run without a result
+    stands alone.
+    """
+    entries: list[Entry] = []
+    for run in runs:
+        entry = next((one for one in entries if _is_of_another_seed(run, one)), None)
+        if entry is None:
+            entry = Entry("", failure=run.failure, pruned=run.pruned)
+            entries.append(entry)
+        entry.runs.append(run)
+        if run.report is not None:
+            entry.reports.append(run.report)
+            entry.seeds.append(run.seed)
+    methods: list[list[Entry]] = []
+    for entry in entries:
+        method = next((one for one in methods if _is_of_another_part(entry, one)), None)
+        if method is None:
+            methods.append([entry])
+        else:
+            method.append(entry)
+    entries = [method[0] if len(method) == 1 else _join(method) for method in methods]
+    _name(entries)
+    return entries
+
+
+def _is_of_another_seed(run: Run, entry: Entry) -> bool:
+    """Tell whether a run is another seed of what an entry holds."""
+    first = entry.runs[0]
+    return (
+        run.report is not None
+        and first.report is not None
+        and run.seed is not None
+        and run.seed not in entry.seeds
+        and None not in entry.seeds
+        and bool(run.recipe)
+        and run.recipe == first.recipe
+        and (run.report.name, run.report.test_set) == (first.report.name, first.report.test_set)
+    )
+
+
+def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
+    """Tell whether an entry differs from those of a method in nothing but its parts."""
+    first = method[0]
+    if not entry.reports or not first.reports or not entry.runs[0].recipe:
+        return False
+    known = {name for one in method for name in one.reports[0].errors}
+    return (
+        entry.runs[0].recipe == first.runs[0].recipe
+        and entry.reports[0].name == first.reports[0].name
+        and None not in entry.seeds
+        and set(entry.seeds) == set(first.seeds)
+        and known.isdisjoint(entry.reports[0].errors)
+    )
+
+
+def _join(method: Sequence[Entry]) -> Entry:
+    by_seed = [dict(zip(entry.seeds, entry.reports, strict=True)) for entry in method]
+    return replace(
+        method[0],
+        reports=[Report.joined([one[seed] for one in by_seed]) for seed in method[0].seeds],
+        runs=[run for entry in method for run in entry.runs],
+    )
+
+
+def _name(entries: Sequence[Entry]) -> None:
+    """Name each entry after its model and the overrides in which the entries differ.
+
+    Where these are too many, and where two entries would have one name, the folder's name serves;
+    where even that is the same, its path.
+    """
+    overrides = [
+        [text for text in entry.runs[0].overrides if all(text in r.overrides for r in entry.runs)]
+        for entry in entries
+    ]
+    for entry, mine in zip(entries, overrides, strict=True):
+        differing = [text for text in mine if not all(text in other for other in overrides)]
+        rest = [text for text in differing if not text.startswith("model=")]
+        entry.name = " ".join([entry.runs[0].model, *rest])
+        if len(entry.name) > _LONGEST_NAME:
+            entry.name = f"{entry.runs[0].model} {entry.runs[0].place}"
+    for more in ("place", "folder"):
+        counts = Counter(entry.name for entry in entries)
+        for entry in entries:
+            if counts[entry.name] > 1:
+                entry.name = f"{entry.name} {getattr(entry.runs[0], more)}"

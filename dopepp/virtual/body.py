@@ -1,0 +1,201 @@
+"""A body: what can be put into a scene, and on which faces of its convex hull it can lie there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, QhullError
+
+from dopepp.core.errors import UserError
+from dopepp.parts.part import Part
+from dopepp.virtual.scene import Triple, triple
+from dopepp.virtual.surface import Surface, make_surface
+
+_COPLANAR_DEG: Final = 0.05
+"""Neighbouring triangles of a hull whose normals differ by less are one face."""
+
+_LEAST_SHARE: Final = 0.002
+"""Faces under which a body comes to rest more rarely than this are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface that can be posed.
+
+    Attributes:
+        surface: Its geometry.
+        part: The part it is; None for what no network is to find.
+        source: The body it was stretched from.
+        stretch: By how much, along x, y and z.
+    """
+
+    surface: Surface
+    part: Part | None = None
+    source: Body | None = None
+    stretch: Triple = (1.0, 1.0, 1.0)
+
+    @cached_property
+    def hull(self) -> Hull:
+        """Its convex hull; that of a stretched body is stretched, not computed again."""
+        if self.source is not None:
+            return self.source.hull.scaled(np.array(self.stretch))
+        return make_hull(self.surface)
+
+    def stretched(self, scale: Float[np.ndarray, "3"]) -> Body:
+        """Return a body of no part, stretched along its axes by positive factors."""
+        stretch = triple(scale)
+        return Body(self.surface.scaled(np.array(stretch)), source=self, stretch=stretch)
+
+
+def make_body(part: Part, *, is_target: bool) -> Body:
+    """Prepare a part's mesh.
+
+    Args:
+        part: With its mesh.
+        is_target: Whether the network is to find it.
+
+    Raises:
+        UserError: The part has no mesh, or one that cannot be rendered.
+    """
+    if part.mesh is None:
+        raise UserError(
+            f"part {part.name} without a mesh",
+            "parts that were read from a mesh file or built in",
+            "give the part's mesh file; a checkpoint's objects table holds no mesh",
+        )
+    return Body(make_surface(part.mesh), part if is_target else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """A body's convex hull and centre of mass.
+
+    Attributes:
+        vertices: Object frame, metres; the lowest point of the body is always one of them.
+        triangles: Vertex indices, counter-clockwise from outside.
+        facets: Number of the flat face that each triangle belongs to.
+        centre: Centre of mass of a solid body, object frame, metres.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    triangles: Int[np.ndarray, "triangles 3"]
+    facets: Int[np.ndarray, "triangles"]
+    centre: Float[np.ndarray, "3"]
+
+    def scaled(self, scale: Float[np.ndarray, "3"]) -> Hull:
+        """Return the hull stretched along its axes by positive factors.
+
+        A linear map takes the hull to the hull, flat faces to flat faces, the centre to the centre.
+        """
+        return replace(self, vertices=self.vertices * scale, centre=self.centre * scale)
+
+    @cached_property
+    def rests(self) -> tuple[Float[np.ndarray, "rests 3"], Float[np.ndarray, "rests"]]:
+        """Outward normals of the faces on which the body rests, and how often it does.
+
+        A face is stable if the centre of mass stands above it. Its frequency is taken as the
+        solid angle under which the centre sees it (the share of directions in which a body that
+        falls without bouncing lands on it); a body that would roll over an unstable face is left
+        out of the count.
+        """
+        corners = self.vertices[self.triangles] - self.centre
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(normals, axis=1)
+        normals /= np.maximum(areas, 1e-300)[:, None]
+        supported = _foot_inside(corners, normals) & (areas > 0)
+        number = int(self.facets.max()) + 1
+        # Bitwise equal sums on every run: bincount adds in order.
+        shares = np.bincount(self.facets, _solid_angles(corners), number) / (4 * np.pi)
+        stable = np.bincount(self.facets, supported, number) > 0
+        largest = np.zeros(number, np.int64)
+        order = np.argsort(areas, kind="stable")
+        largest[self.facets[order]] = order  # the last one written is the largest
+        chosen = np.flatnonzero(stable & (shares > _LEAST_SHARE))
+        if not len(chosen):
+            # A ball of thousands of faces rests on any of them, each rarely.
+            chosen = np.flatnonzero(stable)
+        shares = shares[chosen]
+        if not shares.any():
+            shares = np.ones(len(chosen))  # a flat sheet, whose centre lies in both of its faces
+        return normals[largest[chosen]], shares / shares.sum()
+
+
+def make_hull(surface: Surface) -> Hull:
+    """Compute a surface's hull and centre of mass (milliseconds; do it once per part)."""
+    used = surface.vertices[np.unique(surface.faces)]
+    try:
+        hull = ConvexHull(used)
+    except QhullError:
+        # A flat or straight mesh has no volume; joggled by a rounding error, it has.
+        hull = ConvexHull(used, qhull_options="QJ")
+    triangles = _outward(hull)
+    closed = surface.vertices[surface.faces] if surface.closed else hull.points[triangles]
+    kept, index = np.unique(triangles, return_inverse=True)
+    return Hull(
+        vertices=np.asarray(used[kept], np.float64),
+        triangles=index.reshape(-1, 3),
+        facets=_facets(hull),
+        centre=_centre_of_mass(closed),
+    )
+
+
+def _outward(hull: ConvexHull) -> Int[np.ndarray, "triangles 3"]:
+    """Return the hull's triangles, wound so that their normals point outwards."""
+    a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles = hull.simplices.copy()
+    triangles[inward] = triangles[inward][:, ::-1]
+    return np.asarray(triangles)
+
+
+def _facets(hull: ConvexHull) -> Int[np.ndarray, "triangles"]:
+    """Number the flat faces: neighbouring triangles with one normal share a number."""
+    normals = hull.equations[:, :3]
+    cosine = np.cos(np.radians(_COPLANAR_DEG))
+    numbers = np.full(len(normals), -1)
+    for seed in range(len(normals)):
+        if numbers[seed] >= 0:
+            continue
+        numbers[seed], front = seed, [seed]
+        while front:
+            for neighbour in hull.neighbors[front.pop()]:
+                if numbers[neighbour] < 0 and normals[neighbour] @ normals[seed] >= cosine:
+                    numbers[neighbour] = seed
+                    front.append(int(neighbour))
+    return np.asarray(np.unique(numbers, return_inverse=True)[1])
+
+
+def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "3"]:
+    """Return the centroid of the volume inside triangles, by signed tetrahedra."""
+    origin = corners.reshape(-1, 3).mean(axis=0)
+    a, b, c = (corners - origin).swapaxes(0, 1)
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
+    if not abs(volumes.sum()) > 1e-9 * np.abs(corners - origin).max() ** 3:
+        return np.asarray(origin)  # no volume to speak of
+    return np.asarray(origin + volumes @ (a + b + c) / (4 * volumes.sum()))
+
+
+def _foot_inside(
+    corners: Float[np.ndarray, "triangles 3 3"], normals: Float[np.ndarray, "triangles 3"]
+) -> Bool[np.ndarray, "triangles"]:
+    """Tell whether the origin's foot on each triangle's plane lies in the triangle."""
+    foot = np.einsum("ij,ij->i", corners[:, 0], normals)[:, None, None] * normals[:, None]
+    along = np.roll(corners, -1, axis=1) - corners
+    side = np.einsum("ijk,ijk->ij", np.cross(along, foot - corners), normals[:, None])
+    # A foot on the edge between two triangles of one face must count for one of them.
+    return np.asarray((side >= -1e-9 * np.abs(along).max() ** 2).all(axis=1))
+
+
+def _solid_angles(corners: Float[np.ndarray, "triangles 3 3"]) -> Float[np.ndarray, "triangles"]:
+    """Return the solid angle of each triangle from the origin (van Oosterom and Strackee 1983)."""
+    lengths = np.linalg.norm(corners, axis=2)
+    (a, b, c), (la, lb, lc) = corners.swapaxes(0, 1), lengths.T
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    dot = [np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (b, c), (c, a))]
+    return np.asarray(
+        2 * np.arctan2(volume, la * lb * lc + dot[0] * lc + dot[1] * la + dot[2] * lb)
+    )

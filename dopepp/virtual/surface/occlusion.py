@@ -1,0 +1,304 @@
+"""Baked ambient occlusion: how much of the sky above every point of a surface is open.
+
+The mesh is drawn as depth maps from directions all around it, and points spread over its
+triangles are looked up in each (as in Landis, "Production-ready global illumination", 2002). The
+result lies on a grid of every triangle's own, because a CAD plate is two huge triangles, and its
+corners know nothing of a rib in its middle; small triangles keep their three corners.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
+
+_DIRECTIONS: Final = (24, 256)
+"""Fewest and most directions a mesh is drawn from."""
+
+_DRAWN_FACES: Final = 6_000_000
+"""Triangles drawn in all; a huge mesh is drawn from fewer directions."""
+
+_MAP_SIDE: Final = 192
+"""Texels across a depth map."""
+
+_FINEST: Final = 1 / 96
+"""Spacing of the points over the mesh's size, and the most steps along a triangle's edge."""
+
+_EXTRA_POINTS: Final = 40_000
+"""Points in all beyond the triangles' corners."""
+
+_MOST_COMPARED: Final = 1000
+"""Triangles up to which it pays to see whether a mesh is convex; that takes their square."""
+
+_DISTANCE: Final = 20.0
+"""Of a direction's camera from the mesh, in radii: as good as parallel."""
+
+_MOST_BAKED: Final = 32
+"""Meshes whose open sky is kept: more than the parts of a run."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenSky:
+    """The share of a point's hemisphere, weighted by the cosine, that its own mesh leaves open.
+
+    Attributes:
+        steps: Steps along the edges of every triangle's grid, shape (F,).
+        firsts: First point of every triangle's grid, shape (F,).
+        values: Shares on the front sides, then on the back sides, shape (2, points).
+    """
+
+    steps: Int[np.ndarray, "faces"]
+    firsts: Int[np.ndarray, "faces"]
+    values: Float[np.ndarray, "2 points"]
+
+
+_BAKED: Final[dict[bytes, OpenSky]] = {}
+
+
+def bake_open_sky(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+    closed: bool,
+) -> OpenSky:
+    """Measure the open sky over a mesh; the time grows with the number of triangles.
+
+    The last ones are kept, because a run prepares its parts anew for every set of its data.
+
+    Args:
+        vertices: Object frame, metres.
+        faces: Vertex indices.
+        normals: Unit normal of every corner.
+        closed: Whether nobody sees the back sides.
+    """
+    digest = hashlib.sha256(str((vertices.shape, closed)).encode())
+    for array in (vertices, faces, normals):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    baked = _BAKED.get(key)
+    if baked is None:
+        if len(_BAKED) >= _MOST_BAKED:
+            _BAKED.pop(next(iter(_BAKED)), None)
+        baked = _BAKED[key] = _bake_mesh(vertices, faces, normals, closed)
+    return baked
+
+
+def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
+    corners = vertices[faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    if _hides_nothing(vertices, faces, flat, closed):
+        steps, firsts = np.ones(len(faces), np.int32), np.zeros(len(faces), np.int64)
+        return OpenSky(steps, firsts, np.ones((2, 3), np.float32))
+    used = corners.reshape(-1, 3)
+    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    radius = math.sqrt(float(((used - centre) ** 2).sum(axis=1).max()))
+    steps, firsts, count = _grids(corners, 2 * radius)
+    points, upright = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    ground = np.empty(count, np.int32)
+    _spread(corners, normals, steps, firsts, points, upright, ground)
+    sums = np.zeros((4, count), np.float32)
+    directions = spread_directions(int(np.clip(_DRAWN_FACES // len(faces), *_DIRECTIONS)))
+    _bake(
+        vertices, faces, closed, centre, radius, directions, _MAP_SIDE, CENTRE_SAMPLE, points,
+        upright, flat, ground, sums,
+    )  # fmt: skip
+    # A point that no direction sees from outside (a face without area) counts as open.
+    values = np.where(sums[1::2] > 0, sums[::2] / np.maximum(sums[1::2], 1e-9), 1.0)
+    return OpenSky(steps, firsts, values.astype(np.float32))
+
+
+def _hides_nothing(vertices: Array, faces: Array, flat: Array, closed: bool) -> bool:
+    """Tell whether a mesh is convex, or flat if it is open, so that it cannot hide its own sky."""
+    if len(faces) > _MOST_COMPARED:
+        return False
+    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+    return bool(_is_convex(vertices, faces, flat, not closed, 1e-4 * size))
+
+
+@compiled()
+def _is_convex(vertices: Array, faces: Array, flat: Array, both: bool, slack: float) -> bool:
+    """Tell whether all corners lie behind every face's plane (or, for ``both``, on it)."""
+    for f in range(faces.shape[0]):
+        a = faces[f, 0]
+        for other in range(faces.shape[0]):
+            for k in range(3):
+                v = faces[other, k]
+                height = 0.0
+                for r in range(3):
+                    height += flat[f, r] * (vertices[v, r] - vertices[a, r])
+                if height > slack or (both and height < -slack):
+                    return False
+    return True
+
+
+def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
+    """Choose every triangle's steps so that the points are few and evenly spaced."""
+    longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
+    spacing, most = _FINEST * size, 3 * len(corners) + _EXTRA_POINTS
+    for _ in range(13):
+        steps = np.ceil(longest / spacing).clip(1, round(1 / _FINEST)).astype(np.int32)
+        sizes = (steps.astype(np.int64) + 1) * (steps + 2) // 2
+        if sizes.sum() <= most:
+            break
+        spacing = min(spacing * 1.3, size)
+    firsts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    return steps, firsts, int(sizes.sum())
+
+
+def spread_directions(count: int) -> Float[np.ndarray, "directions 3"]:
+    """Return directions spread evenly over the sphere (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, k * np.pi * (1 + np.sqrt(5))
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+@compiled()
+def _spread(
+    corners: Array, normals: Array, steps: Array, firsts: Array, points: Array, upright: Array,
+    ground: Array,
+) -> None:  # fmt: skip
+    """Write every triangle's grid of points, their normals and their triangle."""
+    for f in range(corners.shape[0]):
+        n = steps[f]
+        # A little inside the triangle, or a point in a corner of the mesh would lie on both walls.
+        inset = 0.1 / n
+        p = firsts[f]
+        for j in range(n + 1):
+            for i in range(n + 1 - j):
+                k1 = inset / 3 + (1 - inset) * i / n
+                k2 = inset / 3 + (1 - inset) * j / n
+                k0 = 1.0 - k1 - k2
+                for r in range(3):
+                    points[p, r] = (
+                        k0 * corners[f, 0, r] + k1 * corners[f, 1, r] + k2 * corners[f, 2, r]
+                    )
+                    upright[p, r] = (
+                        k0 * normals[f, 0, r] + k1 * normals[f, 1, r] + k2 * normals[f, 2, r]
+                    )
+                ground[p] = f
+                p += 1
+
+
+@compiled()
+def _bake(
+    vertices: Array, faces: Array, closed: bool, centre: Array, radius: float, directions: Array,
+    side: int, samples: Array, points: Array, upright: Array, flat: Array, ground: Array,
+    sums: Array,
+) -> None:  # fmt: skip
+    """Sum the open and all of the cosine over directions, for front and back sides.
+
+    Args:
+        vertices: Object frame, metres.
+        faces: Vertex indices.
+        closed: Drop back faces.
+        centre: Of the mesh.
+        radius: Of the mesh around its centre.
+        directions: Unit vectors, shape (D, 3).
+        side: Texels across a depth map.
+        samples: The one at a texel's centre.
+        points: To measure at, shape (n, 3).
+        upright: Their normals, shape (n, 3).
+        flat: Normal of every face.
+        ground: Face of every point, shape (n,).
+        sums: Open front, all front, open back and all back, shape (4, n), updated in place.
+    """
+    distance = _DISTANCE * radius
+    focal = 0.5 * (side - 4) * distance / radius
+    K = np.array([[focal, 0.0, 0.5 * side], [0.0, focal, 0.5 * side], [0.0, 0.0, 1.0]])
+    # As for shadows: a point lifted by more than √2 texels is not hidden by its own plane.
+    lift = 1.5 * 2.0 * radius / side
+    cam, hom = np.empty_like(vertices), np.empty_like(vertices)
+    depth = np.empty((side, side, 1), np.float32)
+    ids = np.empty((side, side, 1), np.int32)
+    T, P = np.zeros((4, 4)), np.empty((3, 4), np.float32)
+    for k in range(directions.shape[0]):
+        dx, dy, dz = directions[k]
+        # Any two axes across the direction do.
+        if abs(dz) < 0.9:
+            norm = 1.0 / math.sqrt(dx * dx + dy * dy)
+            rx, ry, rz = -dy * norm, dx * norm, 0.0
+        else:
+            norm = 1.0 / math.sqrt(dy * dy + dz * dz)
+            rx, ry, rz = 0.0, -dz * norm, dy * norm
+        T[0, 0], T[0, 1], T[0, 2] = rx, ry, rz
+        # The camera looks along −d: its third axis; the second is third × first.
+        T[1, 0], T[1, 1], T[1, 2] = -(dy * rz - dz * ry), -(dz * rx - dx * rz), -(dx * ry - dy * rx)
+        T[2, 0], T[2, 1], T[2, 2] = -dx, -dy, -dz
+        for r in range(3):
+            T[r, 3] = -(T[r, 0] * centre[0] + T[r, 1] * centre[1] + T[r, 2] * centre[2])
+        T[2, 3] += distance
+        project_vertices(vertices, T, K, cam, hom)
+        for r in range(3):
+            for c in range(4):
+                P[r, c] = K[r, 0] * T[0, c] + K[r, 1] * T[1, c] + K[r, 2] * T[2, c]
+        depth[:] = 0.0
+        rasterise(hom, faces, closed, distance - 2.0 * radius, (0, 0), samples, depth, ids, 0)
+        for p in range(points.shape[0]):
+            f = ground[p]
+            facing = flat[f, 0] * dx + flat[f, 1] * dy + flat[f, 2] * dz
+            cosine = upright[p, 0] * dx + upright[p, 1] * dy + upright[p, 2] * dz
+            if facing < 0.0:
+                if closed:
+                    continue
+                facing, cosine = -facing, -cosine
+                back, up = 2, -lift
+            else:
+                back, up = 0, lift
+            if facing < 1e-3 or cosine <= 0.0:
+                continue
+            sums[back + 1, p] += cosine
+            sums[back, p] += cosine * lit_share(
+                np.float32(points[p, 0] + up * flat[f, 0]),
+                np.float32(points[p, 1] + up * flat[f, 1]),
+                np.float32(points[p, 2] + up * flat[f, 2]),
+                depth, P,
+            )  # fmt: skip
+
+
+@compiled(fastmath=True)
+def look_up_sky(
+    face: Array, share: Array, steps: Array, firsts: Array, values: Array, out: Array
+) -> None:
+    """Interpolate the open sky at an object's fragments.
+
+    Args:
+        face: Triangle of every fragment, complemented for back sides, shape (n,).
+        share: Weights of the triangle's corners, shape (3, n).
+        steps: Of an :class:`OpenSky`; firsts and values too.
+        firsts: First point of every triangle.
+        values: Shares of both sides, shape (2, points).
+        out: Result, shape (n,).
+    """
+    for p in range(face.shape[0]):
+        f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)
+        n, first = steps[f], firsts[f]
+        x, y = n * share[1, p], n * share[2, p]
+        i, j = min(int(x), n - 1), min(int(y), n - 1)
+        if i + j > n - 1:
+            # On the far edge, rounded beyond the last cell.
+            i, j = max(i - 1, 0), j if i > 0 else j - 1
+        x, y = x - i, y - j
+        # Row j starts after n + 1, n, n − 1, … points.
+        low = first + j * (n + 1) - j * (j - 1) // 2 + i
+        high = low + n + 1 - j
+        if x + y <= 1.0 or i + j == n - 1:
+            out[p] = (
+                (1.0 - x - y) * values[side, low]
+                + x * values[side, low + 1]
+                + y * values[side, high]
+            )
+        else:
+            out[p] = (
+                (x + y - 1.0) * values[side, high + 1]
+                + (1.0 - x) * values[side, high]
+                + (1.0 - y) * values[side, low + 1]
+            )

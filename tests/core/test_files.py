@@ -1,0 +1,43 @@
+"""Files that are whole or absent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.files import write_png, write_whole
+
+
+def test_a_png_keeps_its_pixels_in_rgb(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    write_png(tmp_path / "new" / "image.png", image)
+    back = cv2.imread(str(tmp_path / "new" / "image.png"))[..., ::-1]
+    assert np.array_equal(back, image)
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((2, 2, 3)), np.zeros((2, 2), np.uint8), np.zeros((0, 2, 3), np.uint8)]
+)
+def test_what_is_no_image_is_refused(image: np.ndarray, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"an image must be uint8 \(H, W, 3\), got"):
+        write_png(tmp_path / "image.png", image)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.csv"
+    write_whole(path, b"old")
+
+    def full(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_whole(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,142 @@
+"""Which data an evaluation uses: the checkpoint's, another set, or some options changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.build.splits import share_of
+from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run import EvaluationConfig, RunConfig
+from dopepp.models.checkpoint.schema import read
+
+Composer = Callable[..., dict[str, Any]]
+Parser = Callable[..., RunConfig]
+PRETRAINED = sorted((Path(__file__).parents[3] / "dopepp" / "pretrained").glob("*.safetensors"))
+
+
+@pytest.fixture
+def trained(tiny: Parser) -> RunConfig:
+    return tiny("data.num_test=300")
+
+
+@pytest.fixture
+def stored(trained: RunConfig) -> dict[str, Any]:
+    """What a checkpoint says of the data it was trained on."""
+    return trained.stored_data()
+
+
+@pytest.fixture
+def evaluated(composed: Composer) -> Callable[..., DataConfig]:
+    """The data that ``evaluate.py`` with overrides chooses, given what a checkpoint says."""
+
+    def choose(stored: object, *overrides: str) -> DataConfig:
+        asked = EvaluationConfig.of(composed(*overrides, config="evaluate"))
+        return chosen_data(asked.data, asked.virtual, stored, "best.ckpt")
+
+    return choose
+
+
+Evaluated = Callable[..., DataConfig]
+
+
+def test_the_checkpoints_own_data_by_default(
+    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
+) -> None:
+    assert evaluated(stored) == trained.data
+
+
+def test_single_options_replace_the_stored_ones(
+    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
+) -> None:
+    data = evaluated(
+        stored, "++data.num_test=7", "data/test=photoreal", "++data.image_sets.test=other",
+        "++virtual.preset=table", "++virtual.scene.turning.tilt_deg=10",
+    )  # fmt: skip
+    virtual = replace(trained.data.virtual, preset="table", scene={"turning": {"tilt_deg": 10}})
+    test = replace(trained.data.test, renderer="photoreal", cache="disk")
+    sets = {**trained.data.image_sets, "test": "other"}
+    assert data == replace(trained.data, num_test=7, test=test, image_sets=sets, virtual=virtual)
+    assert stored["num_test"] == 300
+
+
+def test_a_whole_data_set_keeps_only_how_to_render(
+    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
+) -> None:
+    data = evaluated(stored, "data=virtual", "data.num_test=5")
+    assert (data.name, data.num_test, data.samples_per_epoch) == ("virtual", 5, 10000)
+    assert data.virtual == trained.data.virtual
+    whole = evaluated(stored, "data=virtual", "virtual=default", "virtual.preset=table")
+    assert whole.virtual == replace(trained.data.virtual, preset="table")
+    # Labelled images need no renders.
+    assert evaluated(None, "data=bop", "data.root=x").virtual.preset is None
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("++data.num_tests=5", r"data\.num_tests=5.*num_test"),
+        ("++data.num_test=many", r"best\.ckpt.*data\.num_test='many'"),
+        ("++data.masking.share=1", r"data\.masking\.share=1"),
+        ("++virtual.presets=bin", r"virtual\.presets='bin'; allowed: preset"),
+        ("++data.virtual.preset=bin", r"data\.virtual=.*fix: set virtual\.…"),
+    ],
+)
+def test_what_does_not_exist_is_named(
+    override: str, message: str, evaluated: Evaluated, stored: dict[str, Any]
+) -> None:
+    with pytest.raises(UserError, match=message):
+        evaluated(stored, override)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("++data.num_test=5", r"best\.ckpt, which names no data"),
+        ("data=virtual", r"best\.ckpt, which does not say how to render"),
+    ],
+)
+def test_a_checkpoint_without_data_asks_for_them(
+    override: str, message: str, evaluated: Evaluated
+) -> None:
+    with pytest.raises(UserError, match=message):
+        evaluated(None, override)
+
+
+@pytest.mark.parametrize("path", PRETRAINED, ids=lambda path: path.stem)
+def test_the_data_of_released_checkpoints_are_read(path: Path, evaluated: Evaluated) -> None:
+    stored = trained_on(read(path).data)
+    data = evaluated(stored)
+    assert stored is not None
+    assert data.virtual.preset == stored["virtual"]["preset"]
+    assert (data.num_test, data.is_rendered("test")) == (300, True)
+
+
+def test_checkpoints_of_earlier_versions_lack_newer_options(
+    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
+) -> None:
+    newer = ("symmetries", "test", "cache", "cache_dir", "masking", "augment", "eval_seed")
+    older = {key: value for key, value in stored.items() if key not in newer}
+    older["virtual"] = {"preset": "quickstart", "scene": {}, "renderer": "raster"}
+    data = evaluated(trained_on({"seed": 7, "config": older}))
+    # Held-out images were rendered with the training's own seed.
+    assert data == replace(trained.data, eval_seed=7, masking={}, augment={})
+    assert evaluated(trained_on({"seed": 7, "config": older}), "++data.eval_seed=5").eval_seed == 5
+    assert evaluated(trained_on({"seed": 7, "config": stored})).eval_seed == 0
+    assert trained_on({"seed": 7}) is None
+
+
+def test_a_folder_that_splits_share_is_divided() -> None:
+    shared = {"train": "a", "val": "a", "test": "a"}
+    ranges = [share_of(shared, split) for split in ("train", "val", "test")]
+    assert ranges == [(0.0, 0.8), (0.8, pytest.approx(0.9)), (pytest.approx(0.9), 1.0)]
+    assert ranges[1][1] == ranges[2][0]
+    assert share_of({"train": "a", "val": "b", "test": "b"}, "train") == (0.0, 1.0)
+    assert share_of({"train": "a", "val": "b", "test": "b"}, "test") == (0.5, 1.0)
+    assert share_of({"train": "a", "val": "a", "test": "b"}, "val") == (0.8, 1.0)
+    assert share_of({"train": "a", "val": "b", "test": "a"}, "test") == (0.8, 1.0)

@@ -1,0 +1,134 @@
+"""Options are read once: what one may not be is refused in a line; former names still count."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.utils import get_class
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.build.registries import AUGMENTATIONS, CALLBACKS, MASKINGS
+from dopepp.experiment.config.parse import FORMER_TARGETS, flat, with_present_names
+from dopepp.experiment.config.run import EvaluationConfig, RunConfig
+from dopepp.experiment.launch.remote import goes_on
+from dopepp.experiment.runs import record
+from dopepp.experiment.runs.resume import config_differences
+from dopepp.experiment.runs.sweep import CompareJobs
+
+Composer = Callable[..., dict[str, Any]]
+
+
+@pytest.mark.parametrize(
+    ("override", "got"),
+    [
+        ("+speed=1", "speed=1"),
+        ("+data.colour=red", "data.colour='red'"),
+        ("+virtual.colour=red", "virtual.colour='red'"),
+        ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
+        ("~data.batch_size", "no data.batch_size"),
+        ("job=mow", "job='mow'"),
+        ("seed=-1", "seed=-1"),
+        ("seed=1.5", "seed=1.5"),
+        ("seed=true", "seed=True"),
+        ("compile=1", "compile=1"),
+        ("tune=maybe", "tune='maybe'"),
+        ("ema=slow", "ema='slow'"),
+        ("ema=nan", "ema=nan"),
+        ("resume=[a]", "resume=['a']"),
+        ("num_empty=0", "num_empty=0"),
+        ("num_empty=2.5", "num_empty=2.5"),
+        ("false_positive_rate=1.5", "false_positive_rate=1.5"),
+        ("maps.sigma=0", "maps.sigma=0"),
+        ("recovery.max_peaks=all", "recovery.max_peaks='all'"),
+        ("data.eval_seed=-1", "data.eval_seed=-1"),
+        ("data.parts=pivconnector", "data.parts=pivconnector"),
+        ("data.parts=[1]", "data.parts[0]=1"),
+        ("data.batch_size=0", "data.batch_size=0"),
+        ("data.batch_size=many", "data.batch_size='many'"),
+        ("data.num_val=0", "data.num_val=0"),
+        ("data.num_workers=-1", "data.num_workers=-1"),
+        ("data.real_fraction=1.5", "data.real_fraction=1.5"),
+        ("data.input_size=[100,64]", "data.input_size=[100, 64]"),
+        ("data.input_size=64", "data.input_size=64"),
+        ("data.cache=tape", "data.cache='tape'"),
+        ("data.root=1", "data.root=1"),
+        ("data.test.cache=tape", "data.test.cache='tape'"),
+        ("data.masking=none", "data.masking='none'"),
+        ("data.image_sets={train: 1}", "data.image_sets.train=1"),
+        ("model.backbone=vgg", "model.backbone='vgg'"),
+        ("lr_finder.num_steps=9", "lr_finder.num_steps=9"),
+        ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
+        ("trainer.max_epochs=0", "trainer.max_epochs=0"),
+        ("trainer.ddp_timeout_s=0", "trainer.ddp_timeout_s=0"),
+        ("trainer.profiler=slow", "trainer.profiler='slow'"),
+    ],
+)
+def test_a_mistake_is_told_by_its_options_name(override: str, got: str, composed: Composer) -> None:
+    with pytest.raises(UserError) as error:
+        RunConfig.of(composed(override))
+    assert error.value.got == got
+    assert error.value.allowed
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "got"),
+    [("bop_csv=1", "bop_csv=1"), ("num_pictures=-1", "num_pictures=-1"), ("+x=1", "x=1"),
+     ("tune=1", "tune=1"), ("ckpt_path=[a]", "ckpt_path=['a']")],
+)  # fmt: skip
+def test_a_mistake_in_an_evaluation(override: str, got: str, composed: Composer) -> None:
+    with pytest.raises(UserError) as error:
+        EvaluationConfig.of(composed(override, config="evaluate"))
+    assert error.value.got == got
+
+
+def test_values_are_typed_and_the_plain_config_stays(composed: Composer) -> None:
+    plain = composed("data.root=photos", "+trainer.limit_val_batches=2", "ema=0.5", "shading=0.4")
+    config = RunConfig.of(plain)
+    assert config.plain == plain
+    assert config.data.root == Path("photos")
+    assert (config.data.input_size, config.data.parts[0]) == ((416, 416), "servoholder")
+    assert config.trainer.lightning["limit_val_batches"] == 2
+    assert config.protocols.shading == (0.4,)
+    assert type(config.recovery["max_peaks"]) is int
+    assert config.false_positives.num_empty == 500
+    assert config.stored_data()["virtual"] == plain["virtual"]
+    assert (config.ema, config.logger, config.search) == (0.5, None, None)
+
+
+def test_a_class_goes_by_its_former_name(composed: Composer) -> None:
+    for former, present in FORMER_TARGETS.items():
+        with pytest.raises(ModuleNotFoundError):
+            importlib.import_module(former.rpartition(".")[0])
+        registry: Any = CALLBACKS
+        if former.startswith("dopepp.data"):
+            registry = MASKINGS if "masking" in former else AUGMENTATIONS
+        registry.resolve(present)
+    # What Hydra itself builds.
+    assert get_class("dopepp.experiment.sweep.CompareJobs") is CompareJobs
+    overrides = [
+        "data.masking._target_=dopepp.data.masking.RandomMask",
+        "callbacks.overlays._target_=dopepp.training.overlays.Overlays",
+    ]
+    assert RunConfig.of(composed(*overrides)) == RunConfig.of(composed())
+
+
+def test_an_older_runs_config_is_no_other_one(composed: Composer, tmp_path: Path) -> None:
+    plain = composed()
+    former = {present: name for name, present in FORMER_TARGETS.items()}
+    older = with_present_names(plain)
+    older["data"] = {**older["data"], "virtual": dict(older["virtual"])}
+    for node in (older["data"]["masking"], older["data"]["augment"], *older["callbacks"].values()):
+        node["_target_"] = former.get(node["_target_"], node["_target_"])
+    assert "dopepp.training.finite.FiniteSteps" in dict(flat(older)).values()
+    assert config_differences(older, plain) == []
+    record.write_config(tmp_path, older)
+    (tmp_path / record.LAST_CHECKPOINT).parent.mkdir()
+    (tmp_path / record.LAST_CHECKPOINT).touch()
+    assert goes_on(plain, tmp_path)
+    # Users' own files of conf/data may still hold the copy of `virtual`.
+    assert RunConfig.of(older).data == RunConfig.of(plain).data

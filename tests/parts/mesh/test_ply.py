@@ -1,0 +1,196 @@
+"""PLY files: every dialect a program writes, and headers and lists that lie."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from dopepp.core.errors import UserError
+from dopepp.parts import Mesh, read_mesh
+from dopepp.parts.mesh.ply import read_ply
+
+BOX = trimesh.creation.box((10.0, 20.0, 30.0))
+TRIANGLES = BOX.faces.tolist()
+QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+MIXED = [*QUADS[:3], [2, 3, 7], [2, 7, 6], *QUADS[4:]]
+CODES = {"uchar": "B", "int": "i", "uint": "I", "ushort": "H", "int32": "i", "uint8": "B"}
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+Write = Callable[[str, str | bytes], Path]
+Refused = Callable[[str, str | bytes, str], None]
+
+
+def ply(
+    form: str,
+    faces: list[list[int]],
+    *,
+    extra: bool = False,
+    uv: tuple[str, str] | None = None,
+    types: tuple[str, str] = ("uchar", "int"),
+    promised: tuple[int, int] | None = None,
+    count: int | None = None,
+    newline: str = "\n",
+) -> bytes:
+    """Write a box, with further columns and a further table before, between and behind."""
+    order = FORMATS[form]
+    num_vertices, num_faces = promised or (8, len(faces))
+    header = ["ply", f"format {form} 1.0", "comment by hand", "obj_info none"]
+    header += ["comment TextureFile t.png"] if uv else []
+    header += ["element camera 1", "property list uchar float view"] if extra else []
+    header += [f"element vertex {num_vertices}"] + [f"property float {axis}" for axis in "xyz"]
+    header += ["property uchar red", "property double quality"] if extra else []
+    header += [f"property float {name}" for name in uv or ()]
+    header += [f"element face {num_faces}", f"property list {types[0]} {types[1]} vertex_indices"]
+    header += ["property list uchar float weights", "property uchar flags"] if extra else []
+    header += ["end_header"]
+    rows: list[tuple[str, tuple[float, ...]]] = [("B2f", (2, 0.5, 0.25))] if extra else []
+    for number, vertex in enumerate(BOX.vertices):
+        values = (
+            *vertex.tolist(),
+            *((7, 1.5) if extra else ()),
+            *((number / 8, 0.25) if uv else ()),
+        )
+        rows.append(("3f" + ("Bd" if extra else "") + ("2f" if uv else ""), values))
+    for number, face in enumerate(faces):
+        weights = [0.5] * (number % 3)
+        code = f"{CODES[types[0]]}{len(face)}{CODES[types[1]]}"
+        values = (len(face) if count is None else count, *face)
+        if extra:
+            code, values = f"{code}B{len(weights)}fB", (*values, len(weights), *weights, 3)
+        rows.append((code, values))
+    text = newline.join(header) + newline
+    if form == "ascii":
+        return (text + newline.join(" ".join(map(str, v)) for _, v in rows) + newline).encode()
+    return text.encode() + b"".join(struct.pack(order + code, *v) for code, v in rows)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("faces", [TRIANGLES, QUADS, MIXED], ids=["triangles", "quads", "mixed"])
+@pytest.mark.parametrize("extra", [False, True])
+@pytest.mark.parametrize("types", [("uchar", "int"), ("uint8", "int32"), ("uint", "ushort")])
+def test_every_dialect_gives_the_box(
+    write: Write, form: str, faces: list[list[int]], extra: bool, types: tuple[str, str]
+) -> None:
+    loaded = read_mesh(write("a.ply", ply(form, faces, extra=extra, types=types)), "mm")
+    assert loaded.uv is None
+    solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
+    assert solid.is_volume
+    assert solid.volume == pytest.approx(6e-6)
+    assert len(loaded.faces) == 12
+
+
+@pytest.mark.parametrize("newline", ["\r\n", "\r"])
+@pytest.mark.parametrize("form", FORMATS)
+def test_line_ends_of_every_system(write: Write, form: str, newline: str) -> None:
+    assert len(read_mesh(write("a.ply", ply(form, MIXED, newline=newline)), "mm").faces) == 12
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
+def test_a_texture_and_its_coordinates_by_any_name(
+    tmp_path: Path, write: Write, form: str, names: tuple[str, str]
+) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "t.png")
+    content = ply(form, TRIANGLES, uv=names, extra=True)
+    loaded = read_mesh(write("a.ply", content), "mm")
+    assert loaded.uv is not None
+    np.testing.assert_allclose(loaded.uv, np.stack([np.arange(8) / 8, np.full(8, 0.25)], axis=1))
+    np.testing.assert_array_equal(loaded.texture, pixels)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_agrees_with_trimesh(tmp_path: Path, encoding: str) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
+    ball.export(tmp_path / "a.ply", encoding=encoding)
+    expected = trimesh.load(tmp_path / "a.ply", process=False)
+    vertices, faces, *_ = read_ply(tmp_path / "a.ply")
+    np.testing.assert_allclose(vertices, expected.vertices, rtol=1e-7)
+    np.testing.assert_array_equal(faces, expected.faces)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"promised": (7, 12)}, "export the mesh again"),
+        ({"promised": (10**12, 12)}, "less data than 1000000000000 rows of element vertex"),
+        ({"promised": (8, 10**12)}, "less data than 1000000000000 rows of element face"),
+        ({"promised": (8, 11)}, "more than its header promises"),
+        ({"promised": (8, 13)}, "less data|buffer is smaller"),
+        ({"promised": (-1, 12)}, "element vertex with -1 rows"),
+        ({"promised": (0, 0)}, "more than its header promises"),
+        ({"types": ("int", "int"), "count": -3}, "a list of -3"),
+        ({"types": ("uint", "int"), "count": 2**31}, "a list of 2147483648"),
+        ({"count": 200}, "less data than 12 rows"),
+        ({"count": 2}, "face 0 of fewer than 3|bytes more"),
+    ],
+)
+def test_a_header_or_a_list_that_lies_is_refused(
+    refused: Refused, form: str, options: dict[str, object], message: str
+) -> None:
+    refused("a.ply", ply(form, TRIANGLES, **options), message)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("format ascii 1.0", "", "where one of binary_little_endian"),
+        ("format ascii", "format text", "where one of binary_little_endian"),
+        ("property float z", "property float w", "no vertex table with x, y, z"),
+        ("property float z", "property float y", "element vertex with 8 rows"),
+        ("vertex_indices", "corners", "no face table with vertex_indices"),
+        ("property float x", "property half x", "KeyError"),
+        ("end_header", "header_end", "no PLY header"),
+        ("ply\n", "obj\n", "no PLY header"),
+        ("-5.0", "five", "export the mesh again"),
+        ("3 1 3 0", "3.5 1 3 0", "a list of 3.5 values"),
+        ("3 1 3 0", "3 1 3 -1", "a face index outside"),
+        ("3 1 3 0", "3 1 3 8", "a face index outside of its 8 vertices"),
+        ("obj_info none", "comment TextureFile t.png", "1 textures, no uv"),
+    ],
+)
+def test_damage_is_named(refused: Refused, old: str, new: str, message: str) -> None:
+    content = ply("ascii", TRIANGLES)
+    assert old.encode() in content
+    refused("a.ply", content.replace(old.encode(), new.encode(), 1), message)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("gone.png", "does not exist"), ("../t.png", "outside of its folder")]
+)
+def test_a_texture_elsewhere_is_refused(refused: Refused, name: str, message: str) -> None:
+    content = ply("ascii", TRIANGLES, uv=("u", "v")).replace(b"t.png", name.encode())
+    refused("a.ply", content, f"TextureFile '{name}' .*{message}")
+
+
+def test_a_folded_polygon_is_named(refused: Refused) -> None:
+    content = ply("binary_little_endian", [[0, 3, 1, 2], *QUADS[1:]])
+    refused("a.ply", content, "a polygon that is not convex, face 0")
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.data())
+def test_a_changed_byte_gives_a_mesh_or_one_line(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    form = data.draw(st.sampled_from(sorted(FORMATS)))
+    content = bytearray(ply(form, MIXED, extra=True))
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("any") / "a.ply"
+    path.write_bytes(content)
+    try:
+        loaded: Mesh = read_mesh(path, "mm")
+    except UserError:
+        return
+    assert np.isfinite(loaded.vertices).all()
+    assert loaded.faces.max() < len(loaded.vertices)

@@ -1,0 +1,90 @@
+"""The pages "adding a …", read and run: what they tell a reader to write works as it stands."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from scipy.spatial.transform import Rotation
+
+from dopepp.experiment.build.registries import CALLBACKS
+from dopepp.metrics.functional import distances
+from dopepp.parts import servoholder
+from dopepp.virtual import PRESETS, Factory
+from dopepp.virtual.renderers import RENDERERS
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def documented(page: str) -> str:
+    """Return the first block of Python code of a page."""
+    return (DOCS / page).read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+
+
+def module_of(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Run a page's module under the name that the page gives it."""
+    module = ModuleType(name)
+    exec(documented(page), vars(module))
+    monkeypatch.setitem(sys.modules, name, module)
+    return module
+
+
+def test_the_documented_renderer_works(monkeypatch):
+    name = "dopepp.virtual.renderers.grey_depth"
+    module_of("adding-a-renderer.md", name, monkeypatch)
+    monkeypatch.setitem(RENDERERS, "grey_depth", name)
+    preset = PRESETS["paper"].resized(96, 64)
+    usual, grey = (
+        Factory([servoholder()], preset, 0, renderer=renderer).render(0, 0)
+        for renderer in ("raster", "grey_depth")
+    )
+    np.testing.assert_array_equal(grey.depth, usual.depth)
+    # The factory's sensor adds its noise to both.
+    assert grey.image[usual.depth > 0].max() > 200
+    assert grey.image[usual.depth == 0].max() < 30
+
+
+def test_the_documented_error_is_the_angle_between_axes(monkeypatch):
+    monkeypatch.setattr(distances, "axis_error", None, raising=False)
+    exec(documented("adding-a-metric.md"), vars(distances))
+    turns = Rotation.random(50, random_state=0).as_matrix()
+    about_z = Rotation.from_rotvec(np.outer(np.linspace(-3, 3, 50), [0, 0, 1])).as_matrix()
+    about_x = Rotation.from_rotvec([np.radians(20), 0, 0]).as_matrix()
+    true, same, tilted = (torch.from_numpy(R) for R in (turns, turns @ about_z, turns @ about_x))
+    error = distances.axis_error
+    torch.testing.assert_close(error(same, true), torch.zeros(50).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(error(tilted, true), torch.full((50,), 20.0).double())
+    assert error(true * torch.nan, true).isinf().all()
+
+
+class OneWeight(LightningModule):
+    """Learns one number: the gradient of ``3·w`` has length 3."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.w = torch.nn.Parameter(torch.ones(1))
+
+    def training_step(self, batch: torch.Tensor) -> torch.Tensor:
+        return 3 * self.w.sum()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def test_the_documented_callback_works(monkeypatch):
+    name = "dopepp.training.callbacks.gradient_norm"
+    module_of("adding-a-callback.md", name, monkeypatch)
+    monkeypatch.setattr(CALLBACKS, "_targets", {*CALLBACKS.targets})
+    CALLBACKS.register(f"{name}.GradientNorm")
+    callback = CALLBACKS.build({"_target_": f"{name}.GradientNorm", "every": 1})
+    trainer = Trainer(
+        max_steps=2, callbacks=[callback], logger=False, barebones=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(OneWeight(), torch.utils.data.DataLoader(torch.zeros(2)))
+    assert trainer.callback_metrics["train/gradient_norm"] == pytest.approx(3.0)

@@ -1,0 +1,163 @@
+"""The same scenes from nearer and farther, against projections and rigid motions in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.part import Part
+from dopepp.virtual import Factory, Scene, SceneObject
+from dopepp.virtual.arrange.random_scene import approach
+from dopepp.virtual.presets.preset import customised_preset
+from dopepp.virtual.scene import NEAR
+
+NUM_SCENES = 6
+SCALES = (0.5, 1.7)
+
+
+class Waves:
+    """A picture so smooth that resampling it hardly changes a colour."""
+
+    def identity(self) -> list[str]:
+        return ["waves"]
+
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+        y, x = np.mgrid[:height, :width] / width
+        channels = [np.sin(2 * x + 3 * y), np.cos(3 * x), np.sin(2 * y + rng.random())]
+        return (127 + 120 * np.stack(channels, axis=-1)).astype(np.uint8)
+
+
+FAR = {
+    "horizontal_fov_deg": 20.0,
+    "placement": {"nearest": 1.0, "farthest": 2.0, "margin": 0.3},
+    "distractors": {"number": [0, 0]},
+}
+PRESETS = {
+    "wide": customised_preset("wide", {}),
+    "paper": customised_preset("paper", {}).resized(160, 120),
+    "table": customised_preset("table", {}).resized(160, 120),
+    "far": customised_preset("wide", FAR),
+}
+
+
+@cache
+def factory(name: str) -> Factory:
+    return Factory([servoholder(), pivconnector()], PRESETS[name], 1, Waves())
+
+
+def scenes(name: str, scale: float) -> list[Scene]:
+    return [factory(name).scene(0, index, scale) for index in range(NUM_SCENES)]
+
+
+def centre(item: SceneObject) -> np.ndarray:
+    assert item.part is not None
+    return np.asarray(item.T_cam_obj @ [*item.part.cuboid[CENTROID], 1])[:3]
+
+
+@pytest.mark.parametrize("scale", [0.25, *SCALES])
+def test_a_part_keeps_its_place_and_its_distance_is_divided(scale: float) -> None:
+    for scene, near in zip(scenes("wide", 1), scenes("wide", scale), strict=True):
+        (index,), (there,) = scene.targets, near.targets
+        item = scene.objects[index]
+        assert item.part is not None
+        turned = (item.part.cuboid - item.part.cuboid[CENTROID]) @ item.T_cam_obj[:3, :3].T
+        pixels = (turned + centre(item) / scale) @ scene.K.T
+        np.testing.assert_allclose(near.keypoints(there), pixels[:, :2] / pixels[:, 2:])
+        same_place = scene.keypoints(index)[CENTROID]
+        np.testing.assert_allclose(near.keypoints(there)[CENTROID], same_place)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_a_small_part_appears_so_many_times_as_large(scale: float) -> None:
+    for index in range(NUM_SCENES):
+        usual, near = (factory("far").render(0, index, one) for one in (1.0, scale))
+        box, larger = (np.ptp(one.scene.keypoints(0), axis=0) for one in (usual, near))
+        np.testing.assert_allclose(larger, scale * box, rtol=0.12)  # 0.12 m across, 1 m away
+        seen, more = ((one.instances == 0).sum() for one in (usual, near))
+        assert more == pytest.approx(scale**2 * seen, rel=0.25)
+
+
+@pytest.mark.parametrize("name", ["wide", "table"])
+@pytest.mark.parametrize("scale", SCALES)
+def test_only_the_camera_moves(name: str, scale: float) -> None:
+    for scene, near in zip(scenes(name, 1), scenes(name, scale), strict=True):
+        middles = [
+            np.mean([centre(o.objects[i]) for i in o.targets], axis=0) for o in (scene, near)
+        ]
+        np.testing.assert_allclose(middles[1], middles[0] / scale)
+        shift = middles[1] - middles[0]
+        depths = [transform(item.T_cam_obj, item.surface.hull)[:, 2] for item in scene.objects]
+        kept = [item for item, z in zip(scene.objects, depths, strict=True)
+                if (z + shift[2]).min() > NEAR]  # fmt: skip
+        for item, other in zip(kept, near.objects, strict=True):
+            np.testing.assert_array_equal(other.surface.hull, item.surface.hull)
+            assert other.material == item.material
+            np.testing.assert_array_equal(other.T_cam_obj[:3, :3], item.T_cam_obj[:3, :3])
+            np.testing.assert_allclose(other.T_cam_obj[:3, 3], item.T_cam_obj[:3, 3] + shift)
+        for one, other in zip(scene.lights, near.lights, strict=True):
+            np.testing.assert_allclose(other.position, one.position + shift)
+            assert (one.intensity, one.reach) == (other.intensity, other.reach)
+        assert (scene.ambient, scene.sensor) == (near.ambient, near.sensor)
+        if scene.plane is None:
+            np.testing.assert_array_equal(scene.background, near.background)
+        else:
+            assert near.plane is not None
+            assert near.plane.normal == scene.plane.normal
+            offset = scene.plane.offset + scene.plane.normal @ shift
+            assert near.plane.offset == pytest.approx(offset)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_picture_on_a_table_stays_where_it_lies(scale: float) -> None:
+    rng, differences = np.random.default_rng(0), []
+    for scene, near in zip(scenes("table", 1), scenes("table", scale), strict=True):
+        assert scene.plane is not None
+        pixels = np.rint(rng.uniform(0, 1, (200, 2)) * (np.array(scene.size) - 1)).astype(int)
+        rays = np.c_[pixels, np.ones(200)] @ np.linalg.inv(scene.K).T
+        points = rays * (scene.plane.offset / (rays @ scene.plane.normal))[:, None]
+        shift = centre(near.objects[0]) - centre(scene.objects[0])
+        seen = (points + shift) @ scene.K.T
+        moved = np.rint(seen[:, :2] / seen[:, 2:]).astype(int)
+        inside = ((moved >= 0) & (moved < scene.size)).all(axis=1) & (seen[:, 2] > 0)
+        colours = scene.background[tuple(pixels[inside, ::-1].T)].astype(int)
+        others = near.background[tuple(moved[inside, ::-1].T)].astype(int)
+        differences += np.abs(colours - others).max(axis=1).tolist()
+    assert len(differences) > 200
+    # Half a pixel of a smooth picture; more only at the few points that are seen at a flat angle.
+    assert np.quantile(differences, 0.95) <= 6
+
+
+@pytest.mark.parametrize("name", ["paper", "table"])
+def test_once_as_large_is_the_image_itself(name: str) -> None:
+    usual, same = factory(name).render(0, 0), factory(name).render(0, 0, 1.0)
+    for field in ("image", "depth", "instances", "visible_fractions"):
+        assert getattr(usual, field).tobytes() == getattr(same, field).tobytes()
+
+
+def test_without_a_part_the_camera_stays() -> None:
+    distractors = [one for scene in scenes("wide", 1) for one in scene.objects if not one.is_target]
+    assert distractors
+    np.testing.assert_array_equal(approach(distractors, 3.0), np.zeros(3))
+
+
+def test_what_the_camera_reaches_is_no_longer_in_the_scene() -> None:
+    assert len(factory("paper").scene(0, 0).targets) == 1
+    rendered = factory("paper").render(0, 0, 15.0)
+    assert rendered.scene.objects == ()
+    assert (rendered.instances == -1).all()
+
+
+def test_a_camera_stays_above_the_table(sized_box: Callable[[str, float], Part]) -> None:
+    low = {"distance": [0.3, 0.3], "elevation_deg": [10.0, 10.0]}
+    preset = customised_preset("table", {"table": low, "min_visible_fraction": 0.1})
+    factory = Factory([sized_box("high", 8.0)], preset, 0)
+    factory.scene(0, 0)
+    with pytest.raises(UserError, match=r"scale 0\.25 of a scene .*choose a larger scale"):
+        factory.scene(0, 0, 0.25)

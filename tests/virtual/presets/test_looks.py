@@ -1,0 +1,156 @@
+"""Random light and materials: colours against physics, shares and ranges over many draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.parts.part import Mesh
+from dopepp.virtual import (
+    DistancePlacement,
+    Distractors,
+    FacingTurning,
+    FillPlacement,
+    Lighting,
+    Materials,
+    OffsetPlacement,
+    Surface,
+    Table,
+    make_surface,
+)
+from dopepp.virtual.presets.lighting import black_body_rgb
+
+
+def planck_rgb(temperature: float) -> np.ndarray:
+    """Integrate Planck's law over Wyman, Sloan and Shirley's fits of the CIE 1931 observer."""
+    nm = np.arange(380.0, 781.0)
+
+    def lobe(height: float, centre: float, left: float, right: float) -> np.ndarray:
+        scaled = (nm - centre) * np.where(nm < centre, left, right)
+        return height * np.exp(-0.5 * scaled**2)
+
+    observer = np.array(
+        [
+            lobe(1.056, 599.8, 0.0264, 0.0323) + lobe(0.362, 442.0, 0.0624, 0.0374)
+            + lobe(-0.065, 501.1, 0.0490, 0.0382),
+            lobe(0.821, 568.8, 0.0213, 0.0247) + lobe(0.286, 530.9, 0.0613, 0.0322),
+            lobe(1.217, 437.0, 0.0845, 0.0278) + lobe(0.681, 459.0, 0.0385, 0.0725),
+        ]
+    )  # fmt: skip
+    power = nm**-5.0 / (np.exp(1.4387769e7 / (nm * temperature)) - 1)
+    x, y, z = observer @ power
+    xyz = np.array([x / y, 1.0, z / y])
+    # From the primaries' and the white's chromaticities (BT.709), not from a printed matrix.
+    corners = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]])
+    columns = np.stack([corners[:, 0] / corners[:, 1], np.ones(4),
+                        (1 - corners.sum(axis=1)) / corners[:, 1]])  # fmt: skip
+    primaries = columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3])
+    return np.linalg.solve(primaries, xyz)
+
+
+@pytest.mark.parametrize("temperature", [2700, 4000, 4001, 5000, 6504, 9000, 15000])
+def test_black_body_colours_follow_plancks_law(temperature: float) -> None:
+    np.testing.assert_allclose(black_body_rgb(temperature), planck_rgb(temperature), atol=0.05)
+
+
+def test_black_bodies_are_white_at_daylight_and_redder_below() -> None:
+    np.testing.assert_allclose(black_body_rgb(6500), 1.0, atol=0.06)
+    ratios = [np.divide(*black_body_rgb(t)[[0, 2]]) for t in (2000, 3000, 5000, 8000, 20000)]
+    assert (np.diff(ratios) < 0).all()
+
+
+def test_lights_stand_above_their_plane() -> None:
+    ranges, rng = Lighting(num_lights=(1, 3)), np.random.default_rng(0)
+    normal = np.array([0.3, -0.6, -0.5]) / np.linalg.norm([0.3, -0.6, -0.5])
+    centre, counts = np.array([0.0, 0.0, 0.5]), set()
+    for _ in range(300):
+        lights, ambient = ranges.draw(rng, centre, normal)
+        counts.add(len(lights))
+        np.testing.assert_allclose(ambient.up, normal)
+        for light in lights:
+            away = np.array(light.position) - centre
+            distance = np.linalg.norm(away)
+            assert away @ normal / distance >= np.cos(np.radians(75)) - 1e-9
+            assert 0.5 - 1e-9 <= distance <= 2.5 + 1e-9
+            assert light.reach == pytest.approx(distance)
+    assert counts == {1, 2, 3}
+
+
+def test_materials_keep_to_their_ranges_and_shares(box_surface: Surface) -> None:
+    ranges = Materials(metal_share=0.3, brushed_share=0.5, print_share=0.6)
+    rng = np.random.default_rng(0)
+    drawn = [ranges.draw(rng, box_surface) for _ in range(3000)]
+    metals = [m for m in drawn if m.metallic]
+    plastics = [m for m in drawn if not m.metallic]
+    assert len(metals) / 3000 == pytest.approx(0.3, abs=0.03)
+    assert np.mean([m.grooves is not None for m in metals]) == pytest.approx(0.5, abs=0.06)
+    assert np.mean([m.grooves is not None for m in plastics]) == pytest.approx(0.6, abs=0.04)
+    for m in drawn:
+        assert all(0 <= c <= 1 for c in m.colour)
+        assert 0 <= m.noise <= 0.12
+    for m in metals:
+        assert 0.2 <= m.roughness <= 0.6
+        assert m.grooves is None or (m.grooves.irregularity == 1 and m.grooves.pitch <= 5e-4)
+    for m in plastics:
+        assert 0.25 <= m.roughness <= 0.9
+        assert 0.02 <= m.specular <= 0.07
+        assert max(m.colour) <= 0.9 * 1.05 + 1e-9
+        assert m.grooves is None or 1e-4 <= m.grooves.pitch <= 3e-4
+    # The box is thinnest along z, where most prints of it would be built up.
+    axes = [m.grooves.axis for m in plastics if m.grooves]
+    assert np.mean([axis == (0, 0, 1) for axis in axes]) == pytest.approx(7 / 9, abs=0.05)
+
+
+def test_textured_surfaces_keep_their_colours(sheet: Callable[..., Mesh]) -> None:
+    surface = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        material = Materials(metal_share=1.0).draw(rng, surface)
+        assert material.colour[0] == material.colour[1] == material.colour[2]
+        assert 0.7 <= material.colour[0] <= 1.2
+        assert material.metallic == material.noise == 0
+        assert material.grooves is None
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Materials(metal_share=1.5),
+        lambda: Materials(metal_share=True),
+        lambda: Materials(layer_pitch=(3e-4, 1e-4)),
+        lambda: Materials(layer_pitch=(float("nan"), 1e-4)),
+        lambda: Materials(roughness=(0.0, 0.5)),
+        lambda: Materials(albedo=(0.1,)),  # type: ignore[arg-type]
+        lambda: Materials(albedo=[0.1, 0.2]),  # type: ignore[arg-type]
+        lambda: Materials(noise=("a", "b")),  # type: ignore[arg-type]
+        lambda: Lighting(num_lights=(2, 1)),
+        lambda: Lighting(num_lights=(1.0, 2.0)),  # type: ignore[arg-type]
+        lambda: Lighting(temperature_k=(500, 6500)),
+        lambda: Lighting(key_intensity=(0.1, float("inf"))),
+        lambda: Lighting(max_angle_deg=200),
+        lambda: Distractors((3, 1)),
+        lambda: Distractors((-1, 1)),
+        lambda: Distractors(lookalike_share=-0.1),
+        lambda: Distractors(depth=(0.0, 1.0)),
+        lambda: Table(distance=(0.6, 0.2)),
+        lambda: Table(elevation_deg=(0.0, 90.0)),
+        lambda: Table(heaped=1),  # type: ignore[arg-type]
+        lambda: replace(Table(), tilt_deg=(10**400, 1)),
+        lambda: FillPlacement(0.9, 0.6),
+        lambda: FillPlacement(0.0, 0.6),
+        lambda: FillPlacement(smallest=True),
+        lambda: DistancePlacement(1.0, 0.5),
+        lambda: DistancePlacement(margin=0.6),
+        lambda: DistancePlacement(nearest=float("nan")),
+        lambda: OffsetPlacement(distance=0.1, axial=0.1),
+        lambda: OffsetPlacement(distance=float("inf")),
+        lambda: FacingTurning(tilt_deg=-1),
+    ],
+)
+def test_wrong_ranges_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(UserError, match=r"allowed: .*fix: (change|move)"):
+        make()

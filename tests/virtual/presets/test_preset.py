@@ -1,0 +1,328 @@
+"""Presets: ranges that hold over random scenes, cameras that follow the size, plain changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import kstest
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import project, resize_camera, transform
+from dopepp.geometry.rotation import random_rotation
+from dopepp.parts.part import Part
+from dopepp.virtual import (
+    PRESETS,
+    DistancePlacement,
+    Distractors,
+    Factory,
+    FillPlacement,
+    OffsetPlacement,
+    Preset,
+    Scene,
+    Table,
+    customised_preset,
+    visible_fractions,
+)
+
+
+def scenes(preset: Preset, parts: list[Part], count: int = 200) -> list[Scene]:
+    small = preset.resized(max(preset.width // 8, 32), max(preset.height // 8, 24))
+    factory = Factory(parts, small, seed=5)
+    return [factory.scene(0, index) for index in range(count)]
+
+
+@pytest.fixture(scope="module")
+def quickstart_scenes(parts: list[Part]) -> list[Scene]:
+    factory = Factory(parts, PRESETS["quickstart"], seed=5)
+    return [factory.scene(0, index) for index in range(200)]
+
+
+def angles(rotation: np.ndarray) -> tuple[float, float]:
+    """(in-plane, tilt) in degrees, from the rotation alone.
+
+    The tilt rotates about an axis in the image plane, so the twist about the optical axis of
+    R·FACINGᵀ is the in-plane angle (swing-twist decomposition).
+    """
+    tilt = np.degrees(np.arccos(np.clip(-rotation[2, 2], -1, 1)))
+    swing = rotation @ np.diag([1.0, -1.0, -1.0])
+    in_plane = np.degrees(np.arctan2(swing[1, 0] - swing[0, 1], swing[0, 0] + swing[1, 1]))
+    return float(in_plane), float(tilt)
+
+
+def test_quickstart_poses(quickstart_scenes: list[Scene]) -> None:
+    in_plane, tilt = zip(
+        *(angles(s.objects[0].T_cam_obj[:3, :3]) for s in quickstart_scenes), strict=True
+    )
+    assert 42 < np.abs(in_plane).max() <= 45 + 1e-6
+    assert 37 < max(tilt) <= 40 + 1e-6
+    assert {s.objects[0].label for s in quickstart_scenes} == {"servoholder", "pivconnector"}
+    assert {len(s.objects) for s in quickstart_scenes} == {1, 2, 3}
+    assert all(s.plane is None for s in quickstart_scenes)
+
+
+def test_quickstart_fill(quickstart_scenes: list[Scene]) -> None:
+    shares = []
+    for scene in quickstart_scenes:
+        item = scene.objects[0]
+        pixels = project(transform(item.T_cam_obj, item.surface.vertices), scene.K)
+        shares.append(np.ptp(pixels, axis=0).max() / 128)
+        assert pixels.min() > -1
+        assert pixels.max() < 128
+    assert 0.597 < min(shares) < 0.65
+    assert 0.90 < max(shares) < 0.953
+
+
+def test_targets_stay_visible(parts: list[Part]) -> None:
+    preset = replace(PRESETS["quickstart"], distractors=Distractors((3, 5), (0.3, 0.7), (0.5, 0.9)))
+    factory = Factory(parts, preset, seed=1)
+    fractions = [visible_fractions(factory.scene(0, index))[0] for index in range(60)]
+    assert preset.min_visible_fraction <= min(fractions) < 0.95
+
+
+def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(
+    parts: list[Part],
+) -> None:
+    preset = PRESETS["paper"]
+    factory = Factory(parts, preset.resized(80, 60), seed=90125)
+    drawn = [factory.scene(0, index) for index in range(600)]
+    assert {len(scene.objects) for scene in drawn} == {1}
+    T = np.array([scene.objects[0].T_cam_obj for scene in drawn])
+    x, y, z = T[:, :3, 3].T
+    assert 0.10 <= z.min() < 0.12 < 0.28 < z.max() <= 0.30
+    for aside in (x, y):
+        assert np.abs(aside).max() <= 0.15
+        assert kstest(np.abs(aside) / 0.15, "uniform").pvalue > 0.05
+        assert np.abs(aside).mean() == pytest.approx(0.075, abs=0.003)
+    # A sphere's area is uniform over its height.
+    assert kstest((T[:, 2, 2] + 1) / 2, "uniform").pvalue > 0.05
+    # At 90° the picture shows the box's whole width where y is small and z large: no skew there.
+    whole = (np.abs(y) < 0.05) & (np.abs(x) < 0.05)
+    assert z[whole].mean() == pytest.approx(0.2, abs=0.02)
+    assert z.mean() == pytest.approx(0.219, abs=0.005)
+
+
+def test_a_place_that_no_depth_suits_is_given_up(sized_box: Callable[[str, float], Part]) -> None:
+    preset = replace(PRESETS["paper"].resized(80, 60), placement=OffsetPlacement(lateral=0.25))
+    factory = Factory([sized_box("large", 3)], preset, seed=0)
+    places = np.array([factory.scene(0, n).objects[0].T_cam_obj[:3, 3] for n in range(20)])
+    # Of the drawn ones, a tenth is never in the picture.
+    assert (np.abs(places[:, 1]) < 0.225).all()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_centroids_lie_inside_and_in_front(name: str, box_part: Part) -> None:
+    for scene in scenes(PRESETS[name], [box_part], 60):
+        if name == "ycb":
+            assert 0.5 <= scene.objects[0].T_cam_obj[2, 3] <= 1.2
+        width, height = scene.size
+        for index in scene.targets:
+            u, v = scene.keypoints(index)[8]
+            assert -0.5 <= u < width - 0.5
+            assert -0.5 <= v < height - 0.5
+            corners = transform(scene.objects[index].T_cam_obj, scene.objects[index].surface.hull)
+            assert corners[:, 2].min() > 0.01
+
+
+def test_light_ranges(quickstart_scenes: list[Scene]) -> None:
+    ranges = PRESETS["quickstart"].lighting
+    for scene in quickstart_scenes:
+        assert ranges.num_lights[0] <= len(scene.lights) <= ranges.num_lights[1]
+        for number, light in enumerate(scene.lights):
+            low, high = ranges.fill_intensity if number else ranges.key_intensity
+            luminance = np.array(light.intensity) @ [0.2126, 0.7152, 0.0722]
+            assert low * (1 - ranges.tint) <= luminance <= high * (1 + ranges.tint)
+            assert light.reach > 0
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_resized_follows_the_resize_rule(preset: Preset) -> None:
+    resized = preset.resized(416, 312)
+    expected = resize_camera(preset.K, 416 / preset.width, 312 / preset.height)
+    np.testing.assert_allclose(resized.K, expected)
+    assert (resized.width, resized.height) == (416, 312)
+    blur = np.array(preset.sensors.blur_px) * 416 / preset.width
+    np.testing.assert_allclose(resized.sensors.blur_px, blur)
+    assert resized.sensors.read_noise == preset.sensors.read_noise
+
+
+def test_resized_draws_the_same_poses(box_part: Part) -> None:
+    preset = replace(PRESETS["ycb"], distractors=Distractors((0, 0)), min_visible_fraction=0.0)
+    factories = [Factory([box_part], p, 3) for p in (preset, preset.resized(320, 240))]
+    for index in range(5):
+        large, small = (factory.scene(0, index).objects[0] for factory in factories)
+        np.testing.assert_allclose(large.T_cam_obj, small.T_cam_obj, atol=1e-9)
+
+
+def test_field_of_view_follows_the_width() -> None:
+    wide = replace(PRESETS["paper"], width=320, height=240)
+    assert wide.K[0, 0] == pytest.approx(160.0)
+    np.testing.assert_allclose(wide.K[:2, 2], [159.5, 119.5])
+    assert PRESETS["paper"].K[0, 0] == pytest.approx(320.0)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    seed=st.integers(0, 10_000),
+    share=st.floats(0.1, 1.0),
+    width=st.integers(16, 800),
+    height=st.integers(16, 800),
+    focal=st.floats(0.3, 4.0),
+)
+def test_fill_placement_reaches_its_share(
+    seed: int, share: float, width: int, height: int, focal: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    hull = rng.uniform(-1, 1, (30, 3)) * rng.uniform(0.01, 0.5, 3) @ random_rotation(rng).T
+    K = np.array([[focal * width, 0, width * 0.45], [0, focal * width, height * 0.6], [0, 0, 1]])
+    placement = FillPlacement(share, share)
+    offset = placement.draw(rng, K, (width, height), hull)
+    pixels = project(hull + offset, K)
+    assert np.isfinite(pixels).all()
+    assert (np.ptp(pixels, axis=0) / (width, height)).max() == pytest.approx(share, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"targets_per_image": (2, 1)}, "targets_per_image"),
+        ({"targets_per_image": (0.0, 1.0)}, "two whole numbers"),
+        ({"width": 4}, "width=4 of quickstart; allowed: a number from 8"),
+        ({"width": True}, "width=True of quickstart"),
+        ({"min_visible_fraction": float("nan")}, "min_visible_fraction=nan.* from 0 to 0.95"),
+        ({"horizontal_fov_deg": 179.0}, r"from 5 to 150 \(degrees\)"),
+        ({"intrinsics_px": (300.0, 300.0)}, "four numbers"),
+        ({"intrinsics_px": (300.0, 300.0, 900.0, 20.0)}, "principal point inside"),
+    ],
+)
+def test_wrong_presets_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        replace(PRESETS["quickstart"], **change)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_stated_visibility_holds(name: str, parts: list[Part]) -> None:
+    preset = replace(PRESETS[name].resized(320, 240), distractors=Distractors((0, 8)))
+    factory = Factory(parts, preset, seed=3)
+    for scene in (factory.scene(0, index) for index in range(10)):
+        assert visible_fractions(scene)[list(scene.targets)].min() >= preset.min_visible_fraction
+
+
+def test_zero_to_one_target_gives_both(parts: list[Part]) -> None:
+    preset = replace(PRESETS["paper"].resized(80, 60), targets_per_image=(0, 1))
+    factory = Factory(parts, preset, seed=0)
+    counts = [len(factory.scene(0, index).targets) for index in range(40)]
+    assert set(counts) == {0, 1}
+
+
+def test_a_part_that_cannot_be_shown_is_an_error(sized_box: Callable[[str, float], Part]) -> None:
+    with pytest.raises(UserError, match="part huge of diameter 4"):
+        Factory([sized_box("huge", 40)], PRESETS["paper"], 0).scene(0, 0)
+
+
+def test_several_targets_do_not_pierce_each_other(parts: list[Part]) -> None:
+    preset = replace(
+        PRESETS["paper"], targets_per_image=(2, 3), min_visible_fraction=0.2,
+        placement=DistancePlacement(0.2, 0.5),
+    )  # fmt: skip
+    factory = Factory(parts, preset.resized(160, 120), seed=2)
+    drawn = [factory.scene(0, index) for index in range(20)]
+    assert {len(scene.targets) for scene in drawn} >= {2, 3}
+    for scene in drawn:
+        assert visible_fractions(scene)[list(scene.targets)].min() >= 0.2
+
+
+def test_nested_fields_change_and_the_others_stay() -> None:
+    changes = {
+        "targets_per_image": [0, 2],
+        "materials": {"metal_share": 1, "layer_pitch": [0.0001, 0.0002]},
+        "table": {"distance": (0.3, 0.4), "heaped": True},
+        "sensors": {"jpeg_quality": [50, 60]},
+    }
+    original = PRESETS["table"]
+    preset = customised_preset("table", changes)
+    assert preset == replace(
+        original,
+        targets_per_image=(0, 2),
+        materials=replace(original.materials, metal_share=1.0, layer_pitch=(0.0001, 0.0002)),
+        table=replace(Table(), distance=(0.3, 0.4), heaped=True),
+        sensors=replace(original.sensors, jpeg_quality=(50, 60)),
+    )
+    assert isinstance(preset.materials.metal_share, float)
+    assert customised_preset("table", {}) == original
+
+
+def test_groups_come_and_go() -> None:
+    assert customised_preset("paper", {"table": {}}).table == Table()
+    assert customised_preset("paper", {"table": {"roll_deg": 5}}).table == Table(roll_deg=5.0)
+    assert customised_preset("bin", {"table": None}).table is None
+    narrow = customised_preset("ycb", {"intrinsics_px": None, "horizontal_fov_deg": 40})
+    assert narrow.intrinsics_px is None
+    assert narrow.K[0, 0] == pytest.approx(320 / 0.36397, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"colour": 1}, "'colour' in preset paper; allowed: name, width"),
+        ({"materials": {"metal": 1}}, "'metal' in materials of preset paper"),
+        ({"materials": 3}, "3 for materials of preset paper; allowed: a mapping"),
+        ({"materials": {"metal_share": True}}, "True for metal_share"),
+        ({"materials": {"metal_share": "0.2"}}, "'0.2' for metal_share"),
+        ({"materials": {"metal_share": None}}, "None for metal_share"),
+        ({"materials": {"metal_share": 1.1}}, r"metal_share=1.1 of Materials"),
+        ({"lighting": {"num_lights": [1]}}, r"\[1\] for num_lights .* a list of 2 numbers"),
+        ({"lighting": {"num_lights": [1, 2, 3]}}, "a list of 2 numbers"),
+        ({"lighting": {"num_lights": 2}}, "a list of 2 numbers"),
+        ({"lighting": {"num_lights": [1.0, 2.0]}}, "a whole number"),
+        ({"lighting": {"key_intensity": [1.0, 0.5]}}, "smallest <= largest"),
+        ({"sensors": {"blur_px": [float("nan"), 1]}}, "nan for blur_px"),
+        ({"sensors": {"blur_px": [0, float("inf")]}}, "inf for blur_px"),
+        ({"sensors": {"jpeg_quality": [0, 90]}}, "jpeg_quality"),
+        ({"placement": {"distance": 10**400}}, "distance of placement"),
+        ({"placement": {"distance": 0.05}}, "axial < distance"),
+        ({"table": {"heaped": 1}}, "1 for heaped .* true or false"),
+        ({"table": {"elevation_deg": [5, 80]}}, "elevation_deg"),
+        ({"intrinsics_px": [1, 2]}, "a list of 4 numbers"),
+        ({"targets_per_image": [-1, 1]}, "targets_per_image"),
+        ({"width": 640.5}, "a whole number"),
+        ({"width": 10**9}, "width"),
+    ],
+)
+def test_wrong_changes_are_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        customised_preset("paper", changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_presets_are_refused() -> None:
+    with pytest.raises(
+        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"
+    ):
+        customised_preset("shelf", {})
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=4,
+)
+
+
+@given(
+    field=st.sampled_from(
+        ["width", "table", "materials", "intrinsics_px", "targets_per_image", "placement", "name"]
+    ),
+    value=PLAIN,
+)
+def test_any_plain_value_is_taken_or_refused(field: str, value: Any) -> None:
+    try:
+        preset = customised_preset("paper", {field: value})
+    except UserError:
+        return
+    assert type(preset) is type(PRESETS["paper"])

@@ -1,0 +1,221 @@
+"""Path-traced pictures: labels as the rasteriser's, light that is plausible."""
+
+from __future__ import annotations
+
+import importlib
+import pickle
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.parts.catalogue import BUILTIN
+from dopepp.parts.mesh.read import read_mesh
+from dopepp.parts.part import Part
+from dopepp.virtual import (
+    PRESETS,
+    Ambient,
+    Factory,
+    Grooves,
+    Light,
+    Material,
+    Plane,
+    Rendered,
+    Scene,
+    SceneObject,
+    make_surface,
+    render,
+)
+from dopepp.virtual.renderers import Renderer, find_renderer
+
+pytestmark = pytest.mark.render
+MakeScene = Callable[..., Scene]
+
+
+@pytest.fixture(scope="module")
+def photoreal() -> Renderer:
+    pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
+    pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
+    return find_renderer("photoreal")
+
+
+def lying(part: Part, height: float, **options: Material) -> SceneObject:
+    """Place a part's frame above the plane that :func:`on_table` adds, half a metre away."""
+    T = np.eye(4)
+    T[:3, 3] = 0.0, 0.0, 0.5 - height
+    assert part.mesh is not None
+    return SceneObject(make_surface(part.mesh), T, part=part, **options)
+
+
+def on_table(scene: Scene) -> Scene:
+    """Look straight down on a plane at half a metre."""
+    return replace(scene, plane=Plane((0.0, 0.0, -1.0), -0.5))
+
+
+def assert_same_labels(found: Rendered, expected: Rendered) -> None:
+    assert (np.abs(found.depth - expected.depth) < 1e-3).mean() >= 0.99
+    assert (found.instances == expected.instances).mean() >= 0.99
+    np.testing.assert_array_equal(found.visible_fractions, expected.visible_fractions)
+
+
+@pytest.mark.parametrize(("preset", "seed"), [("paper", 1), ("paper", 2), ("table", 3), ("bin", 5)])
+def test_labels_agree_with_the_rasteriser(photoreal: Renderer, preset: str, seed: int) -> None:
+    parts = [make() for make in BUILTIN.values()]
+    scene = Factory(parts, PRESETS[preset].resized(160, 120), seed).scene(0, seed)
+    expected, found = render(scene), photoreal(scene)
+    assert_same_labels(found, expected)
+    # The labels are not the rasteriser's by construction: each renderer casts its own.
+    assert found.image.dtype == np.uint8
+    assert found.depth.dtype == np.float32
+    assert found.instances.dtype == np.int16
+    # The same lamps and colours, so about the same picture.
+    assert abs(found.image.astype(float).mean() - expected.image.mean()) < 12
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        Material(),
+        Material(metallic=1.0, roughness=0.15, colour=(0.9, 0.7, 0.4)),
+        Material(noise=0.5, noise_pitch=0.01),
+        Material(metallic=0.5, grooves=Grooves(irregularity=1.0)),
+        Material(roughness=1.0, specular=0.0, colour=(0.0, 0.0, 0.0)),
+    ],
+)
+def test_every_material_renders(
+    photoreal: Renderer, material: Material, box_part: Part, scene_of: MakeScene
+) -> None:
+    scene = scene_of(lying(box_part, 0.1, material=material))
+    found = photoreal(scene)
+    covered = found.instances == 0
+    assert covered.sum() > 500
+    assert not np.array_equal(found.image[covered], scene.background[covered])
+    away = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    np.testing.assert_array_equal(found.image[away], scene.background[away])
+    assert_same_labels(found, render(scene))
+
+
+def test_a_textured_model_shows_its_texture(
+    photoreal: Renderer, ycb_root: Path, scene_of: MakeScene
+) -> None:
+    mesh = read_mesh(ycb_root / "models" / "003_cracker_box" / "textured.obj", "m")
+    T = np.eye(4)
+    T[:3, :3], T[2, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], 0.5
+    scene = scene_of(SceneObject(make_surface(mesh), T), lights=(Light((0.3, -0.3, 0.0)),))
+    expected, found = render(scene), photoreal(scene)
+    assert_same_labels(found, expected)
+    covered = expected.instances == 0
+    for channel in range(3):
+        one, other = (picture.image[covered][:, channel] for picture in (expected, found))
+        assert np.corrcoef(one, other)[0, 1] > 0.9
+
+
+def test_no_light_at_all_is_black_and_finite(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    dark = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
+    scene = on_table(scene_of(lying(box_part, 0.01), lights=(), ambient=dark))
+    found = photoreal(scene)
+    inside = found.instances == 0
+    assert (np.percentile(found.image[inside], 90) == 0).all()
+    # Without light there is nothing that an object could keep from the table.
+    np.testing.assert_array_equal(found.image[:4], scene.background[:4])
+
+
+def test_the_table_is_darker_near_the_contact(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    scene = on_table(scene_of(lying(box_part, 0.01), lights=()))
+    found = photoreal(scene)
+    assert found.depth[0, 0] == pytest.approx(0.5, abs=1e-6)
+    row = np.flatnonzero((found.instances == 0).any(axis=1))[-1]
+    column = scene.size[0] // 2
+    below = found.image[row + 2 :, column].astype(float).mean(axis=1)
+    assert below[0] < 80  # of a background of 90
+    assert below[0] < below[6] < below[20] + 1.0
+
+
+def test_a_shadow_falls_away_from_its_lamp(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    dim = Ambient(above=(0.02, 0.02, 0.02), below=(0.02, 0.02, 0.02))
+    lamp = Light((-0.4, 0.0, 0.2))
+    scene = on_table(scene_of(lying(box_part, 0.03), lights=(lamp,), ambient=dim))
+    found, expected = photoreal(scene), render(scene)
+    columns = np.flatnonzero((found.instances == 0).any(axis=0))
+    row = scene.size[1] // 2
+    left, right = found.image[row, columns[0] - 4].mean(), found.image[row, columns[-1] + 4].mean()
+    assert right < 45 < left
+    assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
+
+
+def test_a_red_neighbour_is_seen_in_a_mirror(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    mirror = Material(metallic=1.0, roughness=0.05, colour=(0.9, 0.9, 0.9))
+    red = Material(colour=(0.9, 0.02, 0.02))
+    plate = lying(box_part, 0.1, material=mirror)
+    wall = lying(box_part, 0.1, material=red)
+    # A wall on edge along the plate's far side, leaning over it towards the camera.
+    turned = wall.T_cam_obj.copy()
+    turned[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    turned[:3, 3] = 0.0, -0.042, 0.36
+    scene = scene_of(plate, replace(wall, T_cam_obj=turned))
+    both, alone = photoreal(scene), photoreal(replace(scene, objects=(plate,)))
+    seen = (both.instances == 0) & (alone.instances == 0)
+
+    def redness(picture: Rendered) -> float:
+        values = picture.image[seen].astype(float)
+        return float((values[:, 0] - values[:, 1]).max())
+
+    assert redness(both) > redness(alone) + 30
+
+
+def test_pixels_that_are_not_square(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    scene = scene_of(lying(box_part, 0.1))
+    K = scene.K.copy()
+    K[0, 0] *= 1.3
+    K[0, 1] = 5.0
+    scene = replace(scene, K=K)
+    expected, found = render(scene), photoreal(scene)
+    assert_same_labels(found, expected)
+    covered = expected.instances == 0
+    # The picture stands where the labels do.
+    changed = (found.image != scene.background).any(axis=2)
+    assert (changed & covered).sum() > 0.97 * covered.sum()
+    near = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not (changed & ~near).any()
+
+
+def test_a_scene_gives_the_same_bytes(
+    photoreal: Renderer, box_part: Part, scene_of: MakeScene
+) -> None:
+    scene = on_table(scene_of(lying(box_part, 0.02)))
+    first, second = photoreal(scene), photoreal(pickle.loads(pickle.dumps(scene)))
+    for field in ("image", "depth", "instances"):
+        np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
+
+
+def test_an_empty_scene_is_its_background(photoreal: Renderer, scene_of: MakeScene) -> None:
+    scene = scene_of()
+    for found in (photoreal(scene), photoreal(on_table(scene))):
+        np.testing.assert_array_equal(found.image, scene.background)
+        assert (found.instances == -1).all()
+
+
+@pytest.mark.parametrize("package", ["mitsuba", "pyoidn"])
+def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, "dopepp.virtual.renderers.photoreal.renderer", raising=False)
+    pattern = rf"without the package {package}.*pip install 'dopepp\[photoreal\]'"
+    with pytest.raises(UserError, match=pattern):
+        importlib.import_module("dopepp.virtual.renderers.photoreal.renderer")
+    with pytest.raises(UserError, match=pattern):
+        find_renderer("photoreal")

@@ -1,0 +1,176 @@
+"""The supporting plane: depth, what it hides, and the shadows on its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.geometry.camera import make_transform, project
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.parts.part import Mesh
+from dopepp.virtual import (
+    Ambient,
+    Light,
+    Plane,
+    Rendered,
+    Scene,
+    SceneObject,
+    make_surface,
+    render,
+    visible_fractions,
+)  # fmt: skip
+
+MakeScene = Callable[..., Scene]
+ANGLE = 0.7
+NORMAL = np.array([0.0, -np.sin(ANGLE), -np.cos(ANGLE)])
+"""The camera looks down at an angle; the plane's middle is 0.5 m away along the optical axis."""
+
+PLANE = Plane(tuple(NORMAL), float(NORMAL[2] * 0.5))
+IMAGE = {"size": (320, 240), "focal": 320.0}
+DARK = Ambient(above=(0, 0, 0), below=(0, 0, 0))
+
+
+def on_plane(x: float, y: float, height: float) -> np.ndarray:
+    """A point in the camera frame, from plane coordinates around its middle."""
+    side = np.array([1.0, 0, 0])
+    return np.array([0, 0, 0.5]) + x * side + y * np.cross(NORMAL, side) + height * NORMAL
+
+
+def box_at(x: float, y: float, height: float, extents: tuple[float, float, float]) -> SceneObject:
+    """A box whose bottom hovers over the plane."""
+    box = trimesh.creation.box(extents)
+    side = np.array([1.0, 0, 0])
+    rotation = np.stack([side, np.cross(NORMAL, side), NORMAL], axis=1)
+    surface = make_surface(Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+    return SceneObject(surface, make_transform(rotation, on_plane(x, y, height + extents[2] / 2)))
+
+
+def drawn(scene: Scene) -> Rendered:
+    return render(replace(scene, plane=PLANE))
+
+
+def brightness(rendered: Rendered, point: np.ndarray) -> float:
+    u, v = np.round(project(point, rendered.scene.K)).astype(int)
+    assert rendered.instances[v, u] == -1
+    return float(rendered.image[v, u, 1])
+
+
+def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of: MakeScene) -> None:
+    # Looking nearly along the plane, the upper part of the image is above the horizon.
+    normal = np.array([0.0, -np.cos(0.1), -np.sin(0.1)])
+    scene = replace(scene_of(**IMAGE), plane=Plane(tuple(normal), -0.3))
+    rendered = render(scene)
+    v, u = np.mgrid[:240, :320]
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
+    expected = -0.3 / (rays @ normal)
+    in_front = expected > 0
+    assert 0.3 < in_front.mean() < 0.9
+    assert (rendered.depth[~in_front] == 0).all()
+    np.testing.assert_allclose(rendered.depth[in_front], expected[in_front], rtol=1e-5)
+    assert (rendered.instances == -1).all()
+    assert (rendered.image == scene.background).all()
+
+
+def test_depth_is_right_around_objects(scene_of: MakeScene) -> None:
+    item = box_at(0, 0, 0.0, (0.1, 0.1, 0.05))
+    bare = drawn(scene_of(**IMAGE))
+    rendered = drawn(scene_of(item, **IMAGE))
+    empty = rendered.instances < 0
+    np.testing.assert_array_equal(rendered.depth[empty], bare.depth[empty])
+    assert (rendered.depth[~empty] < bare.depth[~empty]).all()
+    assert rendered.visible_fractions[0] == 1.0
+
+
+def test_what_is_below_is_hidden_and_counts(scene_of: MakeScene) -> None:
+    # A box sunk in by half of its height, one below the plane and a whole one.
+    sunk = box_at(-0.1, 0, -0.05, (0.05, 0.05, 0.1))
+    below = box_at(0.1, 0, -0.2, (0.05, 0.05, 0.1))
+    whole = box_at(0.0, 0.1, 0.0, (0.05, 0.05, 0.1))
+    scene = replace(scene_of(sunk, below, whole, **IMAGE), plane=PLANE)
+    rendered = render(scene)
+    assert rendered.visible_fractions[1] == 0
+    assert rendered.visible_fractions[2] == 1
+    assert (rendered.instances != 1).all()
+    alone = render(replace(scene, plane=None, objects=(sunk,)))
+    points = np.argwhere(alone.instances == 0)
+    rays = np.stack([points[:, 1], points[:, 0], np.ones(len(points))]).T @ np.linalg.inv(scene.K).T
+    heights = (rays * alone.depth[points[:, 0], points[:, 1]][:, None]) @ NORMAL - PLANE.offset
+    assert rendered.visible_fractions[0] == pytest.approx((heights > 0).mean(), abs=0.01)
+    assert 0.3 < rendered.visible_fractions[0] < 0.9
+    np.testing.assert_array_equal(visible_fractions(scene), rendered.visible_fractions)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_shadow_lies_where_the_light_is_blocked(scene_of: MakeScene, which: int) -> None:
+    item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
+    lamp = on_plane(-0.4, 0.1, 0.5)
+    weak = Light((0.0, 0.0, 0.0), (1e-4, 1e-4, 1e-4))
+    lights = [Light(tuple(lamp), (1, 1, 1), 0.6), weak]
+    scene = scene_of(item, lights=tuple(lights[:: 1 - 2 * which]), ambient=DARK, **IMAGE)
+    rendered = drawn(scene)
+    # Similar triangles: the ray through the box's centre goes on by 0.105/(0.5 − 0.105).
+    stretch = 0.105 / (0.5 - 0.105)
+    middle = on_plane(0.4 * stretch, -0.1 * stretch, 0)
+    assert brightness(rendered, middle) < 10
+    half = 0.03 * (1 + stretch)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        inner = on_plane(0.4 * stretch + 0.75 * half * dx, -0.1 * stretch + 0.75 * half * dy, 0)
+        outer = on_plane(0.4 * stretch + 1.5 * half * dx, -0.1 * stretch + 1.5 * half * dy, 0)
+        assert brightness(rendered, outer) == 90
+        assert brightness(rendered, inner) < 15
+
+
+def test_a_lamp_adds_to_what_is_left(scene_of: MakeScene) -> None:
+    # Two equal lamps at equal distances, one blocked, no sky: half of the light is left.
+    item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
+    lamps = [Light(tuple(on_plane(x, 0, 0.4)), (0.5, 0.5, 0.5), 0.5) for x in (-0.4, 0.4)]
+    shift = 0.4 * 0.105 / (0.4 - 0.105)
+    rendered = drawn(scene_of(item, lights=tuple(lamps), ambient=DARK, **IMAGE))
+    near, far = 0.4 - shift, 0.4 + shift
+    share = (near**2 + 0.16) ** -1.5 / ((near**2 + 0.16) ** -1.5 + (far**2 + 0.16) ** -1.5)
+    linear = ((90 / 255 + 0.055) / 1.055) ** 2.4 * share
+    expected = 255 * (1.055 * linear ** (1 / 2.4) - 0.055)
+    # At +shift the lamp at −0.4 is blocked, so the nearer one's share is left.
+    assert brightness(rendered, on_plane(shift, 0, 0)) == pytest.approx(expected, abs=2)
+
+
+def test_contact_darkens_the_sky_more_the_nearer(scene_of: MakeScene) -> None:
+    # Beside a long wall of height h, at distance d, (1 + d/√(d² + h²))/2 of the sky is left.
+    item = box_at(0, 0.05, 0, (0.3, 0.02, 0.05))
+    sky = Ambient(tuple(NORMAL), (0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+    scene = scene_of(item, lights=(), ambient=sky, size=(640, 480), focal=640.0)
+    rendered = drawn(scene)
+    light = []
+    for d in (0.012, 0.025, 0.05):
+        code = brightness(rendered, on_plane(0, 0.04 - d, 0)) / 90
+        light.append(code**2.2)
+        assert light[-1] == pytest.approx((1 + d / np.hypot(d, 0.05)) / 2, abs=0.1)
+    assert light[0] < light[1] < light[2]
+
+
+def test_far_from_objects_the_picture_is_untouched(scene_of: MakeScene) -> None:
+    item = box_at(0, 0, 0, (0.02, 0.02, 0.02))
+    scene = scene_of(item, lights=(Light(tuple(on_plane(0, 0, 1.0))),), **IMAGE)
+    rendered = drawn(scene)
+    assert (rendered.image[:60] == 90).all()
+    assert (rendered.image[-60:] == 90).all()
+    assert rendered.image.min() < 85
+
+
+def test_odd_lights_and_places_do_no_harm(scene_of: MakeScene) -> None:
+    tall = box_at(0.1, 0, 0, (0.03, 0.03, 0.2))
+    for position in (
+        on_plane(0, 0, 0.1), on_plane(0, 0, -0.2), on_plane(0.3, 0, 0), on_plane(0.1, 0, 0.1),
+        (0.0, 0.0, 0.0), (0.0, 0.0, -1.0),
+    ):  # fmt: skip
+        scene = scene_of(tall, lights=(Light(tuple(position)),), **IMAGE)
+        rendered = drawn(scene)
+        assert np.isfinite(rendered.depth).all()
+        assert rendered.image.max() <= 255
+    turned = rotation_vector_to_matrix(np.array([0.0, 0.0, 1.0]))
+    under = SceneObject(tall.surface, make_transform(turned, np.array([0, 0, -0.3])))
+    assert drawn(scene_of(under, **IMAGE)).visible_fractions[0] == 0

@@ -1,0 +1,88 @@
+"""Meshes made ready: creases, closedness, and meshes that nobody can render."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.parts.part import Mesh
+from dopepp.virtual import Surface, make_surface
+
+MakeSurface = Callable[[trimesh.Trimesh], Surface]
+FACE = np.array([(0, 1, 2)], np.int32)
+
+
+def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of: MakeSurface) -> None:
+    surface = surface_of(trimesh.creation.box((0.1, 0.1, 0.1)))
+    corners = surface.vertices[surface.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    np.testing.assert_allclose(surface.normals, flat[:, None].repeat(3, axis=1), atol=1e-6)
+    surface = surface_of(trimesh.creation.cylinder(0.05, 0.1, sections=24))
+    positions = surface.vertices[surface.faces]
+    side = np.abs(surface.normals[..., 2]) < 0.5
+    radial = positions[side] * (1, 1, 0)
+    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
+    np.testing.assert_allclose(surface.normals[side], radial, atol=0.02)
+    np.testing.assert_allclose(np.abs(surface.normals[~side][:, 2]), 1, atol=1e-6)
+
+
+def test_split_vertices_are_closed_and_smooth_again() -> None:
+    # STL gives every triangle vertices of its own.
+    ball = trimesh.creation.icosphere(2, 0.05)
+    soup = np.asarray(ball.triangles).reshape(-1, 3)
+    surface = make_surface(Mesh(soup, np.arange(len(soup), dtype=np.int32).reshape(-1, 3)))
+    assert surface.closed
+    outward = surface.vertices[surface.faces]
+    outward = outward / np.linalg.norm(outward, axis=2, keepdims=True)
+    np.testing.assert_allclose(surface.normals, outward, atol=0.03)
+
+
+def test_open_and_inside_out_meshes_are_not_closed(surface_of: MakeSurface) -> None:
+    ball = trimesh.creation.icosphere(1, 0.05)
+    assert surface_of(ball).closed
+    ball.invert()
+    assert not surface_of(ball).closed
+    ball.invert()
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    assert not surface_of(ball).closed
+
+
+def test_stretching_keeps_normals_upright(surface_of: MakeSurface) -> None:
+    scale = np.array([0.1, 0.2, 0.05])
+    stretched = surface_of(trimesh.creation.icosphere(3, 1.0)).scaled(scale)
+    # The gradient of the ellipsoid's equation.
+    outward = stretched.vertices[stretched.faces] / scale**2
+    outward /= np.linalg.norm(outward, axis=2, keepdims=True)
+    np.testing.assert_allclose(stretched.normals, outward, atol=0.05)
+
+
+BAD_UV = np.array([(0, 0), (np.nan, 0), (0, 1)], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        (Mesh(np.eye(3), np.zeros((0, 3), np.int32)), "at least one face and finite vertices"),
+        (Mesh(np.full((3, 3), np.nan), FACE), "at least one face and finite vertices"),
+        *((Mesh(np.eye(3), np.array([(0, 1, i)])), "vertices 0 to 2") for i in (-1, 3, 2**31 - 1)),
+        (Mesh(np.eye(3), FACE, BAD_UV, np.zeros((2, 2, 3), np.uint8)), "texture coordinate"),
+    ],
+)
+def test_meshes_that_cannot_be_rendered_are_refused(mesh: Mesh, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make_surface(mesh)
+
+
+def test_faces_without_area_change_nothing(sheet: Callable[..., Mesh]) -> None:
+    mesh = sheet(0.2)
+    faces = np.vstack([mesh.faces, [[0, 0, 1], [1, 1, 1]]]).astype(np.int32)
+    with np.errstate(all="raise"):
+        surface = make_surface(replace(mesh, faces=faces))
+    assert np.isfinite(surface.normals).all()
+    np.testing.assert_array_equal(surface.normals[:2], make_surface(mesh).normals)

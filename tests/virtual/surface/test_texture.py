@@ -1,0 +1,132 @@
+"""Filtered textures against a heavily supersampled reference, near, far and at grazing angles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.geometry.camera import make_transform, resize_camera
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.parts.mesh.read import ycb_part
+from dopepp.parts.part import Mesh
+from dopepp.virtual import Ambient, Material, Scene, SceneObject, Surface, make_surface, render
+from dopepp.virtual.presets.placement import FACING
+from dopepp.virtual.surface.texture import make_texture
+
+MakeScene = Callable[..., Scene]
+SIDE = 0.3
+DIM = Ambient(above=(0.4, 0.4, 0.4), below=(0.4, 0.4, 0.4))
+
+
+def linear(codes: np.ndarray) -> np.ndarray:
+    codes = codes / 255.0
+    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(light: np.ndarray) -> np.ndarray:
+    curve = 1.055 * np.maximum(light, 0) ** (1 / 2.4) - 0.055
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, curve)
+
+
+def supersampled(texture: np.ndarray, pose: np.ndarray, scene: Scene, n: int = 12) -> np.ndarray:
+    """Mean linear texel under n×n rays a pixel; NaN where some of them miss the sheet."""
+    width, height = scene.size
+    v, u = np.mgrid[:height, :width]
+    inverse_K, rotation = np.linalg.inv(scene.K), pose[:3, :3]
+    start, light, total = -rotation.T @ pose[:3, 3], linear(texture), 0.0
+    for dx, dy in (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) / n - 0.5:
+        rays = np.stack([u + dx, v + dy, np.ones_like(u)], axis=-1) @ inverse_K.T @ rotation
+        stretch = -start[2] / rays[..., 2]
+        place = (start + stretch[..., None] * rays)[..., :2] / SIDE + 0.5
+        inside = (stretch > 0) & ((place >= 0) & (place < 1)).all(axis=-1)
+        cell = np.where(inside[..., None], place, 0) * (texture.shape[1], texture.shape[0])
+        column, row = cell[..., 0].astype(int), texture.shape[0] - 1 - cell[..., 1].astype(int)
+        total = total + np.where(inside[..., None], light[row, column], np.nan)
+    return np.asarray(total) / n**2
+
+
+def unfiltered(surface: Surface) -> Surface:
+    assert surface.texture is not None
+    return replace(surface, texture=replace(surface.texture, levels=surface.texture.levels[:1]))
+
+
+@pytest.mark.parametrize(("angle", "distance"), [(0, 0.8), (55, 0.6), (75, 0.5), (82, 0.8)])
+def test_a_fine_checker_matches_supersampling(
+    scene_of: MakeScene, sheet: Callable[..., Mesh], angle: float, distance: float
+) -> None:
+    tiles = np.indices((80, 80)).sum(axis=0) % 2
+    texture = (np.kron(tiles, np.ones((3, 3)))[..., None].repeat(3, -1) * 200 + 30).astype(np.uint8)
+    tilt = rotation_vector_to_matrix(np.array([np.radians(angle), 0, 0]))
+    turn = rotation_vector_to_matrix(np.array([0, 0, 0.3]))
+    pose = make_transform(tilt @ turn @ FACING, np.array([0, 0, distance]))
+    item = SceneObject(make_surface(sheet(SIDE, texture)), pose, Material((1, 1, 1), 1.0, 0.0))
+    scene = scene_of(item, lights=(), ambient=DIM)
+    expected = encoded(0.4 * supersampled(texture, pose, scene))
+    known = np.isfinite(expected)
+    assert known.sum() > 400
+    point_sampled = encoded(0.4 * supersampled(texture, pose, scene, 1))
+    errors = [
+        float(np.sqrt(((image - expected)[known] ** 2).mean()))
+        for image in (render(scene).image, point_sampled)
+    ]
+    assert errors[0] < 12
+    assert errors[0] < errors[1] / 4
+
+
+@pytest.mark.parametrize("name", ["003_cracker_box", "005_tomato_soup_can"])
+@pytest.mark.parametrize("distance", [0.6, 1.2])
+def test_ycb_models_match_supersampling(ycb_root: Path, name: str, distance: float) -> None:
+    part = ycb_part(ycb_root, name)
+    assert part.mesh is not None
+    surface = make_surface(part.mesh)
+    # One side is seen at a grazing angle.
+    turn, tilt = (rotation_vector_to_matrix(np.array(v)) for v in ((0, 0, 0.4), (1.8, 0.4, 0.2)))
+    pose = make_transform(turn @ tilt, np.array([0, 0, distance]))
+    K = np.array([[400.0, 0, 79.5], [0, 400.0, 79.5], [0, 0, 1]])
+    errors = []
+    for candidate in (surface, unfiltered(surface)):
+        item = SceneObject(candidate, pose, Material((1, 1, 1), 1.0, 0.0))
+
+        def drawn(scale: int, item: SceneObject = item) -> np.ndarray:
+            background = np.zeros((160 * scale, 160 * scale, 3), np.uint8)
+            scene = Scene(resize_camera(K, scale, scale), background, (item,), (), DIM)
+            return render(scene).image
+
+        fine = cv2.resize(linear(drawn(8)), (160, 160), interpolation=cv2.INTER_AREA)
+        whole = cv2.erode((fine.sum(axis=2) > 0).astype(np.uint8), np.ones((3, 3))) > 0
+        assert whole.sum() > 500
+        errors.append(np.sqrt(((drawn(1) - encoded(fine))[whole] ** 2).mean()))
+    assert errors[0] < 9
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_unused_texels_leave_no_seams(scene_of: MakeScene, sheet: Callable[..., Mesh]) -> None:
+    # Only the left half of the texture is used; the rest is of a colour that nobody should see.
+    texture = np.full((128, 128, 3), (120, 120, 120), np.uint8)
+    texture[:, 64:] = (255, 0, 255)
+    mesh = sheet(SIDE, texture)
+    assert mesh.uv is not None
+    mesh = replace(mesh, uv=mesh.uv * (0.5, 1.0))
+    item = SceneObject(
+        make_surface(mesh), make_transform(FACING, np.array([0, 0, 4.0])), Material((1, 1, 1), 1, 0)
+    )
+    rendered = render(scene_of(item, lights=(), ambient=DIM))
+    seen = rendered.image[rendered.instances == 0].astype(int)
+    assert len(seen) > 50
+    assert (seen[:, 0] - seen[:, 1]).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (37, 101), (1, 5), (1, 1)])
+def test_the_coarsest_level_is_the_mean_light(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    texture = make_texture(image, uv, np.array([(0, 1, 2), (0, 2, 3)], np.int32))
+    assert texture.images[-1].shape == (1, 1, 3)
+    np.testing.assert_array_equal(texture.images[0], image)
+    expected = encoded(linear(image.astype(float)).mean(axis=(0, 1)))
+    np.testing.assert_allclose(texture.images[-1][0, 0], expected, atol=3)

@@ -1,0 +1,90 @@
+"""Stable faces: closed forms, trimesh, and shapes that can only lie one way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.parts.catalogue import pivconnector
+from dopepp.parts.part import Mesh
+from dopepp.virtual.body import Body, make_hull
+from dopepp.virtual.surface import Surface, make_surface
+
+MakeSurface = Callable[[trimesh.Trimesh], Surface]
+
+
+def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of: MakeSurface) -> None:
+    sides = np.array([0.10, 0.06, 0.02])
+    normals, shares = make_hull(surface_of(trimesh.creation.box(sides))).rests
+    assert len(normals) == 6
+    for normal, share in zip(normals, shares, strict=True):
+        axis = int(np.abs(normal).argmax())
+        np.testing.assert_allclose(np.abs(normal), np.eye(3)[axis], atol=1e-12)
+        (a, b), d = np.delete(sides, axis), sides[axis] / 2
+        # The solid angle of a rectangle seen from a point above its middle.
+        angle = 4 * np.arctan(a * b / (2 * d * np.sqrt(4 * d**2 + a**2 + b**2)))
+        assert share == pytest.approx(angle / (4 * np.pi), rel=1e-9)
+
+
+def test_the_stable_faces_are_trimeshs() -> None:
+    mesh = pivconnector().mesh
+    assert mesh is not None
+    hull = make_hull(make_surface(mesh))
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    np.testing.assert_allclose(hull.centre, solid.center_mass, atol=1e-9)
+    poses, chances = solid.compute_stable_poses(threshold=0.01)
+    theirs = -poses[:, 2, :3]  # what points down
+    normals, shares = hull.rests
+    for direction, chance in zip(theirs, chances, strict=True):
+        nearest = int((normals @ direction).argmax())
+        assert normals[nearest] @ direction > 0.9999
+        # They also count what rolls over onto the face.
+        assert shares[nearest] == pytest.approx(chance, abs=0.1)
+    assert shares.sum() == pytest.approx(1.0)
+
+
+def test_a_leaning_tower_does_not_stand(surface_of: MakeSurface) -> None:
+    tower = trimesh.creation.box((0.02, 0.02, 0.1))
+    tower.vertices[:, 0] += 0.5 * tower.vertices[:, 2]  # its centre is beside its foot
+    normals, _ = make_hull(surface_of(tower)).rests
+    assert len(normals) == 4
+    assert np.abs(normals[:, 2]).max() < 0.99
+
+
+def test_a_cone_never_stands_on_its_tip(surface_of: MakeSurface) -> None:
+    cone = trimesh.creation.cone(0.03, 0.1, sections=32)
+    hull = make_hull(surface_of(cone))
+    np.testing.assert_allclose(hull.centre, [0, 0, 0.025], atol=1e-9)
+    normals, shares = hull.rests
+    assert normals[:, 2].min() == pytest.approx(-1.0)
+    assert normals[:, 2].max() < 0.5
+    assert len(shares) == 33
+
+
+def test_a_ball_of_many_faces_rests_on_any(surface_of: MakeSurface) -> None:
+    normals, shares = make_hull(surface_of(trimesh.creation.icosphere(3, 0.05))).rests
+    assert len(normals) > 600
+    assert np.linalg.norm(shares @ normals) < 0.02
+
+
+def test_a_flat_sheet_lies_on_either_side(sheet: Callable[..., Mesh]) -> None:
+    normals, _ = make_hull(make_surface(sheet(0.1))).rests
+    np.testing.assert_allclose(np.abs(normals), np.tile([0, 0, 1.0], (len(normals), 1)), atol=1e-3)
+    assert {round(z) for z in normals[:, 2]} == {-1, 1}
+
+
+def test_a_stretched_hull_is_the_stretched_bodys_hull() -> None:
+    mesh = pivconnector().mesh
+    assert mesh is not None
+    body, scale = Body(make_surface(mesh)), np.array([0.5, 1.2, 3.0])
+    stretched = body.stretched(scale)
+    fresh = make_hull(stretched.surface)
+    np.testing.assert_allclose(stretched.hull.centre, fresh.centre, atol=1e-12)
+    ours, theirs = (sorted(zip(h.rests[1], h.rests[0].tolist(), strict=True)) for h in
+                    (stretched.hull, fresh))  # fmt: skip
+    assert [share for share, _ in ours] == pytest.approx([share for share, _ in theirs])
+    lowest = stretched.surface.vertices @ np.array([0.3, -0.2, 0.9])
+    assert (stretched.hull.vertices @ np.array([0.3, -0.2, 0.9])).min() == lowest.min()
