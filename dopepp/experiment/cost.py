@@ -42,7 +42,7 @@ from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.network import PoseNetwork, network_cost
 from dopepp.parts.part import Part
-from dopepp.training.system import draw_maps
+from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"

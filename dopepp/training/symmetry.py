@@ -82,7 +82,7 @@ class SymmetryHandling:
     """
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
-        self.options = options
+        self.options, self.num_objects = options, len(parts)
         self.active = options.canonical and any(_is_symmetric(part) for part in parts)
         groups = [_Group.of(part) for part in parts]
         longest = max(len(group.transforms) for group in groups)
