@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import require
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
@@ -105,7 +105,8 @@ class DepthRefiner:
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
-        self._gicp = _small_gicp()
+        require("small_gicp", "refine=depth", "depth")
+        self._gicp: ModuleType = import_module("small_gicp")
         self._surfaces = {
             part.name: surface_points(part.points)
             for part in parts
@@ -237,15 +238,3 @@ def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
     return make_transform(
         rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
     )
-
-
-def _small_gicp() -> ModuleType:
-    """Import small_gicp when it is asked for."""
-    try:
-        return import_module("small_gicp")
-    except ImportError as error:
-        raise UserError(
-            "refine=depth without the package small_gicp",
-            "an installation with the extra: pip install 'dopepp[depth]'",
-            "install it, or leave refine out",
-        ) from error
