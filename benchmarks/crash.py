@@ -28,6 +28,9 @@ from pathlib import Path
 import torch
 
 import dopepp.experiment.train  # noqa: F401 -- the libraries, once
+from dopepp.parts.catalogue import BUILTIN
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
 
 ROOT = Path(__file__).parents[1]
 STEPS_PER_EPOCH = 8
@@ -200,6 +203,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="kept; a temporary one if left out")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    Factory([BUILTIN["pivconnector"]()], PRESETS["paper"], 0)  # what it bakes is kept
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg, vsd
+from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg
 
 K = torch.tensor([[1066.8, 0.0, 313.0], [0.0, 1067.5, 241.3], [0.0, 0.0, 1.0]])
 Poses = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -30,7 +30,6 @@ LIMITS = {"ADD 10,000": 0.15, "ADD-S 2,000": 0.9, "ADD-S 10,000": 7.0}
 """Seconds for 1,000 pairs."""
 
 TURNS = (64, 315)
-VSD_IMAGES = 50
 """Of 640×480: 1,000 would take 7 GB."""
 
 
@@ -113,18 +112,6 @@ def measure_symmetric(poses: Poses, rng: np.random.Generator) -> None:
         report(f"rotation, {turns} symmetries", seconds)
 
 
-def measure_vsd(pairs: int, rng: np.random.Generator) -> None:
-    """Time VSD at BOP's ten tolerances on a slanted square, per ``pairs`` images."""
-    x, y = np.meshgrid(np.arange(640), np.arange(480))
-    inside = (abs(x - 320) < 100) & (abs(y - 240) < 100)
-    slants = rng.uniform(-2e-4, 2e-4, (2, VSD_IMAGES, 1, 1))
-    estimated, true = (torch.from_numpy(inside * (0.8 + slant * x)) for slant in slants)
-    test = torch.full_like(true, 1.0).where(true == 0, true)
-    taus = [0.05 * k for k in range(1, 11)]
-    seconds, _ = timed(lambda: vsd(estimated, true, test, K, taus, diameter=0.2))
-    report("VSD 640×480, 10 tolerances", seconds * pairs / VSD_IMAGES, f"of {VSD_IMAGES} images")
-
-
 def main() -> None:
     """Print a line per error."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -137,7 +124,6 @@ def main() -> None:
     print(f"{options.pairs:,} pairs of poses, one thread, process time")
     measure_distances(poses, rng)
     measure_symmetric(poses, rng)
-    measure_vsd(options.pairs, rng)
 
 
 if __name__ == "__main__":

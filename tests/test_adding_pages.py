@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,7 +13,10 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from scipy.spatial.transform import Rotation
 
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_png
 from dopepp.experiment.build.registries import CALLBACKS
+from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.metrics.functional import distances
 from dopepp.parts import servoholder
 from dopepp.virtual import PRESETS, Factory
@@ -32,6 +36,23 @@ def module_of(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleTy
     exec(documented(page), vars(module))
     monkeypatch.setitem(sys.modules, name, module)
     return module
+
+
+def test_the_documented_format_works(monkeypatch, tmp_path):
+    module = module_of("adding-a-data-format.md", "dopepp.data.formats.posed.source", monkeypatch)
+    part, K = servoholder(), camera_matrix(100, 100, 31.5, 23.5)
+    T_cam_obj = make_transform(Rotation.random(random_state=0).as_matrix(), np.array([0, 0, 0.4]))
+    record = {"K": K.ravel().tolist(), "object": part.name, "T_cam_obj": T_cam_obj.ravel().tolist()}
+    (tmp_path / "a.json").write_text(json.dumps(record))
+    write_png(tmp_path / "a.png", np.full((48, 64, 3), 7, np.uint8))
+    source = module.PosedSource(tmp_path, [part])
+    assert (len(source), source.contains(part.name), source.contains("other")) == (1, True, False)
+    sample = source.sample(0)
+    np.testing.assert_array_equal(sample.instances[0].T_cam_obj, T_cam_obj)
+    assert (sample.image == 7).all()
+    (tmp_path / "a.json").write_text(json.dumps(record | {"T_cam_obj": [2.0] * 16}))
+    with pytest.raises(UserError, match=r"a\.json: T_cam_obj: no rotation"):
+        module.PosedSource(tmp_path, [part])
 
 
 def test_the_documented_renderer_works(monkeypatch):

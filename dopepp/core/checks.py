@@ -1,7 +1,6 @@
-"""Checks of what a preset's fields may hold: every wrong value is refused before a scene is drawn.
+"""Checks of what an option may hold: a wrong value is refused in one line, before it is used.
 
-A group of ranges calls these in its ``__post_init__``, so that a preset is as safe written in
-Python as read from a config.
+Configs, specs and presets come from users and from files, so nothing about their types is known.
 """
 
 from __future__ import annotations
@@ -11,64 +10,74 @@ import sys
 from dopepp.core.errors import UserError
 
 
-def check_number(group: object, name: str, low: float, high: float, unit: str) -> None:
-    """Refuse a field that is no number within bounds.
+def check_number(
+    name: str, value: object, lowest: float, highest: float, unit: str = "", of: object = None
+) -> float:
+    """Return a finite real number of a closed range.
 
     Args:
-        group: The dataclass.
-        name: Its field.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-        unit: What the number counts, for the message.
+        name: The option, for the message, as are the next two.
+        value: What it holds.
+        lowest: Smallest allowed value.
+        highest: Largest allowed value.
+        unit: What the number counts.
+        of: The group that the option belongs to, named by its ``name`` or its class.
 
     Raises:
-        UserError: It is a bool, not a number, not finite, or outside of the bounds.
+        UserError: It is a bool, not a number, not finite, or outside of the range.
     """
-    value = getattr(group, name)
-    if not _is_number(value) or not low <= value <= high:
-        raise _refused(group, name, f"a number from {low:g} to {high:g} ({unit})")
+    if not _is_number(value) or not lowest <= value <= highest:  # type: ignore[operator]
+        allowed = f"a number from {lowest:g} to {highest:g}"
+        raise _refused(name, value, f"{allowed} ({unit})" if unit else allowed, of)
+    return float(value)  # type: ignore[arg-type]
 
 
-def check_range(group: object, name: str, low: float, high: float, unit: str) -> None:
-    """Refuse a field that is no pair (smallest, largest) within bounds.
-
-    Args:
-        group: The dataclass.
-        name: Its field.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-        unit: What the numbers count, for the message.
+def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
+    """Return an integer of a closed range.
 
     Raises:
-        UserError: It is no pair, an entry is a bool, not a number or not finite, an entry is
-            outside of the bounds, or the ends are exchanged.
+        UserError: It is not an integer of that range.
     """
-    value = getattr(group, name)
+    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
+        raise _refused(name, value, f"an integer from {lowest} to {highest}")
+    return value
+
+
+def check_flag(name: str, value: object, of: object = None) -> bool:
+    """Return a truth value.
+
+    Raises:
+        UserError: It is neither true nor false.
+    """
+    if not isinstance(value, bool):
+        raise _refused(name, value, "true or false", of)
+    return value
+
+
+def check_range(
+    name: str, value: object, low: float, high: float, unit: str, of: object = None
+) -> None:
+    """Refuse what is no pair (smallest, largest) within bounds; arguments as above.
+
+    Raises:
+        UserError: It is no pair, an entry is no number within the bounds, or the ends are
+            exchanged.
+    """
     pair = isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value))
-    if not pair or not low <= value[0] <= value[1] <= high:
+    if not pair or not low <= value[0] <= value[1] <= high:  # type: ignore[index]
         allowed = f"(smallest, largest) with {low:g} <= smallest <= largest <= {high:g} ({unit})"
-        raise _refused(group, name, allowed)
+        raise _refused(name, value, allowed, of)
 
 
-def check_counts(group: object, name: str, low: int, high: int) -> None:
-    """Refuse a field that is no pair of whole numbers (smallest, largest) within bounds.
+def check_counts(name: str, value: object, low: int, high: int, of: object = None) -> None:
+    """Refuse what is no pair of whole numbers (smallest, largest) within bounds.
 
     Raises:
         UserError: As for :func:`check_range`, or an entry is not an integer.
     """
-    check_range(group, name, low, high, "a count")
-    if not all(isinstance(value, int) for value in getattr(group, name)):
-        raise _refused(group, name, "two whole numbers")
-
-
-def check_flag(group: object, name: str) -> None:
-    """Refuse a field that is not a bool.
-
-    Raises:
-        UserError: It is anything else.
-    """
-    if not isinstance(getattr(group, name), bool):
-        raise _refused(group, name, "true or false")
+    check_range(name, value, low, high, "a count", of)
+    if not all(isinstance(entry, int) for entry in value):  # type: ignore[attr-defined]
+        raise _refused(name, value, "two whole numbers", of)
 
 
 def _is_number(value: object) -> bool:
@@ -78,6 +87,6 @@ def _is_number(value: object) -> bool:
     return abs(value) <= sys.float_info.max
 
 
-def _refused(group: object, name: str, allowed: str) -> UserError:
-    owner = getattr(group, "name", None) or type(group).__name__
-    return UserError(f"{name}={getattr(group, name)!r} of {owner}", allowed, f"change {name}")
+def _refused(name: str, value: object, allowed: str, of: object = None) -> UserError:
+    owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
+    return UserError(f"{name}={value!r:.100}{owner}", allowed, f"change {name}")

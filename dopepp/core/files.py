@@ -1,4 +1,4 @@
-"""PNG files, and any others, that are there completely or not at all.
+"""Files that are there completely or not at all, PNG among them.
 
 A file is written beside its place under a name of :func:`partial_path` and renamed when it is
 whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
@@ -14,14 +14,11 @@ import re
 import socket
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
@@ -103,14 +100,3 @@ def _machine() -> str:
     if boot.is_file() and namespace.is_symlink():
         facts += [boot.read_text(), str(namespace.readlink())]
     return hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
-
-
-def figure_image(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
-    """Render a figure to RGB without a window, for files and loggers."""
-    # Whoever writes images only does not wait a third of a second for this.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    return np.ascontiguousarray(pixels[..., :3])

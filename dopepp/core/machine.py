@@ -1,9 +1,20 @@
-"""This machine, as a process may use it: its cores, and its user's cache folder."""
+"""This machine, as a process may use it: its cores and threads, and its user's cache folder."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Final
+
+THREAD_LIMITS: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+"""Environment variables that limit the threads of libraries loaded after they are set."""
 
 
 def available_cores() -> int:

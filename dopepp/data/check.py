@@ -1,6 +1,9 @@
 """Find a folder's layout and check it.
 
-To add a layout, write ``check_NAME(report)`` in a module beside this one and a line in ``LAYOUTS``.
+A check lets the layout's own readers report to a
+:class:`~dopepp.data.formats.problems.CheckReport`, and then holds records against each other and
+against the images. To add a layout, write ``check_NAME(report)`` in ``check.py`` of its folder in
+:mod:`dopepp.data.formats`, and a line in ``LAYOUTS``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """What every reader returns: one image with its camera and the posed objects on it.
 
-To add a format, write a class with the :class:`DescribedSource` methods and one YAML file in
+To add a source, write a class with the :class:`DescribedSource` methods and one YAML file in
 ``conf/data``.
-
-What an object covers in the image: its mask, or what can be said without one.
 """
 
 from __future__ import annotations

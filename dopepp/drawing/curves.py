@@ -1,7 +1,7 @@
 """Curves: the share of poses below a threshold, and rates over what makes a task harder.
 
 Figures are objects (:class:`matplotlib.figure.Figure`), never pyplot's global state, so threads
-and tests cannot see each other's. ``figure_image`` turns one into pixels.
+and tests cannot see each other's. :func:`figure_image` turns one into pixels.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 
 MAX_THRESHOLD: Final = 0.1
 """Where accuracy-threshold curves end, metres (paper Fig. 4)."""
@@ -103,6 +104,14 @@ def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figur
     axes.set_title(title)
     axes.grid(visible=True, alpha=0.3)
     return figure, axes
+
+
+def figure_image(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
+    """Render a figure to RGB without a window, for files and loggers."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    return np.ascontiguousarray(pixels[..., :3])
 
 
 def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:

@@ -24,10 +24,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import nn
 
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample
 from dopepp.data.transforms.resize import pad_sample, resize_sample
+from dopepp.drawing.curves import figure_image
 from dopepp.drawing.panels import PlotLine, lines_figure
 from dopepp.experiment.build.sources import build_parts, build_test_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
@@ -41,7 +42,7 @@ from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.network import PoseNetwork, network_cost
 from dopepp.parts.part import Part
-from dopepp.training.system import draw_maps
+from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
 FRAMES_FILE: Final = "frames.csv"

@@ -1,6 +1,4 @@
-"""Which detection on an image stands for which instance of one object.
-
-Every error of one object's poses at once, and which measure each row needs of them.
+"""Which detection stands for which instance of an object, and every error of such a pair.
 
 To add an error, give :class:`PoseErrors` a field and :meth:`PoseErrors.of` its function.
 """

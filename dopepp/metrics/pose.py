@@ -217,14 +217,9 @@ class Gathered:
         table: Float[Tensor, "n 44"],
         false_positives: Float[Tensor, "false_positives"],
     ) -> None:
-        T_est, T_gt, K, width, visible, self.scores = torch.split(
-            table, [16, 16, 9, 1, 1, 1], dim=1
-        )
-        self.part, self.false_positives, self.visible_fractions = (
-            part,
-            false_positives,
-            visible[:, 0],
-        )
+        self.part, self.false_positives = part, false_positives
+        T_est, T_gt, K, width, visible, self.scores = torch.split(table, [16, 16, 9, 1, 1, 1], 1)
+        self.visible_fractions = visible[:, 0]
         self.T_gt, self.K = T_gt.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
         self.errors = PoseErrors.of(part, T_est.reshape(-1, 4, 4), self.T_gt, self.K, width[:, 0])
 

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.models.layers import initialise
-from dopepp.models.registry import check_integer
 
 
 class Attention(nn.Module, ABC):

@@ -13,10 +13,10 @@ from typing import ClassVar, Final
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dopepp.core.checks import check_flag
 from dopepp.core.errors import UserError
 from dopepp.models.checkpoint.storage import read_mapping
 from dopepp.models.layers import conv_block, initialise, scaled_channels
-from dopepp.models.registry import check_flag
 
 POOL: Final = "pool"
 

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dopepp.core.checks import check_flag, check_integer
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.models.layers import conv_block, find_activation, initialise, scaled_channels
-from dopepp.models.registry import check_flag, check_integer
 
 Stage: TypeAlias = tuple[
     Float[Tensor, "batch 9*objects height width"], Float[Tensor, "batch 16*objects height width"]

@@ -1,6 +1,7 @@
-"""The building block that every network part is made of, its width rule and its initialisation.
+"""What all network parts share: the convolution block, its width and initialisation, activations.
 
-What turns a head's belief output into a belief map that peaks at 1, by the name in the spec.
+An activation turns a head's belief output into a belief map that peaks at 1. To add one, name it in
+:data:`ACTIVATIONS`; the loss that it is paired with publishes that name.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Final
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
-from dopepp.models.registry import check_number
 
 MIN_WIDTH: Final = 1 / 64
 MAX_WIDTH: Final = 4.0

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dopepp.core.checks import check_number
 from dopepp.models.heads import Stage
-from dopepp.models.registry import check_number
 
 
 class MapLoss(nn.Module, ABC):

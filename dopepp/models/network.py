@@ -1,6 +1,7 @@
-"""The network: normalisation, backbone, attention and head, wired from what each publishes.
+"""The network: normalisation, backbone, attention and head, and what one costs.
 
-What a network costs: parameters and multiply–accumulates, counted without running it.
+The parts are wired from what each publishes (:mod:`dopepp.models.spec`); a cost is counted without
+running the network.
 """
 
 from __future__ import annotations

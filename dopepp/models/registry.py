@@ -1,17 +1,17 @@
-"""The gate before every object that a config or a checkpoint may name: an explicit allow-list.
+"""Registries: allow-lists of the classes that a config or a checkpoint may name and have built.
 
 A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
 is compared with the allow-list before anything is imported, and what it resolves to is checked
 again, so neither a path through another module (``dopepp.models.spec.os.system``) nor a re-bound
 name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
 
-To allow a class of your own: import its module and call ``GATE.register("package.module.Class")``.
+To add a class of your own, import its module and call ``register("package.module.Class")`` of the
+registry of its kind (``BACKBONES.register(…)``).
 """
 
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
@@ -27,7 +27,7 @@ class Registry(Generic[T]):
     """Builds objects of one kind, and nothing else, from plain nodes.
 
     Args:
-        kind: What the gate builds, for messages: ``"backbone"``, ``"optimizer"``.
+        kind: What the registry builds, for messages: ``"backbone"``, ``"optimizer"``.
         base: The class that every target must inherit from.
         targets: Dotted names of the allowed classes.
     """
@@ -62,7 +62,7 @@ class Registry(Generic[T]):
         """Allow one more class; it is checked now, so a wrong name fails where it was written.
 
         Raises:
-            UserError: The name does not lead to a class of this gate's kind.
+            UserError: The name does not lead to a class of this registry's kind.
         """
         self._load(dotted)
         self._targets.add(dotted)
@@ -189,41 +189,3 @@ def _check_plain(value: object, where: str) -> None:
             "null, true/false, numbers, text, and lists and mappings of them",
             "write a plain value",
         )
-
-
-def check_number(name: str, value: object, lowest: float, highest: float) -> float:
-    """Return a finite real number of a closed range.
-
-    Raises:
-        UserError: It is not a number of that range.
-    """
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or not lowest <= value <= highest:  # type: ignore[arg-type, operator]
-        raise UserError(
-            f"{name}={value!r:.100}", f"a number from {lowest:g} to {highest:g}", f"change {name}"
-        )
-    return float(value)  # type: ignore[arg-type]
-
-
-def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
-    """Return an integer of a closed range.
-
-    Raises:
-        UserError: It is not an integer of that range.
-    """
-    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
-        raise UserError(
-            f"{name}={value!r:.100}", f"an integer from {lowest} to {highest}", f"change {name}"
-        )
-    return value
-
-
-def check_flag(name: str, value: object) -> bool:
-    """Return a truth value.
-
-    Raises:
-        UserError: It is neither true nor false.
-    """
-    if not isinstance(value, bool):
-        raise UserError(f"{name}={value!r:.100}", "true or false", f"change {name}")
-    return value

@@ -11,11 +11,12 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.models import attention, backbones, heads, losses
 from dopepp.models.layers import find_activation
 from dopepp.models.network import PoseNetwork
-from dopepp.models.registry import Registry, check_integer
+from dopepp.models.registry import Registry
 
 BACKBONES = Registry.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
 ATTENTIONS = Registry.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]

@@ -1,4 +1,7 @@
-"""Loggers that cannot end a run: a CSV table that is always on, and a guard around the others."""
+"""Loggers that cannot end a run: a CSV table that is always on, and a guard around the others.
+
+To add a logger, a line in ``dopepp/experiment/build/registries.py`` and a file in ``conf/logger``.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,6 +22,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from dopepp.core.files import write_whole
 
 _log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class MetricsTable(Logger):
@@ -114,7 +118,7 @@ class GuardedLogger(Logger):
         self._failed = False
         self.inner = self.guard(make)
 
-    def guard(self, call: Callable[[], Any]) -> Any:
+    def guard(self, call: Callable[[], T]) -> T | None:
         """Run a call of the logger; None where it fails or has failed before."""
         if self._failed:
             return None
@@ -125,41 +129,35 @@ class GuardedLogger(Logger):
             _log.warning("a logger failed and is off for the rest of the run: %r", error)
             return None
 
+    def _pass_on(self, call: Callable[[Logger], T]) -> T | None:
+        inner = self.inner
+        return None if inner is None else self.guard(lambda: call(inner))
+
     @property
     def name(self) -> str | None:
         """The inner logger's name."""
-        inner = self.inner
-        return None if inner is None else self.guard(lambda: inner.name)
+        return self._pass_on(lambda inner: inner.name)
 
     @property
     def version(self) -> str | int | None:
         """The inner logger's version."""
-        inner = self.inner
-        return None if inner is None else self.guard(lambda: inner.version)
+        return self._pass_on(lambda inner: inner.version)
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kw: Any) -> None:
         """Pass on."""
-        inner = self.inner
-        if inner is not None:
-            self.guard(lambda: inner.log_hyperparams(params, *args, **kw))
+        self._pass_on(lambda inner: inner.log_hyperparams(params, *args, **kw))
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Pass on."""
-        inner = self.inner
-        if inner is not None:
-            self.guard(lambda: inner.log_metrics(metrics, step))
+        self._pass_on(lambda inner: inner.log_metrics(metrics, step))
 
     def save(self) -> None:
         """Pass on."""
-        inner = self.inner
-        if inner is not None:
-            self.guard(inner.save)
+        self._pass_on(lambda inner: inner.save())
 
     def finalize(self, status: str) -> None:
         """Pass on."""
-        inner = self.inner
-        if inner is not None:
-            self.guard(lambda: inner.finalize(status))
+        self._pass_on(lambda inner: inner.finalize(status))
 
     def log_picture(
         self, name: str, image: UInt8[np.ndarray, "height width 3"], step: int | None = None
@@ -192,8 +190,8 @@ class GuardedLogger(Logger):
         inner = self.inner
         if isinstance(inner, WandbLogger):
             self.guard(lambda: inner.experiment.summary.update(dict(figures)))
-        elif inner is not None:
-            self.guard(lambda: inner.log_metrics(dict(figures)))
+        else:
+            self.log_metrics(dict(figures))
 
     def close(self, failed: bool) -> None:
         """End the run there: what is logged after this would be another one's.

@@ -104,23 +104,19 @@ class WatchedLauncher(_SubprocessScriptLauncher):
         _set_num_threads_if_needed(num_processes=self.num_processes)
         watch = Watch(self.procs, None if started_by is None else int(started_by))
         watch.start()
+        death = None
         try:
-            result = function(*args, **kw)
+            return function(*args, **kw)
         except RunError:
-            watch.stop()
             raise
         except Exception as error:
             death = watch.death(_NOTICE_S)
             if death is None:
-                watch.stop()
                 raise
-            # The watch goes on: what follows may hang, too.
             raise ProcessDiedError(f"{death}: the run ends") from error
-        except BaseException:
-            watch.stop()
-            raise
-        watch.stop()
-        return result
+        finally:
+            if death is None:  # else the watch goes on: what follows may hang, too
+                watch.stop()
 
 
 class WatchedDDP(DDPStrategy):

@@ -17,11 +17,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
 from dopepp.data.batch import PADDING, Batch
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.models.registry import check_number
 from dopepp.parts.part import Part
 
 FACING: Final = np.diag([1.0, -1.0, -1.0])
@@ -82,7 +82,7 @@ class SymmetryHandling:
     """
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
-        self.options = options
+        self.options, self.num_objects = options, len(parts)
         self.active = options.canonical and any(_is_symmetric(part) for part in parts)
         groups = [_Group.of(part) for part in parts]
         longest = max(len(group.transforms) for group in groups)

@@ -1,8 +1,8 @@
 """PoseSystem: a network, a loss and an optimiser as a LightningModule.
 
 The network knows nothing of training and this module knows nothing of backbones or files: what can
-be swapped is handed in, built. To add a callback, one class here and one entry in
-``conf/callbacks``.
+be swapped is handed in, built. To add a callback, one class in :mod:`dopepp.training.callbacks`, a
+line in ``dopepp/experiment/build/registries.py`` and an entry in ``conf/callbacks``.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from dopepp.data.batch import PADDING, Batch
-from dopepp.maps.encode import MapGeometry, encode
-from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.data.batch import Batch
+from dopepp.maps.encode import MapGeometry
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
@@ -33,13 +32,10 @@ from dopepp.training.callbacks.averaging import go_on_with_trained
 from dopepp.training.callbacks.finite import check_state
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
+from dopepp.training.targets import Targets, choose_keypoints, draw_maps
 
 OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
-Targets = tuple[
-    Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
-]
-"""Belief maps and vector fields as the network should give them."""
 
 _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
 """What torch's schedulers call how far they are; the rest of their state is the run's length."""
@@ -113,36 +109,21 @@ class PoseSystem(LightningModule):
         return stages
 
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
-        """Draw the batch's target maps on its own device.
+        """Return the maps that the network should give, drawn on the batch's device.
 
-        What no metric counts, because it is hardly visible, is not asked of the network either.
-        Of poses of a symmetric part that look alike, one is drawn; where several are as good, the
-        one that the given maps are nearest to, instance by instance.
+        An instance that is too little visible for a metric to count is left out. A symmetric part
+        looks the same in several poses: the maps are of the one nearest a reference orientation
+        (:mod:`~dopepp.training.symmetry`), or, where two are as good, of the one that the network
+        itself tends to.
 
         Args:
             batch: Images and poses.
-            stages: What the network says; None takes the first of equally good poses.
+            stages: The network's answer to the images, which shows what it tends to; without it
+                the first of equally good poses is taken.
         """
-        if not self.symmetry.active:
-            return self._draw(batch, batch.keypoints)
-        found = self.symmetry.equivalents(batch)
-        keypoints = found.keypoints[:, :, 0].clone()
-        for slot, choice in found.allowed[:, :, 1:].any(dim=0).nonzero().tolist():
-            if stages is None:
-                break
-            rows = found.allowed[:, slot, 1 + choice].nonzero()[:, 0]
-            some, maps = (
-                batch.rows(rows),
-                [(z[rows].detach(), field[rows].detach()) for z, field in stages],
-            )
-            other = keypoints[rows]
-            other[:, slot] = found.keypoints[rows, slot, 1 + choice]
-            present = self.loss.per_image(maps, *self._draw(some, keypoints[rows]))
-            better = self.loss.per_image(maps, *self._draw(some, other)) < present
-            keypoints[rows] = torch.where(better[:, None, None, None], other, keypoints[rows])
-        return self._draw(batch, keypoints)
-
-    def _draw(self, batch: Batch, keypoints: Float[Tensor, "batch instances 9 2"]) -> Targets:
+        keypoints = batch.keypoints
+        if self.symmetry.active:
+            keypoints = choose_keypoints(batch, stages, self.symmetry, self.loss, self.geometry)
         return draw_maps(batch, keypoints, len(self.parts), self.geometry)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -179,15 +160,16 @@ class PoseSystem(LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build the optimiser, and its schedule over all steps of the run."""
         optimizer = self.make_optimizer(self.network.parameters())
-        if self.make_scheduler is None:
-            self._settings = [dict(group) for group in optimizer.param_groups]
-            return optimizer
-        scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        configured: OptimizerLRScheduler = optimizer
+        if self.make_scheduler is not None:
+            scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+            configured = {
+                "optimizer": optimizer,
+                "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+            }
+        # Only now: a schedule adds settings of its own.
         self._settings = [dict(group) for group in optimizer.param_groups]
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        return configured
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep only how far the schedule was: a run resumed for longer has a longer schedule."""
@@ -238,27 +220,6 @@ class PoseSystem(LightningModule):
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
-
-
-def draw_maps(
-    batch: Batch,
-    keypoints: Float[Tensor, "batch instances 9 2"],
-    num_objects: int,
-    geometry: MapGeometry,
-) -> Targets:
-    """Draw the maps of what a network is asked for: the instances that a metric counts, too.
-
-    Args:
-        batch: Images and how much of each instance is visible.
-        keypoints: Of the instances, pixels; those of the batch, or of poses that look alike.
-        num_objects: Number of objects.
-        geometry: Stride, peak width and disc radius of the maps.
-    """
-    height, width = batch.images.shape[-2:]
-    map_size = height // geometry.stride, width // geometry.stride
-    seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
-    index = torch.where(seen, batch.object_index, PADDING)
-    return encode(keypoints, index, num_objects, map_size, geometry)
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -73,13 +73,14 @@ class Sensors:
     def __post_init__(self) -> None:
         """Check the ranges."""
         for step in ("exposure", "blur", "motion", "noise", "jpeg"):
-            check_number(self, f"{step}_probability", 0.0, 1.0, "probability")
-        check_range(self, "exposure_ev", -8.0, 8.0, "stops")
-        check_range(self, "blur_px", 0.0, 50.0, "pixels")
-        check_range(self, "motion_px", 0.0, 200.0, "pixels")
-        check_range(self, "read_noise", 0.0, 127.0, "grey levels")
-        check_range(self, "shot_noise", 0.0, 127.0, "grey levels")
-        check_range(self, "jpeg_quality", 1, 100, "JPEG quality")
+            name = f"{step}_probability"
+            check_number(name, getattr(self, name), 0.0, 1.0, "probability", of=self)
+        check_range("exposure_ev", self.exposure_ev, -8.0, 8.0, "stops", of=self)
+        check_range("blur_px", self.blur_px, 0.0, 50.0, "pixels", of=self)
+        check_range("motion_px", self.motion_px, 0.0, 200.0, "pixels", of=self)
+        check_range("read_noise", self.read_noise, 0.0, 127.0, "grey levels", of=self)
+        check_range("shot_noise", self.shot_noise, 0.0, 127.0, "grey levels", of=self)
+        check_range("jpeg_quality", self.jpeg_quality, 1, 100, "JPEG quality", of=self)
 
     def resized(self, scale: float) -> Sensors:
         """Return the same camera for a picture that is ``scale`` times as large."""

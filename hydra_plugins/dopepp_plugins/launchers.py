@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
 from hydra.core.utils import JobReturn
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-if TYPE_CHECKING:
-    from dopepp.experiment.launch.jobs import Runner
-
 
 class _RemoteLauncher(Launcher):
-    """Hands jobs to :func:`dopepp.experiment.launch.jobs.launch`."""
+    """Hands jobs to :func:`dopepp.experiment.launch.jobs.launch`.
+
+    Args:
+        module: Of ``dopepp.experiment.launch``.
+        function: Its function that returns the runner.
+        *options: The function's arguments.
+    """
+
+    def __init__(self, module: str, function: str, *options: object) -> None:
+        self.module, self.function, self.options = module, function, options
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -31,51 +37,31 @@ class _RemoteLauncher(Launcher):
         from dopepp.experiment.launch.jobs import Jobs, launch
 
         jobs = Jobs.of(self.hydra_context, self.config, self.task_function)
-        return launch(jobs, job_overrides, initial_job_idx, self.runner())
-
-    @abstractmethod
-    def runner(self) -> Runner:
-        """Return what runs the jobs."""
+        module = import_module(f"dopepp.experiment.launch.{self.module}")
+        runner = getattr(module, self.function)(*self.options)
+        return launch(jobs, job_overrides, initial_job_idx, runner)
 
 
 class JoblibLauncher(_RemoteLauncher):
     """Jobs in several processes of this machine."""
 
     def __init__(self, n_jobs: int) -> None:
-        self.n_jobs = n_jobs
-
-    def runner(self) -> Runner:
-        """Return what runs the jobs."""
-        from dopepp.experiment.launch.jobs import on_joblib
-
-        return on_joblib(self.n_jobs)
+        super().__init__("jobs", "on_joblib", n_jobs)
 
 
 class RayLauncher(_RemoteLauncher):
     """Jobs as tasks of a Ray cluster."""
 
     def __init__(self, address: str | None, num_cpus: float, num_gpus: float) -> None:
-        self.address, self.num_cpus, self.num_gpus = address, num_cpus, num_gpus
-
-    def runner(self) -> Runner:
-        """Return what runs the jobs."""
-        from dopepp.experiment.launch.jobs import on_ray
-
-        return on_ray(self.address, self.num_cpus, self.num_gpus)
+        super().__init__("jobs", "on_ray", address, num_cpus, num_gpus)
 
 
 class SlurmLauncher(_RemoteLauncher):
     """Jobs as a SLURM job array."""
 
     def __init__(self, folder: str, cluster: str, max_num_timeout: int, **sbatch: Any) -> None:
-        self.folder, self.cluster, self.max_num_timeout = folder, cluster, max_num_timeout
-        self.sbatch = {
+        plain = {
             key: OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
             for key, value in sbatch.items()
         }
-
-    def runner(self) -> Runner:
-        """Return what runs the jobs."""
-        from dopepp.experiment.launch.slurm import on_slurm
-
-        return on_slurm(self.folder, self.cluster, self.max_num_timeout, self.sbatch)
+        super().__init__("slurm", "on_slurm", folder, cluster, max_num_timeout, plain)

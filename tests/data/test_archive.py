@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import gzip
 import io
 import os
-import resource
 import struct
 import tarfile
 import zipfile
@@ -11,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dopepp.core.errors import UserError
 from dopepp.data.archive import Limits, safe_extract
@@ -37,18 +33,6 @@ def make_zip(members: Sequence[tuple[str | zipfile.ZipInfo, bytes]]) -> bytes:
         for name, content in members:
             archive.writestr(name, content)
     return pack.getvalue()
-
-
-def special(kind: bytes, target: str = "") -> tarfile.TarInfo:
-    info = tarfile.TarInfo("set/special")
-    info.type, info.linkname = kind, target
-    return info
-
-
-def zip_link() -> zipfile.ZipInfo:
-    info = zipfile.ZipInfo("link")
-    info.external_attr = 0o120777 << 16
-    return info
 
 
 def unpack(folder: Path, content: bytes, limits: Limits | None = None) -> Path:
@@ -76,10 +60,9 @@ def test_every_format_is_unpacked_completely(tmp_path: Path, mode: str) -> None:
 
 
 def test_folders_may_come_after_their_files_and_twice(tmp_path: Path) -> None:
-    again = [special(tarfile.DIRTYPE), special(tarfile.DIRTYPE)]
-    for info in again:
-        info.name = "set"
-    folder = unpack(tmp_path, make_tar([("./set/a", b"1"), *((info, b"") for info in again)]))
+    again = tarfile.TarInfo("set")
+    again.type = tarfile.DIRTYPE
+    folder = unpack(tmp_path, make_tar([("./set/a", b"1"), (again, b""), (again, b"")]))
     assert (folder / "set" / "a").read_bytes() == b"1"
 
 
@@ -112,24 +95,6 @@ def test_a_path_out_of_the_folder_is_refused(tmp_path: Path, name: str, kind: st
 
 
 @pytest.mark.parametrize(
-    ("info", "message"),
-    [
-        (special(tarfile.SYMTYPE, "/etc/passwd"), "a link to '/etc/passwd'"),
-        (special(tarfile.SYMTYPE, "a"), "a link to 'a'"),
-        (special(tarfile.LNKTYPE, "set/a.txt"), "a link to 'set/a.txt'"),
-        (special(tarfile.CHRTYPE), "a device"),
-        (special(tarfile.FIFOTYPE), "a device or other special file"),
-    ],
-)
-def test_links_and_devices_are_refused(tmp_path: Path, info: tarfile.TarInfo, message: str) -> None:
-    refused(tmp_path, make_tar([*GOOD, (info, b"")]), message)
-
-
-def test_links_in_a_zip_are_refused(tmp_path: Path) -> None:
-    refused(tmp_path, make_zip([(zip_link(), b"/etc/passwd")]), "a link or special file")
-
-
-@pytest.mark.parametrize(
     ("names", "message"),
     [
         (["a", "a"], "two members 'a'"),
@@ -158,15 +123,6 @@ def test_limits(tmp_path: Path) -> None:
     assert unpack(tmp_path, content, Limits(num_members=10, total_bytes=100)).is_dir()
 
 
-def test_a_name_that_claims_gigabytes_takes_no_memory(tmp_path: Path) -> None:
-    info = tarfile.TarInfo("././@LongLink")
-    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 4_000_000_000
-    content = gzip.compress(info.tobuf(tarfile.GNU_FORMAT) + bytes(50_000_000), 1)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    refused(tmp_path, content, "a header of 4000000000 bytes")
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 50_000  # kilobytes
-
-
 def test_a_zip_that_lies_about_a_size_is_refused(tmp_path: Path) -> None:
     content = make_zip([("a", b"hello" * 1000)])
     record = content.rfind(b"PK\x01\x02")  # its size field is 24 bytes on
@@ -181,24 +137,6 @@ def test_a_damaged_archive_is_refused(tmp_path: Path, mode: str) -> None:
     for length in (0, 1, 7, 300, 4000, 7000):
         refused(tmp_path, content[:length], "damaged")
     refused(tmp_path, b"junk" * 500, "damaged")
-
-
-@settings(deadline=None, max_examples=100)
-@given(st.data())
-def test_a_changed_byte_never_escapes_or_crashes(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    folder = tmp_path_factory.mktemp("any")
-    good = data.draw(st.sampled_from([make_tar(GOOD, "w"), make_tar(GOOD, "w:gz"), make_zip(GOOD)]))  # type: ignore[arg-type]
-    content = bytearray(good)
-    for _ in range(data.draw(st.integers(1, 4))):
-        place = data.draw(st.integers(0, min(len(content), 1600) - 1))
-        content[place] = data.draw(st.integers(0, 255))
-    try:
-        unpack(folder, bytes(content))
-    except UserError:
-        assert not (folder / "out").exists()
-    assert {path.name for path in folder.iterdir()} <= {"archive", "out"}
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:

@@ -210,8 +210,7 @@ class SaveAt(pl.Callback):
 
 
 # An epoch has three batches: in the first, at its end, and inside the second.
-@pytest.mark.parametrize("stop", [1, 3, 4, 5])
-@pytest.mark.parametrize("num_workers", [0, 2])
+@pytest.mark.parametrize(("stop", "num_workers"), [(1, 0), (3, 0), (4, 2), (5, 0)])
 def test_lightning_resumes_where_it_stopped(
     build: Any, tmp_path: Path, stop: int, num_workers: int
 ) -> None:

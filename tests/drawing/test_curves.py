@@ -13,11 +13,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.files import figure_image
 from dopepp.drawing.curves import (
     RateCurve,
     accuracy_curve,
     accuracy_figure,
+    figure_image,
     rates_figure,
     save_accuracy_curves,
 )

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.files import figure_image
+from dopepp.drawing.curves import figure_image
 from dopepp.drawing.panels import (
     AXIS_COLOURS,
     COLOURS,

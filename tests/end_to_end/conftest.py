@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from dopepp.experiment.train import PAPER_INPUT_SIZE
+
 ROOT = Path(__file__).parents[2]
 TINY = (
     "data=virtual",
@@ -67,16 +69,17 @@ def environment(folder: Path) -> dict[str, str]:
     return {**own, **offline, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 
-def in_process(script: str, *arguments: str) -> Done:
-    """Run an entry point inside this process, as ``python script arguments``."""
+def in_process(script: str, *arguments: str, paper_size: tuple[int, int] = (64, 64)) -> Done:
+    """Run an entry point inside this process, as ``python script arguments``.
+
+    What a full-size network costs is measured at ``paper_size``.
+    """
     out, err = io.StringIO(), io.StringIO()
     code: object = 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [str(ROOT / script), *arguments])
         patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
-        # What a full-size network costs is measured at this size; the `trained` run does it at
-        # the paper's.
-        patch.setattr("dopepp.experiment.train.PAPER_INPUT_SIZE", (64, 64))
+        patch.setattr("dopepp.experiment.train.PAPER_INPUT_SIZE", paper_size)
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             try:
                 runpy.run_path(str(ROOT / script), run_name="__main__")
@@ -138,13 +141,11 @@ def find_run() -> Callable[[Path], Path]:
 
 @pytest.fixture(scope="session")
 def trained(
-    command: Runner,
-    find_run: Callable[[Path], Path],
-    tmp_path_factory: pytest.TempPathFactory,
+    find_run: Callable[[Path], Path], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Done]:
-    """The folder and the output of one tiny training, run as a user runs it."""
+    """The folder and the output of one tiny training."""
     output_dir = tmp_path_factory.mktemp("outputs")
-    done = command("train.py", *TINY, f"output_dir={output_dir}")
+    done = in_process("train.py", *TINY, f"output_dir={output_dir}", paper_size=PAPER_INPUT_SIZE)
     assert done.code == 0, done.err[-4000:]
     return find_run(output_dir), done
 

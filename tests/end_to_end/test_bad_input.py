@@ -192,19 +192,23 @@ def absent(path: Path, good: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write", "expected"),
+    ("write", "place", "expected"),
     [
-        (write_text, "which is not a torch file or was cut short"),
-        (truncate, "which is not a torch file or was cut short"),
-        (other_zip, "which torch refuses to load"),
-        (foreign, "without 'dopepp' entry"),
-        (hostile_spec, "backbone _target_ 'os.system'"),
-        (hostile_pickle, "which torch refuses to load"),
-        (absent, "which is no file"),
+        (write_text, "ckpt_path", "which is not a torch file or was cut short"),
+        (truncate, "baseline", "which is not a torch file or was cut short"),
+        (other_zip, "init_from", "which torch refuses to load"),
+        (foreign, "ckpt_path", "without 'dopepp' entry"),
+        (hostile_spec, "baseline", "backbone _target_ 'os.system'"),
+        (hostile_spec, "init_from", "backbone _target_ 'os.system'"),
+        (hostile_pickle, "ckpt_path", "which torch refuses to load"),
+        (hostile_pickle, "init_from", "which torch refuses to load"),
+        (absent, "baseline", "which is no file"),
+        (absent, "init_from", "which is no file"),
     ],
 )
 def test_a_file_that_is_no_checkpoint(
     write: Callable[[Path, Path], None],
+    place: str,
     expected: str,
     trained: tuple[Path, Any],
     call: Runner,
@@ -213,15 +217,18 @@ def test_a_file_that_is_no_checkpoint(
 ) -> None:
     good, bad = trained[0] / "checkpoints" / "best.ckpt", tmp_path / "bad.ckpt"
     write(bad, good)
-    output_dir = f"output_dir={tmp_path / 'evaluations'}"
-    for overrides in ([f"ckpt_path={bad}"], [f"ckpt_path={good}", f"baseline={bad}"]):
-        done = call("evaluate.py", *overrides, output_dir)
-        assert expected in done.line
-        assert str(bad) in done.line
+    if place == "init_from":
+        line = train(f"init_from={bad}")
+    else:
+        others = [f"ckpt_path={good}"] if place == "baseline" else []
+        folder = tmp_path / "evaluations"
+        done = call("evaluate.py", *others, f"{place}={bad}", f"output_dir={folder}")
+        line = done.line
         assert done.err.count("\n") == 1
-    assert expected in train(f"init_from={bad}")
+        assert not list(folder.glob("**/versions.json"))
+    assert expected in line
+    assert str(bad) in line
     assert not (tmp_path / "trace").exists()
-    assert not list(tmp_path.glob("evaluations/**/versions.json"))
 
 
 def test_evaluation_asks_for_its_checkpoint(call: Runner, tmp_path: Path) -> None:

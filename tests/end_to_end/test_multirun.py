@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
 
 Runner = Callable[..., Any]
@@ -20,42 +19,6 @@ def table(sweep: Path) -> list[dict[str, str]]:
 def only_sweep(output_dir: Path) -> Path:
     (sweep,) = (output_dir / "compare").iterdir()
     return sweep
-
-
-def test_two_models_end_in_one_table_dope_first(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
-    done = call("train.py", "-m", *tiny, "model=dopepp,dope", f"output_dir={tmp_path}")
-    assert done.code == 0, done.err
-    sweep = only_sweep(tmp_path)
-    rows = table(sweep)
-    assert [row["method"] for row in rows[:2]] == ["dope", "dopepp"]
-    assert rows[0]["Δ ADD-0.1d %"] == ""
-    assert rows[1]["Δ ADD-0.1d %"] not in ("", "n/a")
-    assert rows[1]["Δ ADD-0.1d % verdict"] == "within noise"  # of three instances each
-    assert all(float(row["ms/frame"]) > 0 and float(row["GMACs"]) > 0 for row in rows[:2])
-    # The networks were narrowed: what the full ones cost stands beside it.
-    assert rows[0]["full-size parameters"] == "50,267,350"
-    assert "best constant pose" in [row["method"] for row in rows[2:]]
-
-    text = (sweep / "compare.md").read_text()
-    assert text.startswith("| method | object |")
-    assert "model.width=0.0625" in text
-    assert "the noise of training" in text
-    for name in ("compare", "compare_auc", "compare_loss", "compare_pictures"):
-        assert cv2.imread(str(sweep / f"{name}.png")) is not None, name
-    assert "dopepp" in (sweep / "compare_auc.csv").read_text().splitlines()[0]
-    assert "comparison" in done.out
-    readme = (sweep / "README.md").read_text()
-    assert readme.startswith("# Multirun: finished\n")
-    assert "python train.py -m data=virtual" in readme
-    assert "| [1](1/) | finished |" in readme
-    assert (sweep / "1" / "README.md").read_text().startswith("# dope on virtual: finished")
-    # Both saw the same data.
-    prints = [
-        json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "01"
-    ]
-    assert prints[0] == prints[1]
 
 
 @pytest.mark.slow

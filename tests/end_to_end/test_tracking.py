@@ -1,16 +1,20 @@
-"""What Weights & Biases and TensorBoard hold of runs and multiruns, read back from their files."""
+"""A multirun of two models: its table, and what Weights & Biases and TensorBoard hold of runs."""
 
 from __future__ import annotations
 
+import csv
 import json
+import os
 import struct
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb.proto import wandb_internal_pb2
@@ -94,16 +98,54 @@ def sweep_of(output_dir: Path) -> Path:
     return sweep
 
 
-def test_every_job_is_a_run_and_the_comparison_one_more(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def sweep(call: Runner, tiny: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a multirun of both models that both services follow."""
+    folder = tmp_path_factory.mktemp("sweep")
+    tensorboard = "+logger.tensorboard={_target_: lightning.pytorch.loggers.TensorBoardLogger, "
     done = call(
-        "train.py", "-m", *tiny, "model=dope,dopepp", "logger=wandb", f"output_dir={tmp_path}"
-    )
+        "train.py", "-m", *tiny, "model=dopepp,dope", "logger=wandb",
+        tensorboard + "name: tensorboard, version: ''}", f"output_dir={folder}",
+    )  # fmt: skip
     assert done.code == 0, done.err[-3000:]
     assert "already in progress" not in done.err
-    sweep = sweep_of(tmp_path)
-    for job, model in (("0", "dope"), ("1", "dopepp")):
+    assert "comparison" in done.out
+    return sweep_of(folder)
+
+
+def test_they_end_in_one_table_dope_first(sweep: Path) -> None:
+    with (sweep / "compare.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["method"] for row in rows[:2]] == ["dope", "dopepp"]
+    assert rows[0]["Δ ADD-0.1d %"] == ""
+    assert rows[1]["Δ ADD-0.1d %"] not in ("", "n/a")
+    assert rows[1]["Δ ADD-0.1d % verdict"] == "within noise"  # of three instances each
+    assert all(float(row["ms/frame"]) > 0 and float(row["GMACs"]) > 0 for row in rows[:2])
+    # The networks were narrowed: what the full ones cost stands beside it.
+    assert rows[0]["full-size parameters"] == "50,267,350"
+    assert "best constant pose" in [row["method"] for row in rows[2:]]
+
+    text = (sweep / "compare.md").read_text()
+    assert text.startswith("| method | object |")
+    assert "model.width=0.0625" in text
+    assert "the noise of training" in text
+    for name in ("compare", "compare_auc", "compare_loss", "compare_pictures"):
+        assert cv2.imread(str(sweep / f"{name}.png")) is not None, name
+    assert "dopepp" in (sweep / "compare_auc.csv").read_text().splitlines()[0]
+    readme = (sweep / "README.md").read_text()
+    assert readme.startswith("# Multirun: finished\n")
+    assert "python train.py -m data=virtual" in readme
+    assert "| [1](1/) | finished |" in readme
+    assert (sweep / "1" / "README.md").read_text().startswith("# dope on virtual: finished")
+    # Both saw the same data.
+    prints = [
+        json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "01"
+    ]
+    assert prints[0] == prints[1]
+
+
+def test_every_job_is_a_run_and_the_comparison_one_more(sweep: Path) -> None:
+    for job, model in (("0", "dopepp"), ("1", "dope")):
         run = only(sweep / job)
         assert run.name.startswith(f"{model} virtual")
         assert (run.group, run.job_type, run.exit_code) == (sweep.name, "train", 0)
@@ -158,33 +200,34 @@ def test_a_resumed_run_goes_on_in_the_same_run(
 
 
 def test_a_service_that_dies_in_the_middle_ends_nothing(
-    start: Callable[..., subprocess.Popen[str]], tiny: tuple[str, ...], tmp_path: Path
+    call: Runner, tiny: tuple[str, ...], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    arguments = [*tiny, "trainer.max_epochs=2", "logger=wandb", f"output_dir={tmp_path}"]
-    with start("train.py", "-m", *arguments, "model/attention=none,cbam") as process:
+    killed = []
+
+    def kill_service() -> None:
         until = time.monotonic() + 200
         while not list(tmp_path.glob("compare/*/0/metrics.csv")):  # after the first epoch
-            assert process.poll() is None
             assert time.monotonic() < until
-            time.sleep(0.05)
-        killed = subprocess.run(["pkill", "-9", "-P", str(process.pid), "wandb-core"], check=False)
-        out, err = process.communicate(timeout=200)
-    assert killed.returncode == 0
-    assert process.returncode == 0, err[-3000:]
-    assert "a logger failed" in err
+            time.sleep(0.02)
+        command = ["pkill", "-9", "-P", str(os.getpid()), "wandb-core"]
+        killed.append(subprocess.run(command, check=False).returncode)
+
+    killer = threading.Thread(target=kill_service)
+    killer.start()
+    arguments = [*tiny, "trainer.max_epochs=2", "logger=wandb", f"output_dir={tmp_path}"]
+    done = call("train.py", "-m", *arguments, "model/attention=none,cbam")
+    killer.join()
+    assert killed == [0]
+    assert done.code == 0, done.err[-3000:]
+    assert "a logger failed" in caplog.text
     sweep = sweep_of(tmp_path)
     assert all((sweep / job / "metrics.json").is_file() for job in "01")
-    assert "comparison" in out
+    assert "comparison" in done.out
     # The next job starts a service of its own.
     assert only(sweep / "1").exit_code == 0
 
 
-def test_tensorboard_holds_the_same(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> None:
-    done = call(
-        "train.py", "-m", *tiny, "model=dopepp", "logger=tensorboard", f"output_dir={tmp_path}"
-    )
-    assert done.code == 0, done.err[-3000:]
-    sweep = sweep_of(tmp_path)
+def test_tensorboard_holds_the_same(sweep: Path) -> None:
     events = EventAccumulator(str(sweep / "0" / "tensorboard")).Reload()
     tags = events.Tags()
     assert {"train/loss", "test/pivconnector/add_01d"} <= set(tags["scalars"])

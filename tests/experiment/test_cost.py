@@ -70,11 +70,8 @@ def test_the_original_backbone(parsed: Parser, tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("job=mow", "job='mow'; allowed: train, cost"),
-        ("cost.num_frames=0", "cost.num_frames=0"),
         ("cost.batch_size=0.5", "cost.batch_size=0.5"),
-        ("maps.field_radius=0", "maps.field_radius=0"),
         ("recovery.max_peaks=0", "recovery option max_peaks=0"),
-        ("data.eval_seed=-1", "data.eval_seed=-1"),
     ],
 )
 def test_impossible_jobs(composed: Composer, tmp_path: Path, override: str, message: str) -> None:

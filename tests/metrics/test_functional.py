@@ -1,8 +1,7 @@
-"""Pose errors against brute force, scipy and closed forms."""
+"""Distances of poses against brute force, scipy, OpenCV and closed forms."""
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 
@@ -14,17 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dopepp.core.errors import UserError
 from dopepp.metrics.functional import (
     add,
     add_s,
-    auc,
-    match,
-    pass_rate,
     reprojection_error,
     rotation_error_deg,
     translation_error,
@@ -32,6 +26,7 @@ from dopepp.metrics.functional import (
 
 Array = NDArray[np.float64]
 REL = 1e-9
+K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 
 
 def poses(n: int, seed: int, near: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -68,19 +63,6 @@ def test_add_equals_the_loop(near: bool) -> None:
     np.testing.assert_allclose(add(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_add_s_equals_brute_force_and_kd_tree(near: bool) -> None:
-    R_est, t_est, R_gt, t_gt = poses(7, 2, near)
-    points = cloud(150)
-    estimated, true = placed(R_est, t_est, points), placed(R_gt, t_gt, points)
-    pairs = true[:, :, None] - estimated[:, None]  # from TRUE points to estimated ones
-    brute = np.sqrt((pairs**2).sum(-1)).min(axis=2).mean(axis=1)
-    tree = [KDTree(e).query(g)[0].mean() for e, g in zip(estimated, true, strict=True)]
-    result = add_s(R_est, t_est, R_gt, t_gt, points)
-    np.testing.assert_allclose(result, brute, rtol=REL)
-    np.testing.assert_allclose(result, tree, rtol=REL)
-
-
 def test_add_s_runs_from_true_points_to_estimated_ones() -> None:
     # Points 0 and 1 on a line, the estimate shrunk to one end: true point 1 is 1 away from it,
     # while seen from the estimate every point would lie on a true one.
@@ -89,20 +71,8 @@ def test_add_s_runs_from_true_points_to_estimated_ones() -> None:
     assert add_s(0 * eye, zero, eye, zero, points).item() == pytest.approx(0.5, rel=REL)
 
 
-def test_add_s_with_rotations_rounded_to_float32_and_with_improper_ones() -> None:
-    R_est, t_est, R_gt, t_gt = poses(6, 3, near=True)
-    points = cloud(200)
-    for R in (R_est.float().double(), R_est * torch.tensor([1.0, 1.3, 0.8]).double()):
-        expected = [
-            KDTree(e).query(g)[0].mean()
-            for e, g in zip(placed(R, t_est, points), placed(R_gt, t_gt, points), strict=True)
-        ]
-        np.testing.assert_allclose(add_s(R, t_est, R_gt, t_gt, points), expected, rtol=REL)
-
-
 def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     pose, points = poses(9, 4), cloud(64)
-    K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     whole = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
     monkeypatch.setattr("dopepp.metrics.functional.inputs._CHUNK_POINTS", 128)
     parts = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
@@ -125,50 +95,28 @@ def test_a_pure_translation_is_its_own_length(shift: Array, rotvec: Array) -> No
     assert add_s(R, moved, R, t, cloud(20)).item() <= add(R, moved, R, t, cloud(20)).item() + 1e-15
 
 
-def test_identical_poses_have_no_error() -> None:
-    R, t, _, _ = poses(3, 5)
-    K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
-    for error in (
-        add(R, t, R, t, cloud(30)),
-        add_s(R, t, R, t, cloud(30)),
-        reprojection_error(R, t, R, t, cloud(30), K),
-        translation_error(t, t),
-    ):
-        assert error.tolist() == [0, 0, 0]
-    assert rotation_error_deg(R, R).max() < 1e-13
-
-
-def test_add_s_of_a_symmetric_object_is_zero() -> None:
-    square = torch.tensor([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]).double()
-    quarter = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())[None]
-    eye, zero = torch.eye(3).double()[None], torch.zeros(1, 3).double()
-    assert add_s(quarter, zero, eye, zero, square).item() == pytest.approx(0, abs=1e-15)
-    assert add(quarter, zero, eye, zero, square).item() == pytest.approx(2, rel=REL)
-
-
 def test_reprojection_error_equals_opencv() -> None:
     R_est, t_est, R_gt, t_gt = poses(5, 6)
     points = cloud(40)
-    K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
+    camera = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
 
     def pixels(R: Tensor, t: Tensor) -> Array:
         rvec = cv2.Rodrigues(R.numpy())[0]
-        return np.asarray(cv2.projectPoints(points.numpy(), rvec, t.numpy(), K, None)[0])[:, 0]
+        return np.asarray(cv2.projectPoints(points.numpy(), rvec, t.numpy(), camera, None)[0])[:, 0]
 
     expected = [
         np.linalg.norm(pixels(R_est[i], t_est[i]) - pixels(R_gt[i], t_gt[i]), axis=1).mean()
         for i in range(5)
     ]
-    result = reprojection_error(R_est, t_est, R_gt, t_gt, points, torch.from_numpy(K))
+    result = reprojection_error(R_est, t_est, R_gt, t_gt, points, torch.from_numpy(camera))
     np.testing.assert_allclose(result, expected, rtol=REL)
-    each = torch.from_numpy(np.tile(K, (5, 1, 1)))
+    each = torch.from_numpy(np.tile(camera, (5, 1, 1)))
     torch.testing.assert_close(reprojection_error(R_est, t_est, R_gt, t_gt, points, each), result)
 
 
 def test_a_point_behind_the_camera_makes_the_reprojection_infinite() -> None:
     R, t, _, _ = poses(2, 7)
     behind = t * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
-    K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     errors = reprojection_error(R, behind, R, t, cloud(5), K)
     assert errors[0] == 0
     assert errors[1] == math.inf
@@ -200,7 +148,6 @@ def test_rotation_error_keeps_its_digits_at_both_ends(degrees: float) -> None:
 def test_a_pose_that_is_not_finite_is_a_miss(bad: float, which: int) -> None:
     pose = [tensor.clone() for tensor in poses(3, 8)]
     pose[which][1] = bad
-    K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     for errors in (
         add(*pose, cloud(10)),
         add_s(*pose, cloud(10)),
@@ -254,122 +201,3 @@ def test_single_precision_inputs_are_computed_in_double() -> None:
     assert result.dtype == torch.float64
     expected = add(*(t.double() for t in rounded), cloud(10).float().double())
     assert torch.equal(result, expected)
-
-
-def voc_loop(errors: list[float], maximum: float) -> float:
-    """YCB-Video's rule, written from its description: right-sided rectangles over sorted errors."""
-    total, previous, found = 0.0, 0.0, 0
-    for error in sorted(e for e in errors if e <= maximum):
-        found += 1
-        total += (error - previous) * found / len(errors)
-        previous = error
-    if found == 0:
-        return 0.0
-    return (total + (maximum - previous) * found / len(errors)) / maximum
-
-
-ERRORS = st.lists(
-    st.one_of(st.floats(0, 0.2), st.sampled_from([0.0, 0.05, 0.1, math.inf])), max_size=30
-)
-
-
-@given(ERRORS)
-@settings(deadline=None, max_examples=80)
-def test_auc_equals_loops(errors: list[float]) -> None:
-    values = torch.tensor(errors, dtype=torch.float64)
-    exact = sum(min(max(1 - e / 0.1, 0), 1) for e in errors) / max(len(errors), 1)
-    assert auc(values, 0.1) == pytest.approx(exact, rel=REL, abs=1e-15)
-    voc = auc(values, 0.1, "voc")
-    assert voc == pytest.approx(voc_loop(errors, 0.1), rel=REL, abs=1e-15)
-    hits = [e for e in errors if e <= 0.1]
-    if hits:  # the documented difference between the two
-        assert voc - exact == pytest.approx(max(hits) / (len(errors) * 0.1), rel=1e-6, abs=1e-12)
-
-
-def test_exact_auc_is_the_area_under_the_pass_rate() -> None:
-    errors = torch.from_numpy(np.random.default_rng(0).exponential(0.05, 40))
-    edges = np.concatenate([[0], np.sort(errors[errors < 0.1]), [0.1]])
-    # Between two errors the strict pass rate is constant, so the sum of rectangles is exact.
-    rates = [pass_rate(errors, (a + b) / 2) for a, b in itertools.pairwise(edges)]
-    assert auc(errors, 0.1) == pytest.approx(np.diff(edges) @ rates / 0.1, rel=REL)
-
-
-@pytest.mark.parametrize("method", ["exact", "voc"])
-@pytest.mark.parametrize("errors", [[], [math.inf, math.inf], [math.nan], [0.3]])
-def test_auc_without_a_hit_is_zero(method: str, errors: list[float]) -> None:
-    values = torch.tensor(errors, dtype=torch.float64)
-    assert auc(values, 0.1, method) == 0.0  # type: ignore[arg-type]
-
-
-def test_auc_limits() -> None:
-    assert auc(torch.zeros(4), 0.1) == 1.0
-    assert auc(torch.zeros(4), 0.1, "voc") == 1.0
-    assert auc(torch.tensor([0.05, math.inf]), 0.1) == pytest.approx(0.25, rel=1e-7)
-
-
-def test_auc_refuses_other_methods_and_empty_ranges() -> None:
-    with pytest.raises(UserError, match="got auc method 'coco'; allowed: exact, voc"):
-        auc(torch.zeros(1), 0.1, "coco")  # type: ignore[arg-type]
-    with pytest.raises(UserError, match="got max_threshold=0"):
-        auc(torch.zeros(1), 0)
-
-
-def test_pass_rate_is_strict_and_misses_count() -> None:
-    errors = torch.tensor([0.0, 0.05, 0.1, math.inf, math.nan], dtype=torch.float64)
-    assert pass_rate(errors, 0.05) == 0.2
-    assert pass_rate(errors, 0.1) == 0.4
-    assert pass_rate(torch.empty(0), 0.1) == 0.0
-    assert pass_rate(errors[3:], 0.1) == 0.0
-
-
-def test_match_goes_by_score_not_by_distance() -> None:
-    # The better score takes the instance, though the other prediction is nearer to it.
-    distances = torch.tensor([[0.01, 0.5], [0.05, 0.5]])
-    assert match(torch.tensor([0.3, 0.9]), distances).tolist() == [-1, 0]
-
-
-def test_match_gives_what_is_left_to_the_next() -> None:
-    distances = torch.tensor([[0.01, 0.05], [0.02, 0.09], [0.03, 0.04]])
-    assert match(torch.tensor([0.9, 0.8, 0.7]), distances).tolist() == [0, 1, -1]
-
-
-def test_match_breaks_ties_by_order_and_includes_the_limit() -> None:
-    assert match(torch.ones(2), torch.full((2, 2), 0.1, dtype=torch.float64)).tolist() == [0, 1]
-    assert match(torch.ones(1), torch.tensor([[0.1000001]])).tolist() == [-1]
-    assert match(torch.ones(1), torch.tensor([[0.02, 0.02]])).tolist() == [0]
-
-
-def test_match_of_nothing_and_of_nan() -> None:
-    assert match(torch.empty(0), torch.empty(0, 3)).tolist() == []
-    assert match(torch.ones(2), torch.empty(2, 0)).tolist() == [-1, -1]
-    nan = torch.tensor([[math.nan, 0.02], [0.01, math.nan]])
-    assert match(torch.tensor([math.nan, 0.1]), nan).tolist() == [1, 0]
-    with pytest.raises(ValueError, match="2 scores need as many rows"):
-        match(torch.ones(2), torch.zeros(3, 1))
-
-
-@given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
-@settings(deadline=None, max_examples=60)
-def test_match_equals_a_plain_loop(p: int, g: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    scores, distances = rng.random(p), rng.uniform(0, 0.2, (p, g))
-    expected, taken = [-1] * p, set()
-    for i in sorted(range(p), key=lambda i: -scores[i]):
-        near = sorted((distances[i, j], j) for j in range(g) if j not in taken)
-        if near and near[0][0] <= 0.1:
-            expected[i] = near[0][1]
-            taken.add(near[0][1])
-    assert match(torch.from_numpy(scores), torch.from_numpy(distances)).tolist() == expected
-
-
-def test_real_ycb_points(ycb_root) -> None:  # type: ignore[no-untyped-def]
-    points = np.loadtxt(ycb_root / "models" / "003_cracker_box" / "points.xyz")
-    R_est, t_est, R_gt, t_gt = poses(2, 10, near=True)
-    difference = [
-        (points @ R_est[i].numpy().T + t_est[i].numpy())
-        - (points @ R_gt[i].numpy().T + t_gt[i].numpy())
-        for i in range(2)
-    ]
-    expected = np.linalg.norm(difference, axis=2).mean(axis=1)
-    result = add(R_est, t_est, R_gt, t_gt, torch.from_numpy(points))
-    np.testing.assert_allclose(result, expected, rtol=REL)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.metrics.functional import add, add_s, mspd, mssd, rotation_error_deg
+from dopepp.metrics.functional import add_s, mspd, mssd, rotation_error_deg
 from dopepp.metrics.functional.distances import compare_all_pairs
 from dopepp.metrics.functional.symmetric import _try_everything
 
@@ -108,19 +108,6 @@ def test_mspd_ignores_the_last_row_of_k() -> None:
     np.testing.assert_array_equal(mspd(*arguments, odd), mspd(*arguments, torch.from_numpy(K)))
 
 
-def test_a_symmetric_pose_has_no_error() -> None:
-    R, t = Rotation.random(5, random_state=1).as_matrix(), np.tile([0.1, 0.0, 0.8], (5, 1))
-    S = half_turn()
-    turned = tensors(R @ S[:3, :3], t + R @ S[:3, 3], R, t)
-    group = torch.from_numpy(symmetry_group(S[None]))
-    points = torch.from_numpy(cloud(40))
-    assert float(mssd(*turned, points).min()) > 0.01
-    assert float(mssd(*turned, points, group).max()) < 1e-12
-    assert float(mspd(*turned, points, torch.from_numpy(K), group).max()) < 1e-9
-    np.testing.assert_allclose(rotation_error_deg(turned[0], turned[2]), 180, rtol=1e-9)
-    assert float(rotation_error_deg(turned[0], turned[2], group).max()) < 1e-6
-
-
 def test_symmetries_are_taken_as_they_are() -> None:
     R, t = torch.eye(3).double()[None], torch.tensor([[0.0, 0.0, 1.0]])
     only_half_turn = torch.from_numpy(half_turn()[None])
@@ -165,11 +152,6 @@ def test_add_s_is_exact_for_any_matrix(seed: int, count: int, scale: float) -> N
     R_est, t_est, R_gt, t_gt, points = inputs
     pairs = compare_all_pairs(R_est, R_gt, t_gt - t_est, points)
     np.testing.assert_allclose(pairs, expected, rtol=1e-9, atol=1e-15)
-
-
-def test_add_s_never_exceeds_add() -> None:
-    inputs = tensors(*poses(50, 5), cloud(300))
-    assert bool((add_s(*inputs) <= add(*inputs) + 1e-12).all())
 
 
 def test_group_of_a_can() -> None:

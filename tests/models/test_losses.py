@@ -131,16 +131,6 @@ def test_leaves_the_plateau_within_a_few_steps():
     assert activated.amax(-1).min() > 0.5
 
 
-def test_several_instances_share_a_channel():
-    belief = torch.maximum(gaussian(3, 3), gaussian(12, 11))[None, None]
-    logits = belief.clamp(min=math.exp(NOTHING)).log().requires_grad_()
-    field = torch.zeros(1, 16, 16, 16)
-    total, _ = SpatialCrossEntropy(SIGMA)([(logits, field)], belief, field)
-    total.backward()
-    assert abs(total.item()) < 1e-5
-    assert logits.grad.abs().max() < 1e-5
-
-
 def test_field_error_counts_only_inside_the_discs():
     belief, target = targets()
     inside = (target != 0).float()
@@ -174,11 +164,6 @@ def test_terms_are_float32_under_autocast_and_stages_add_up(loss):
     two.backward()
 
 
-def test_losses_name_their_activation():
-    assert MapMSE.activation == "identity"
-    assert SpatialCrossEntropy.activation == "exp"
-
-
 @pytest.mark.parametrize(
     "arguments",
     [{"sigma": 0}, {"sigma": float("nan")}, {"sigma": 1, "count_weight": -1}, {"sigma": "2"}],
@@ -186,3 +171,25 @@ def test_losses_name_their_activation():
 def test_arguments_are_checked(arguments):
     with pytest.raises(UserError, match=list(arguments)[-1]):
         SpatialCrossEntropy(**arguments)
+
+
+@pytest.mark.parametrize("loss", [MapMSE(), SpatialCrossEntropy(1.0, field_weight=0.2)])
+def test_losses_of_the_images_have_the_loss_as_their_mean(loss) -> None:
+    generator = torch.Generator().manual_seed(3)
+    belief, field = torch.rand(4, 9, 8, 8, generator=generator), torch.zeros(4, 16, 8, 8)
+    field[:, :, 2:5, 2:5] = 0.7
+    stages = [(torch.randn(4, 9, 8, 8, generator=generator), 0.1 * field) for _ in range(2)]
+    stages[0][0].requires_grad_()
+    images = loss.per_image(stages, belief, field)
+    assert images.shape == (4,)
+    assert not images.requires_grad
+    assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
+
+
+def test_an_image_is_charged_for_itself_alone() -> None:
+    belief, field = torch.rand(3, 9, 8, 8), torch.ones(3, 16, 8, 8)
+    wrong = belief.clone()
+    wrong[1] += 0.5
+    assert MapMSE().per_image([(wrong, field)], belief, field).tolist() == pytest.approx(
+        [0, 0.25, 0]
+    )

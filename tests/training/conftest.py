@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint.schema import Checkpoint
@@ -24,6 +26,7 @@ from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
 
 INPUT_SIZE = (128, 128)
+NOISE_SIZE = 32
 SystemMaker = Callable[..., PoseSystem]
 
 
@@ -65,7 +68,7 @@ def make_system(part: Part) -> SystemMaker:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_datamodule(part: Part) -> Callable[[], PoseDataModule]:
     """Eight training and three validation renders in batches of two."""
 
@@ -79,14 +82,58 @@ def make_datamodule(part: Part) -> Callable[[], PoseDataModule]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def batch(make_datamodule: Callable[[], PoseDataModule]) -> Batch:
-    """Two rendered images."""
+    """Two rendered images; not to be changed."""
     first: Batch = next(iter(make_datamodule().val_dataloader()))
     return first
 
 
-@pytest.fixture
+class Noise:
+    """A source of pictures that are others in every epoch and cost nothing."""
+
+    name = "noise"
+
+    def __init__(self, num_images: int, part: Part) -> None:
+        self.num_images, self.part = num_images, part
+
+    def __len__(self) -> int:
+        return self.num_images
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        rng = np.random.default_rng([epoch, index])
+        image = rng.integers(0, 255, (NOISE_SIZE, NOISE_SIZE, 3), np.uint8)
+        keypoints = rng.uniform(0, NOISE_SIZE, (9, 2))
+        return Sample(image, np.eye(3), [Instance(self.part.name, np.eye(4), keypoints)])
+
+    def describe(self) -> list[SourceInfo]:
+        return []
+
+    def contains(self, label: str) -> bool:
+        return True
+
+
+@pytest.fixture(scope="session")
+def make_noise(part: Part) -> Callable[[], PoseDataModule]:
+    """Eight training and four validation pictures of noise in batches of two."""
+
+    def make() -> PoseDataModule:
+        sources = [Noise(number, part) for number in (8, 4, 1)]
+        return PoseDataModule(*sources, [part.name], (NOISE_SIZE, NOISE_SIZE), batch_size=2)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def read_csv() -> Callable[[Path], list[dict[str, str]]]:
+    def read(path: Path) -> list[dict[str, str]]:
+        with path.open(newline="") as stream:
+            return list(csv.DictReader(stream))
+
+    return read
+
+
+@pytest.fixture(scope="session")
 def read_png() -> Callable[[Path], np.ndarray]:
     def read(path: Path) -> np.ndarray:
         import cv2

@@ -18,6 +18,14 @@ def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes
     return subprocess.Popen([sys.executable, "-c", code])
 
 
+def run(script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True, text=True, timeout=100, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+
+
 def test_a_death_is_told_with_its_cause() -> None:
     quiet, killed = sleeper(), sleeper()
     failed, done = sleeper("raise SystemExit(3)"), sleeper("pass")
@@ -48,11 +56,7 @@ def test_what_hangs_is_ended_from_outside() -> None:
         processes.Watch([child], None).start()
         time.sleep(120)
     """
-    ended = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        capture_output=True, text=True, timeout=100, check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+    ended = run(script)
     assert ended.returncode == 1
     assert ended.stderr.endswith("was killed by signal 9: the run ends\n")
 
@@ -79,9 +83,5 @@ def test_a_child_sees_that_its_parent_is_gone() -> None:
         time.sleep(1)
         os.kill(os.getpid(), 9)
     """
-    ended = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        capture_output=True, text=True, timeout=100, check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+    ended = run(script)
     assert "(rank 0 on this machine) has died" in ended.stdout

@@ -1,18 +1,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler, OneCycleLR
 
-from dopepp.data.batch import PADDING, Batch
+from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Part
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
@@ -20,63 +21,6 @@ from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 SystemMaker = Callable[..., PoseSystem]
-
-
-def test_targets_have_the_stride_and_a_peak_per_keypoint(
-    make_system: SystemMaker, batch: Batch
-) -> None:
-    belief, field = make_system().targets(batch)
-    assert belief.shape == (2, 9, 16, 16)
-    assert field.shape == (2, 16, 16, 16)
-    inside = ((batch.keypoints[:, 0] >= 0) & (batch.keypoints[:, 0] <= 127)).all(-1)
-    assert (belief.amax((2, 3))[inside] > 0.7).all()
-    # The largest cell is the one that holds the keypoint.
-    cell = (batch.keypoints[:, 0] + 0.5).div(8, rounding_mode="floor")
-    peak = belief.flatten(2).argmax(2)
-    expected = cell[..., 1] * 16 + cell[..., 0]
-    assert torch.equal(peak[inside], expected[inside].long())
-
-
-def test_hardly_visible_instances_and_padding_leave_empty_channels(
-    make_system: SystemMaker, batch: Batch
-) -> None:
-    system = make_system()
-    hidden = replace(batch, visible_fraction=torch.tensor([[0.0999], [0.1001]]))
-    belief, field = system.targets(hidden)
-    assert belief[0].abs().sum() == 0
-    assert field[0].abs().sum() == 0
-    assert belief[1].max() > 0.7
-    padded = replace(batch, object_index=torch.full_like(batch.object_index, PADDING))
-    assert system.targets(padded)[0].abs().sum() == 0
-
-
-def test_an_instance_fills_its_own_objects_channels_only(
-    make_system: SystemMaker, batch: Batch
-) -> None:
-    system = make_system(num_objects=2)
-    second = replace(batch, object_index=torch.tensor([[0], [1]]))
-    belief, field = system.targets(second)
-    assert belief.shape[1] == 18
-    assert [bool(belief[row, 9 * c : 9 * c + 9].any()) for row in (0, 1) for c in (0, 1)] == [
-        True, False, False, True,
-    ]  # fmt: skip
-    assert not field[0, 16:].any()
-    assert not field[1, :16].any()
-
-
-def test_the_loss_falls_on_a_fixed_batch(make_system: SystemMaker, batch: Batch) -> None:
-    system = make_system()
-    targets = system.targets(batch)
-    optimizer = system.make_optimizer(system.network.parameters())
-    losses = []
-    for _ in range(40):
-        optimizer.zero_grad()
-        loss, terms = system.loss(system(batch.images), *targets)
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.75 * losses[0]
-    assert all(torch.isfinite(term) for term in terms.values())
 
 
 def fit(
@@ -104,20 +48,18 @@ def fit(
 
 
 def test_a_checkpoint_describes_itself_and_predicts(
-    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule], tmp_path: Path
+    make_system: SystemMaker, make_noise: Callable[[], PoseDataModule], tmp_path: Path
 ) -> None:
-    system, data = make_system(), make_datamodule()
-    fit(system, data, tmp_path)
+    system = make_system()
+    fit(system, make_noise(), tmp_path)
     path = tmp_path / "checkpoints" / "best.ckpt"
-    content = torch.load(path, weights_only=True)
-    assert content["dopepp"] == system.payload
-    assert content["dopepp"]["parts"][0]["name"] == "pivconnector"
-
+    assert torch.load(path, weights_only=True)["dopepp"] == system.payload
     estimator = PoseEstimator.load(path)
+    assert [part.name for part in estimator.checkpoint.parts] == ["pivconnector"]
     for name, value in system.network.state_dict().items():
         assert torch.equal(value, estimator.network.state_dict()[name]), name
-    sample = data.test_source.sample(0)
-    assert isinstance(estimator.predict(sample.image, sample.K), list)
+    image = np.zeros((96, 128, 3), np.uint8)
+    assert isinstance(estimator.predict(image, camera_matrix(110.0, 110.0, 63.5, 47.5)), list)
 
 
 def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> LRScheduler:
@@ -128,11 +70,11 @@ def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> LRScheduler:
     return CosineAnnealingLR(optimizer, T_max=num_steps)
 
 
-@pytest.mark.parametrize("schedule", [one_cycle, pytest.param(cosine, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("schedule", [one_cycle, cosine])
 def test_a_run_resumed_for_longer_follows_the_longer_schedule(
     schedule: Callable[[torch.optim.Optimizer, int], LRScheduler],
     make_system: SystemMaker,
-    make_datamodule: Callable[[], PoseDataModule],
+    make_noise: Callable[[], PoseDataModule],
     tmp_path: Path,
 ) -> None:
     """A schedule that had ended neither fails nor stays at a learning rate of zero."""
@@ -148,7 +90,7 @@ def test_a_run_resumed_for_longer_follows_the_longer_schedule(
         system = make_system(system_class=Watched, make_scheduler=schedule, make_optimizer=adam)
         assert isinstance(system, Watched)
         system.rates = []
-        fit(system, make_datamodule(), tmp_path / folder, epochs, resume)
+        fit(system, make_noise(), tmp_path / folder, epochs, resume)
         return system.rates
 
     whole = run("whole", 2)
@@ -162,13 +104,8 @@ def test_a_run_resumed_for_longer_follows_the_longer_schedule(
 
 
 def test_recover_names_the_parts(make_system: SystemMaker, batch: Batch, part: Part) -> None:
-    system = make_system().eval()
-    with torch.no_grad():
-        logits, field = system(batch.images)[-1]
-    belief, target_field = system.targets(batch)
-    output = ValidationOutput(torch.tensor(0.0), belief, target_field)
-    assert logits.shape == belief.shape
-    assert field.shape == target_field.shape
+    system = make_system()
+    output = ValidationOutput(torch.tensor(0.0), *system.targets(batch))
     for detections, truth in zip(system.recover(output, batch), batch.T_cam_obj, strict=True):
         assert [one.object for one in detections] == [part.name]
         offset = detections[0].T_cam_obj[:3, 3] - truth[0, :3, 3].numpy()

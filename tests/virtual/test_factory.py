@@ -151,11 +151,8 @@ def test_a_renamed_built_in_part_is_no_negative() -> None:
 
 
 def test_seed_epoch_and_index_all_matter() -> None:
-    digests = {
-        digest(make_factory(seed).render(epoch, index))
-        for seed in (0, 1) for epoch in (0, 1) for index in (0, 1)
-    }  # fmt: skip
-    assert len(digests) == 8
+    factories, places = [make_factory(0), make_factory(1)], [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert len({digest(one.render(*place)) for one in factories for place in places}) == 8
 
 
 def test_import_is_free_of_torch() -> None:

@@ -48,7 +48,7 @@ def check(scene: Scene) -> Rendered:
     return rendered
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 100_000))
 def test_any_triangle_soup(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -102,12 +102,12 @@ def test_nothing_but_faces_without_area(scene_of: MakeScene) -> None:
 
 
 def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of: MakeScene) -> None:
-    # All pairs of these faces would take a minute.
-    count = 60_000
+    # All pairs of these faces would take minutes.
+    count = 150_000
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
     around = np.arange(1, count + 1)
     faces = np.stack([np.zeros(count), around, np.roll(around, -1)], axis=1).astype(np.int32)
     surface = make_surface(Mesh(np.vstack([[0, 0, 0.2], rim]) * 0.1, faces))
     pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.4]))
-    assert check(scene_of(SceneObject(surface, pose))).depth.max() > 0.3
+    assert render(scene_of(SceneObject(surface, pose))).depth.max() > 0.3

@@ -89,15 +89,6 @@ def test_motion_blur_is_the_mean_of_shifted_pictures(
     assert np.abs(blurred - np.mean(shifts, axis=0)).max() < 2.0
 
 
-def test_motion_blur_stays_in_place() -> None:
-    point = np.zeros((41, 41, 3), np.uint8)
-    point[20, 20] = 255
-    blurred = motion_blur(point, (9.0, 4.0))[..., 0].astype(float)
-    rows, columns = np.mgrid[:41, :41]
-    assert (blurred * rows).sum() / blurred.sum() == pytest.approx(20, abs=0.05)
-    assert (blurred * columns).sum() / blurred.sum() == pytest.approx(20, abs=0.05)
-
-
 @pytest.mark.parametrize(("level", "read", "shot"), [(128, 6, 0), (40, 0, 8), (200, 3, 5)])
 def test_noise_has_the_stated_spread(level: int, read: float, shot: float) -> None:
     flat = np.full((300, 400, 3), level, np.uint8)
@@ -168,9 +159,3 @@ def test_everything_off_is_the_zero_sensor() -> None:
     )  # fmt: skip
     drawn = off.draw(np.random.default_rng(1))
     assert drawn == Sensor(noise_seed=drawn.noise_seed)
-
-
-def test_a_resized_camera_blurs_in_proportion() -> None:
-    half = Sensors(blur_px=(0.4, 1.0), motion_px=(2.0, 6.0)).resized(0.5)
-    assert half.blur_px == (0.2, 0.5)
-    assert half.motion_px == (1.0, 3.0)

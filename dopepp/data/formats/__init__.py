@@ -1,9 +1,12 @@
-"""What every writer of a data set offers, so that a render job can be stopped at any moment.
+"""What the layouts share: shares of a data set's items, and writers that can be stopped any moment.
 
 Items are written one by one and finalized chunk by chunk. An item's last file is its marker, so
 what is there is complete; files that a chunk's items share (``scene_gt.json``, a tar shard) are
-assembled when all of them are there. To add a format, write such a class and one line in
-``WRITERS`` of :mod:`dopepp.data.jobs.work`.
+assembled when all of them are there, from items that are staged in a hidden folder until then.
+
+To add a format, write a folder beside these with a source (:mod:`dopepp.data.sample`) that reports
+to a :class:`~dopepp.data.formats.problems.Problems`, a check (:mod:`dopepp.data.check`), and, if it
+is to be rendered, a :class:`Writer` and one line in ``WRITERS`` of :mod:`dopepp.data.jobs.job`.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
+from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.sample import Sample
 
@@ -59,6 +63,27 @@ class Writer(Protocol):
         Idempotent and atomic; two processes may do it at once, and a finalized chunk may be
         finalized again when later items have been added to it.
         """
+
+
+def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
+    """Return which of ``num_items`` items a share given in fractions is.
+
+    Both bounds are rounded alike, so shares that meet in a fraction neither overlap nor leave out.
+
+    Raises:
+        ValueError: The fractions are not ascending in [0, 1].
+        UserError: No item falls into the share.
+    """
+    first, last = part_of
+    if not 0 <= first < last <= 1:
+        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
+    chosen = slice(round(first * num_items), round(last * num_items))
+    if chosen.start == chosen.stop:
+        raise UserError(
+            f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images",
+            "a folder with more images", "give every split a folder of its own",
+        )  # fmt: skip
+    return chosen
 
 
 def stage(path: Path, content: bytes) -> None:

@@ -291,11 +291,13 @@ def picture_shape(
     it does not.
     """
     picture(problems, path, content)
+    file = Path(path) if content is None else io.BytesIO(content)
     try:
-        stated = Image.open(Path(path) if content is None else io.BytesIO(content), formats=FORMATS)
+        with Image.open(file, formats=FORMATS) as stated:
+            width, height = stated.size
     except Exception:  # said above
         return None
-    return (stated.height, stated.width) if 0 < stated.width * stated.height <= MAX_PIXELS else None
+    return (height, width) if 0 < width * height <= MAX_PIXELS else None
 
 
 def read_map(path: Path, shape: tuple[int, int]) -> NDArray[Any]:

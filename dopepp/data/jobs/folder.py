@@ -1,4 +1,8 @@
-"""The folder of a render job: its record, and what killed processes left in it."""
+"""The folder of a render job: its record, and what killed processes left in it.
+
+The record is written into the folder first; whoever comes later with another one is refused, by
+the fields that differ.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +18,13 @@ from dopepp.core.interrupts import NO_SPACE, stopped
 from dopepp.core.json import read_json
 
 RECORD_FILE: Final = "_dopepp_render.json"
-
-
 """The underscore is NDDS's mark of a settings file: without it, readers of that layout would take
 the record for an image's annotation."""
 
-
 _MAX_RECORD_BYTES: Final = 4_000_000
-
-
 """Some 10,000 parts."""
 
-
 _MAX_DIFFERENCES: Final = 3
-
-
 """As many as one line can hold."""
 
 
@@ -39,10 +35,6 @@ def is_begun(root: Path) -> bool:
 
 def begin(root: Path, record: Mapping[str, Any]) -> None:
     """Claim a folder for a job, or find that it is this job's already, and clean it.
-
-    Args:
-        root: The folder; made if it is not there.
-        record: What decides the job's bytes, as plain values.
 
     Raises:
         UserError: The folder cannot be written, holds another job or something else.
@@ -86,19 +78,16 @@ def _claim(root: Path, record: Mapping[str, Any]) -> None:
 def _differences(there: object, now: object, where: str) -> Iterator[str]:
     """Yield every field that differs, with both values."""
     if isinstance(there, dict) and isinstance(now, dict):
-        for key in [*now, *(key for key in there if key not in now)]:
+        for key in now | there:
             field = f"{where}.{key}" if where else str(key)
             yield from _differences(there.get(key), now.get(key), field)
     elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
         for number, pair in enumerate(zip(there, now, strict=True)):
             yield from _differences(*pair, f"{where}[{number}]")
     elif there != now:
-        yield f"{where or 'content'} is {_shown(there)} there and {_shown(now)} now"
-
-
-def _shown(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+        texts = (json.dumps(value) for value in (there, now))
+        before, after = (text if len(text) <= 60 else f"{text[:57]}..." for text in texts)
+        yield f"{where or 'content'} is {before} there and {after} now"
 
 
 def _remove_abandoned(root: Path) -> None:

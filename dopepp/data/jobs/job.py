@@ -1,16 +1,17 @@
-"""What a render job makes: everything that decides its bytes, as a factory and as a record.
+"""What a render job makes: a factory and a layout, from what a user writes, and their record.
 
-What decides a render job's bytes, as plain values: kept in the folder and compared later.
+The record holds, as plain values, everything that decides the job's bytes.
 
-The folder of a render job: its record, and what killed processes left in it.
+To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ import numpy as np
 import yaml
 
 from dopepp.core.errors import UserError
-from dopepp.data.jobs.work import find_writer
+from dopepp.data.formats import Writer
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ASSUMED_UNIT
 from dopepp.parts.part import Part, check_name
@@ -26,62 +27,18 @@ from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets.preset import customised_preset
 
+WRITERS: Final = {
+    "bop": ("dopepp.data.formats.bop.writer", "BopWriter"),
+    "ndds": ("dopepp.data.formats.ndds.writer", "NddsWriter"),
+    "webdataset": ("dopepp.data.formats.webdataset.writer", "WebdatasetWriter"),
+}
+"""Module and class of each layout's writer."""
+
 RECORD_VERSION: Final = 1
 """Of the record's layout."""
 
 _HASH_DIGITS: Final = 16
 """Of the hash of the code that renders, enough to tell versions apart."""
-
-
-def record_of(factory: Factory, layout: str, unit: str | None) -> dict[str, Any]:
-    """Describe a job by plain values, those that a user chooses first.
-
-    Args:
-        factory: Renders the images.
-        layout: Name of the data set's layout.
-        unit: Of the mesh files, as the user states it; None for the assumed one.
-
-    Returns:
-        What JSON can write; equal records give equal bytes.
-    """
-    return {
-        "record_version": RECORD_VERSION,
-        "format": layout,
-        "seed": factory.seed,
-        "renderer": factory.renderer,
-        "unit": unit or ASSUMED_UNIT,
-        "parts": [_part_record(part) for part in factory.parts],
-        "negatives": [_part_record(part) for part in factory.negatives],
-        "backgrounds": factory.backgrounds.identity(),
-        "preset": _plain(factory.preset),
-        "rendering_code": code_hash()[:_HASH_DIGITS],
-    }
-
-
-def _part_record(part: Part) -> dict[str, Any]:
-    """Describe a part by its name, its size and hashes of its shape and its texture."""
-    mesh = part.mesh
-    appearance = hashlib.sha256()
-    for array in () if mesh is None else (mesh.uv, mesh.texture):
-        if array is not None:
-            appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return {
-        "name": part.name,
-        "diameter": float(part.diameter),
-        "mesh_hash": part.mesh_hash,
-        "texture_hash": appearance.hexdigest(),
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Turn a preset into what JSON can write; groups of ranges keep their kind."""
-    if is_dataclass(value):
-        content = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
-        return {"kind": type(value).__name__} | content
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return value
-
 
 _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")
 """``NAME=FILE``; a name is not a path."""
@@ -93,13 +50,17 @@ class Job:
 
     Attributes:
         factory: Renders image (0, index).
-        layout: Name of the data set's layout.
+        layout: Key of :data:`WRITERS`.
         record: The settings as plain values; equal records give equal bytes.
     """
 
     factory: Factory
     layout: str
     record: Mapping[str, Any]
+
+    def writer(self, root: Path) -> Writer:
+        """Return a new writer into a folder."""
+        return _find_writer(self.layout)(root, self.factory.parts)
 
 
 def make_job(
@@ -119,7 +80,7 @@ def make_job(
 
     Args:
         parts: Built-in names, mesh files, or ``NAME=FILE`` where the file's name will not do.
-        unit: The files' unit.
+        unit: The mesh files' unit; None for the assumed one.
         preset: Name of a preset.
         changes: ``field.field=value``, the value as YAML.
         size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels; None for the preset's own.
@@ -127,12 +88,12 @@ def make_job(
         backgrounds: As :func:`~dopepp.virtual.backgrounds.find_backgrounds` takes it.
         negatives: Parts among the distractors, written as ``parts``.
         renderer: Name of a renderer.
-        layout: Name of a layout.
+        layout: Key of :data:`WRITERS`.
 
     Raises:
         UserError: Any of it cannot be used.
     """
-    find_writer(layout)
+    _find_writer(layout)
     scenes = customised_preset(preset, _nested(changes))
     factory = Factory(
         [named_part(text, unit) for text in parts],
@@ -142,7 +103,33 @@ def make_job(
         renderer=renderer,
         negatives=[named_part(text, unit) for text in negatives],
     )
-    return Job(factory, layout, record_of(factory, layout, unit))
+    # What a user chooses comes first: of several differences, the first are shown.
+    record = {
+        "record_version": RECORD_VERSION,
+        "format": layout,
+        "seed": factory.seed,
+        "renderer": factory.renderer,
+        "unit": unit or ASSUMED_UNIT,
+        "parts": [_part_record(part) for part in factory.parts],
+        "negatives": [_part_record(part) for part in factory.negatives],
+        "backgrounds": factory.backgrounds.identity(),
+        "preset": _plain(factory.preset),
+        "rendering_code": code_hash()[:_HASH_DIGITS],
+    }
+    return Job(factory, layout, record)
+
+
+def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
+    """Return the class of a layout's writer; its module is imported only now.
+
+    Raises:
+        UserError: The layout is unknown.
+    """
+    if layout not in WRITERS:
+        raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
+    module, name = WRITERS[layout]
+    writer: Callable[[Path, Sequence[Part]], Writer] = getattr(import_module(module), name)
+    return writer
 
 
 def named_part(text: str, unit: str | None) -> Part:
@@ -179,12 +166,35 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
                 f"--set {change:.200}", "FIELD.FIELD=VALUE, the value in YAML",
                 "write it like lighting.num_lights=[1,3]",
             )  # fmt: skip
-        node = tree
+        node: Any = tree
         for group in groups:
-            node = node.setdefault(group, {})
-            if not isinstance(node, dict):
-                break
+            node = node.setdefault(group, {}) if isinstance(node, dict) else None
         if not isinstance(node, dict) or field in node:
             raise UserError(f"--set {change} after another --set of {path}", "one each", "drop one")
         node[field] = value
     return tree
+
+
+def _part_record(part: Part) -> dict[str, Any]:
+    """Describe a part by its name, its size and hashes of its shape and its texture."""
+    mesh = part.mesh
+    appearance = hashlib.sha256()
+    for array in () if mesh is None else (mesh.uv, mesh.texture):
+        if array is not None:
+            appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return {
+        "name": part.name,
+        "diameter": float(part.diameter),
+        "mesh_hash": part.mesh_hash,
+        "texture_hash": appearance.hexdigest(),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Turn a preset into what JSON can write; groups of ranges keep their kind."""
+    if is_dataclass(value):
+        content = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+        return {"kind": type(value).__name__} | content
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value

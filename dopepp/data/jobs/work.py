@@ -1,8 +1,7 @@
 """A piece of a render job and what came of it, the same on every engine.
 
-To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
-
-Which images belong to a shard, and which of them are still to be made.
+A job's images lie in chunks, which are finalized when they are complete. A shard is a contiguous
+part of the job; it may begin and end within a chunk.
 """
 
 from __future__ import annotations
@@ -11,19 +10,17 @@ import pickle
 import re
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Final
 
 import cv2
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import Writer
 from dopepp.data.jobs.folder import RECORD_FILE, is_begun
-from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
-from dopepp.parts.part import Part
+from dopepp.data.jobs.job import Job
+from dopepp.data.sources.rendered import rendered_sample
 from dopepp.virtual.factory import Factory
 
 
@@ -78,16 +75,6 @@ class Chunk:
     missing: Sequence[int]
 
 
-def check_count(num_items: int) -> None:
-    """Refuse a number of images that no job can have.
-
-    Raises:
-        UserError: It is not in 1 … 10⁹.
-    """
-    if not 1 <= num_items <= MAX_ITEMS:
-        raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "change -n")
-
-
 def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
     """Yield the chunks that a shard touches, in order, also those that are complete."""
     span, size = shard.span(num_items), writer.chunk_size
@@ -101,56 +88,13 @@ def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
         yield Chunk(number, required, missing)
 
 
-WriterClass = Callable[[Path, Sequence[Part]], Writer]
-
-WRITERS: Final = {
-    "bop": ("dopepp.data.formats.bop.writer", "BopWriter"),
-    "ndds": ("dopepp.data.formats.ndds.writer", "NddsWriter"),
-    "webdataset": ("dopepp.data.formats.webdataset.writer", "WebdatasetWriter"),
-}
-"""Module and class of each layout's writer."""
-
-
-def find_writer(layout: str) -> WriterClass:
-    """Return a layout's writer; its module is imported only now.
-
-    Raises:
-        UserError: The layout is unknown.
-    """
-    if layout not in WRITERS:
-        raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
-    module, name = WRITERS[layout]
-    writer: WriterClass = getattr(import_module(module), name)
-    return writer
-
-
-@dataclass(frozen=True)
-class Work:
-    """What a process needs to know in order to do any task of a job.
-
-    Attributes:
-        factory: Renders the images.
-        layout: Key of :data:`WRITERS`.
-        root: The data set's folder, absolute.
-    """
-
-    factory: Factory
-    layout: str
-    root: Path
-
-    def writer(self) -> Writer:
-        """Return a new writer into the folder."""
-        return find_writer(self.layout)(self.root, self.factory.parts)
-
-
 @dataclass(frozen=True)
 class Task:
-    """A piece of the job.
+    """Images to render and write, or a chunk to finalize.
 
     Attributes:
         chunk: The chunk it belongs to.
-        indices: The images to render and write; for finalizing, those without which it must not
-            happen.
+        indices: The images; for finalizing, those without which it must not happen.
         finalizes: Whether the chunk is to be finalized.
     """
 
@@ -165,25 +109,25 @@ class Outcome:
 
     Attributes:
         task: The task.
-        finalized: Whether it finalized its chunk; false where images of it are still to come.
         render_s: CPU seconds that rendering took.
         write_s: CPU seconds that encoding and writing took.
         error: What went wrong.
+        node: Machine of a cluster that did it, by its id; empty for this one.
     """
 
     task: Task
-    finalized: bool = False
     render_s: float = 0.0
     write_s: float = 0.0
     error: Exception | None = None
+    node: str = ""
 
 
 class Worker:
     """Does tasks in one process, on one thread.
 
     Args:
-        content: A pickled :class:`Work`; unpickled with the first task, so that whatever is wrong
-            with it on this machine becomes that task's outcome.
+        content: A pickled job and the data set's folder; unpickled with the first task, so that
+            whatever is wrong with it on this machine becomes that task's outcome.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -195,7 +139,7 @@ class Worker:
         try:
             factory, writer = self._open()
             if task.finalizes:
-                return Outcome(task, finalized=_seal(writer, task))
+                return _finalize(writer, task)
             return _render(factory, writer, task)
         except (UserError, OSError) as error:
             return Outcome(task, error=error)
@@ -205,14 +149,16 @@ class Worker:
     def _open(self) -> tuple[Factory, Writer]:
         if self._opened is None:
             cv2.setNumThreads(1)
-            work: Work = pickle.loads(self._content)
-            if not is_begun(work.root):
+            job: Job
+            root: Path
+            job, root = pickle.loads(self._content)
+            if not is_begun(root):
                 raise UserError(
-                    f"{work.root} without {RECORD_FILE}, as one of the workers sees it",
+                    f"{root} without {RECORD_FILE}, as one of the workers sees it",
                     "a folder that every machine of the cluster sees under the same path",
                     "choose --out on a shared file system",
                 )
-            self._opened = work.factory, work.writer()
+            self._opened = job.factory, job.writer(root)
         return self._opened
 
 
@@ -225,13 +171,12 @@ def _render(factory: Factory, writer: Writer, task: Task) -> Outcome:
         writer.write(index, sample)
         render_s += middle - start
         write_s += time.process_time() - middle
-    return Outcome(task, render_s=render_s, write_s=write_s)
+    return Outcome(task, render_s, write_s)
 
 
-def _seal(writer: Writer, task: Task) -> bool:
-    """Seal a chunk with all it holds, unless an image that belongs to it is missing."""
+def _finalize(writer: Writer, task: Task) -> Outcome:
+    """Finalize a chunk with all it holds, unless images of it are still to come."""
     written = writer.written(task.chunk)
-    if not written.issuperset(task.indices):
-        return False
-    writer.finalize(task.chunk, sorted(written))
-    return True
+    if written.issuperset(task.indices):
+        writer.finalize(task.chunk, sorted(written))
+    return Outcome(task)

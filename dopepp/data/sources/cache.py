@@ -1,8 +1,11 @@
-"""Keep rendered images, in memory or in a file, so each is rendered once.
+"""A cache of rendered images, so that each is rendered once and not once an epoch.
 
-Cached renders ignore the epoch; masking and augmentation come after the cache and do not. All
-loader workers share one map of slots: forked workers inherit it, so it is never pickled. A file
-lasts longer than the run: the next one, and any other at the same time, goes on filling it.
+Kept is what the renderer gave in epoch 0; masking and augmentation are applied to what comes out of
+the cache, and still differ from epoch to epoch.
+
+The cache is one array with a slot for every item, in memory or in a file. Loader workers are forked
+and share it: what one of them renders, all can read. A file outlasts the run: later runs, and runs
+at the same time, read what is in it and fill what is not.
 """
 
 from __future__ import annotations
@@ -26,21 +29,22 @@ from dopepp.data.transforms.resize import resize_sample
 
 _TEXT_LENGTH: Final = 64
 _LAST_LABEL: Final = 255
-"""Masks are kept as one uint8 map: 0 background, i + 1 instance i."""
+"""Masks are kept as one uint8 map: 0 for the background, i + 1 for instance i."""
 
 _FILLED: Final = 1 << 32
-"""Bit beside a slot's CRC-32 that tells a filled slot from an empty one."""
+"""Added to a slot's CRC-32, which may be 0, so that only an empty slot has the checksum 0."""
 
 
 def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Allocate zeros that forked processes share; pages are committed when first written."""
+    """Return zeros that forked processes share; they take memory only where they are written."""
     return np.frombuffer(mmap.mmap(-1, dtype.itemsize * num_items), dtype)
 
 
 def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Map a file of zeros, or the one that is there; all its disk space is taken now.
+    """Map a file that is there, or else a new one of zeros, into memory.
 
-    A full disk is an error here; under a map with holes it would kill the process later.
+    All of its disk space is taken now: a disk that is full now is an error that can be told, and
+    one that becomes full under a map with holes kills the process.
 
     Raises:
         UserError: The file cannot be made as large as it must be.
@@ -67,20 +71,21 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
 
 
 class CachedSource:
-    """A source whose items of epoch 0 are kept, resized to the network's input size.
+    """A source that keeps another one's items of epoch 0, resized to the network's input size.
 
-    Any process fills any slot when it first needs it: the payload is written first, its checksum
-    last. Two processes that race write the same bytes, because an item is a pure function of its
-    index; a slot whose checksum is wrong (torn by a power cut) is filled again.
+    Whoever asks for an item first renders it and fills its slot: the content, then the content's
+    checksum. A slot counts as filled where its checksum is right, so one that was left half written
+    (a kill, a power cut) is filled again. No lock is needed: an item is a pure function of its
+    index, so two processes that fill one slot at once write the same bytes.
 
     Args:
         source: The source to keep, of images of one size.
         input_size: (width, height) the images are shrunk to fit in, so no more than that is kept;
             None keeps size and depth, which training does not need.
-        folder: Where to keep them across runs, in a subfolder named after everything that decides
-            the items; None keeps them in memory, for this run.
-        identity: What decides the items beside the source's own description, e.g. the version of
-            the code that renders them; a cache of another identity is not touched.
+        folder: Where to keep them across runs; None keeps them in memory, for this run. Each cache
+            has a subfolder, named by a hash of everything that decides the items.
+        identity: What decides them beside the source's own description, e.g. the version of the
+            code that renders them: items of another version are never read.
         max_instances: Instances a slot has room for, at most 255.
 
     Raises:

@@ -5,10 +5,8 @@ box high and wide; it is smaller where the background has no such window. The ne
 place the keypoints that the patch covers: keypoints stay as they are, while masks and visible
 fractions lose the covered pixels.
 
-Covering an object with crops of the image's own background, never with a solid colour.
-
-Training and the shading protocol (:mod:`dopepp.data.transforms.shading`) differ in where patches
-lie and how many there are; what a patch may show is decided here for both.
+The shading protocol (:mod:`dopepp.data.transforms.shading`) differs in where patches lie and how
+many there are; what a patch may show, :class:`BackgroundCrops` decides for both.
 """
 
 from __future__ import annotations

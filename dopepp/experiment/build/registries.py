@@ -97,6 +97,6 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
     return make
 
 
-def build_optional(gate: Registry[Any], node: Mapping[str, Any]) -> Any:
+def build_optional(registry: Registry[Any], node: Mapping[str, Any]) -> Any:
     """Build a node's object, or None where its choice is ``none`` (no target)."""
-    return None if node.get(TARGET) is None else gate.build(node)
+    return None if node.get(TARGET) is None else registry.build(node)

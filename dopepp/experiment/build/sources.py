@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
+from dopepp.core.machine import available_cores
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.ycb_video.frame import read_classes
@@ -99,19 +99,12 @@ def build_datamodule(data: DataConfig, parts: Sequence[Part], seed: int) -> Pose
         object_names=[part.name for part in parts],
         input_size=data.input_size,
         batch_size=data.batch_size,
-        num_workers=_num_cores() if data.num_workers is None else data.num_workers,
+        num_workers=available_cores() if data.num_workers is None else data.num_workers,
         seed=seed,
         masking=build_optional(MASKINGS, data.masking),
         augment=build_optional(AUGMENTATIONS, data.augment),
         backgrounds=backgrounds,
     )
-
-
-def _num_cores() -> int:
-    """Return the cores that this process may use, where the system tells (Linux), else all."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def build_test_source(data: DataConfig, parts: Sequence[Part]) -> DescribedSource:

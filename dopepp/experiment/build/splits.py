@@ -5,12 +5,12 @@ To add a format, write a source and one function in :data:`FORMATS`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
+from dopepp.core.machine import cache_folder
 from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.ndds.source import NddsSource
 from dopepp.data.formats.webdataset.source import WebdatasetSource
@@ -186,7 +186,4 @@ def _factory(
 
 
 def _cache_folder(chosen: str | None) -> Path:
-    if chosen is not None:
-        return Path(chosen)
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "dopepp" / "renders"
+    return cache_folder() / "renders" if chosen is None else Path(chosen)

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
 
 from dopepp.core.errors import UserError
@@ -108,13 +108,8 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
         ) from error
 
 
-def build_trainer(
-    config: RunConfig,
-    run_dir: Path,
-    further: Sequence[Callback] = (),
-    trackers: Sequence[Logger] = (),
-) -> Trainer:
-    """Build Lightning's trainer with the config's callbacks and further ones.
+def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
+    """Build Lightning's trainer with the config's callbacks.
 
     Trackers are loggers besides the CSV table that is always on.
 
@@ -148,7 +143,7 @@ def build_trainer(
             **arguments,
             default_root_dir=run_dir,
             logger=[table, *trackers],
-            callbacks=[*callbacks, *further, RunProgress()],
+            callbacks=[*callbacks, RunProgress()],
             # A checkpoint is never newer than the table.
             plugins=[AtomicCheckpointIO(prepare=table.write, folder=run_dir)],
             enable_model_summary=False,

@@ -166,9 +166,8 @@ def chosen_data(
     whole = "name" in given  # a file of conf/data, not single options
     if not whole and not isinstance(stored, dict):
         raise UserError(f"{source}, which names no data", "data=… on the command line", "add it")
-    how = base.get("virtual")
+    own, how = _without_copy(given, virtual), base.get("virtual")
     try:
-        own = _without_copy(given, virtual)
         merged = own if whole else _changed(_without_copy(base, how), own, "data")
         chosen = DataConfig.of(merged, None)
         if not virtual and how is None and not chosen.is_rendered("test"):
@@ -211,7 +210,7 @@ def _without_copy(data: Mapping[str, Any], virtual: object) -> dict[str, Any]:
     """Leave out what the node ``data`` says of ``virtual``; it may not say anything else."""
     copy = data.get("virtual")
     if copy is not None and copy != virtual:
-        raise UserError(f"data.virtual={copy!r:.100}", "the node virtual alone", "set virtual.…")
+        raise UserError(f"data.virtual={copy!r:.100}", "virtual.… alone", "set virtual.…")
     return {key: value for key, value in data.items() if key != "virtual"}
 
 

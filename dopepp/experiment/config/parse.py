@@ -25,8 +25,9 @@ from typing import (
     get_type_hints,
 )
 
+from dopepp.core.checks import check_flag, check_integer, check_number
 from dopepp.core.errors import UserError
-from dopepp.models.registry import TARGET, check_flag, check_integer, check_number
+from dopepp.models.registry import TARGET
 
 T = TypeVar("T")
 
@@ -59,13 +60,15 @@ def parse(kind: type[T], given: object, name: str = "", **known: Any) -> T:
             field's type or outside of its range.
     """
     own = {one.name: one for one in fields(kind) if one.name not in known}  # type: ignore[arg-type]
+    prefix, allowed = f"{name}." if name else "", ", ".join(own)
     if not isinstance(given, Mapping):
-        raise UserError(f"{name}={given!r:.100}", f"options: {', '.join(own)}", f"change {name}")
-    prefix = f"{name}." if name else ""
+        raise UserError(f"{name}={given!r:.100}", f"a mapping of {allowed}", f"change {name}")
     for key, value in given.items():
         if key not in own:
             raise UserError(
-                f"{prefix}{key}={value!r:.100}", ", ".join(own), "check the option's name"
+                f"{prefix}{key}={value!r:.100}",
+                allowed if name else "the options of `--cfg job`",
+                "check the option's name",
             )
     for key, one in own.items():
         if key not in given and one.default is MISSING and one.default_factory is MISSING:

@@ -88,7 +88,7 @@ class TrainerConfig:
 
     accelerator: str = "auto"
     devices: Any = 1
-    num_nodes: Any = 1
+    num_nodes: Annotated[int, Range(1, _MOST)] = 1
     strategy: str = "auto"
     precision: Any = "auto"
     max_epochs: Annotated[int, Range(1, _MAX_EPOCHS)]
@@ -99,11 +99,7 @@ class TrainerConfig:
 
     @classmethod
     def of(cls, node: Mapping[str, Any]) -> TrainerConfig:
-        """Read the node.
-
-        Raises:
-            UserError: An option of ours is missing, of a wrong type or out of range.
-        """
+        """Read the node; a :class:`UserError` tells what is wrong with an option of ours."""
         ours = {one.name for one in fields(cls)} - {"lightning"}
         return parse(
             cls,
@@ -117,15 +113,11 @@ class TrainerConfig:
         """Training processes, over all machines.
 
         Raises:
-            UserError: ``devices`` or ``num_nodes`` means nothing.
+            UserError: ``devices`` means nothing.
         """
         # Where torchrun has started this process, the others exist already.
         world_size = os.environ.get("WORLD_SIZE", "")
         outside = int(world_size) if world_size.isdecimal() else 1
-        if type(self.num_nodes) is not int or self.num_nodes < 1:
-            raise UserError(
-                f"trainer.num_nodes={self.num_nodes}", "a positive integer", "correct it"
-            )
         return max(outside, self.num_nodes * self._num_devices())
 
     def _num_devices(self) -> int:
@@ -262,21 +254,17 @@ class RunConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
-        """Read a composed and resolved config.
-
-        Raises:
-            UserError: An option is unknown, missing, of a wrong type or out of range.
-        """
+        """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
         plain = with_present_names(config)
         nodes = {
-            "data": DataConfig.of(plain["data"], plain["virtual"]),
-            "trainer": TrainerConfig.of(plain["trainer"]),
+            "data": DataConfig.of(plain.get("data"), plain.get("virtual")),
+            "trainer": TrainerConfig.of(plain.get("trainer") or {}),
         }
         return _parsed(cls, plain, ("virtual", *nodes), **nodes)
 
     def stored_data(self) -> dict[str, Any]:
         """Return what a checkpoint says of its data: the node ``data`` with ``virtual`` in it."""
-        return {**self.plain["data"], "virtual": self.plain["virtual"]}
+        return {**self.plain["data"], "virtual": self.plain.get("virtual")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,17 +300,14 @@ class EvaluationConfig(MeasurementConfig):
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
-        """Read a composed and resolved config.
-
-        Raises:
-            UserError: An option is unknown, missing, of a wrong type or out of range.
-        """
+        """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
         return _parsed(cls, with_present_names(config))
 
 
 def _parsed(kind: type[T], plain: Mapping[str, Any], read: Sequence[str] = (), **known: Any) -> T:
     """Parse a config, of which some nodes have been read, with what a measurement asks for."""
-    silent = {one.name: plain[one.name] for one in fields(FalsePositiveTarget)}
+    names = [one.name for one in fields(FalsePositiveTarget)]
+    silent = {name: plain[name] for name in names if name in plain}
     done = {*read, *silent, "shading", "scale_factors", "by", "num_bins"}
     return parse(
         kind,

@@ -2,17 +2,14 @@
 
 To add a launcher, write a :data:`Runner`, a class in ``hydra_plugins.dopepp_plugins.launchers`` and
 a file in ``conf/hydra/launcher``.
-
-Jobs in several processes of this machine.
-
-Jobs as tasks of a Ray cluster.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
-from os import cpu_count
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,10 +18,15 @@ from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import require
-from dopepp.data.jobs.cluster import connect
+from dopepp.core.futures import completed, connect, spread
+from dopepp.core.machine import THREAD_LIMITS, available_cores
 from dopepp.experiment.runs import display, record
-from dopepp.models.registry import check_integer
+
+_MOST: Final = 1024
+_IDLE_S: Final = 300
+"""How long a process waits for its next job."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,11 @@ class Jobs:
         )
 
 
-Runner = Callable[[Jobs, Mapping[int, list[str]]], Iterator[tuple[int, JobReturn | Exception]]]
-"""Runs jobs, given as overrides by number, and yields each as it ends: an exception in place of one
-whose process was lost."""
+Ended = Iterator[tuple[int, JobReturn | Exception]]
+"""Jobs by number as they end: an exception in place of one whose process was lost."""
+
+Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
+"""Runs jobs, given as overrides by number."""
 
 
 def launch(
@@ -108,11 +112,8 @@ def _lost(folder: Path, error: Exception) -> JobReturn:
     return JobReturn(status=JobStatus.COMPLETED)
 
 
-_MOST: Final = 1024
-
-
 def on_joblib(n_jobs: int) -> Runner:
-    """Return a runner that keeps so many jobs going.
+    """Return a runner that keeps so many jobs going in processes of this machine.
 
     Raises:
         UserError: The number is out of range, or joblib is not installed.
@@ -120,36 +121,29 @@ def on_joblib(n_jobs: int) -> Runner:
     check_integer("hydra.launcher.n_jobs", n_jobs, 1, _MOST)
     require("joblib", "hydra/launcher=joblib", "joblib")
 
-    def run(
-        jobs: Jobs, overrides: Mapping[int, list[str]]
-    ) -> Iterator[tuple[int, JobReturn | Exception]]:
-        from joblib import Parallel, delayed
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        import joblib
+        from joblib.externals.loky import get_reusable_executor
         from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-        missing = dict(overrides)
-        while missing:
-            # One job at a time leaves the queue, so that a lost process takes few with it.
-            pool = Parallel(
-                n_jobs=n_jobs, backend="loky", return_as="generator_unordered",
-                batch_size=1, pre_dispatch=n_jobs,
-            )  # fmt: skip
-            calls = [delayed(_numbered)(jobs, *item) for item in missing.items()]
-            try:
-                for number, result in pool(calls):
-                    del missing[number]
-                    yield number, result
-            except TerminatedWorkerError as error:
-                # Those at work beside it are lost with it, the others begin in a new pool.
-                begun = [one for one in missing if (jobs.folder / str(one)).exists()]
-                for number in begun or list(missing):
-                    del missing[number]
-                    yield number, error
+        # Of concurrent.futures' kind, and it pickles what belongs to a script.
+        share = str(max(joblib.cpu_count() // n_jobs, 1))
+        limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}
+
+        def submit(item: tuple[int, list[str]]) -> Future[JobReturn]:
+            # A new one after a process was lost, which takes those at work beside it along.
+            pool = get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits)
+            future: Future[JobReturn] = pool.submit(jobs.run, *item)
+            return future
+
+        try:
+            for (number, _), future in completed(submit, overrides.items(), lambda: n_jobs):
+                yield number, _result(future, TerminatedWorkerError)
+        except BaseException:
+            get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits).shutdown(kill_workers=True)
+            raise
 
     return run
-
-
-def _numbered(jobs: Jobs, number: int, overrides: list[str]) -> tuple[int, JobReturn]:
-    return number, jobs.run(number, overrides)
 
 
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
@@ -161,26 +155,25 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
         num_gpus: Accelerators; a job sees only its own.
     """
 
-    def run(
-        jobs: Jobs, overrides: Mapping[int, list[str]]
-    ) -> Iterator[tuple[int, JobReturn | Exception]]:
-        ray = connect(address, cpu_count() or 1, "hydra/launcher=ray", "hydra.launcher.address")
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        ray = connect(address, available_cores(), "hydra/launcher=ray", "hydra.launcher.address")
         try:
-            # Not repeated: a job that took its process down once would do so again. Without SPREAD,
-            # Ray fills one machine before it uses the next.
-            remote = ray.remote(
-                max_retries=0, scheduling_strategy="SPREAD", num_cpus=num_cpus, num_gpus=num_gpus
-            )(Jobs.run)
-            tasks = {remote.remote(jobs, *item): item[0] for item in overrides.items()}
-            waiting = list(tasks)
-            while waiting:
-                ended, waiting = ray.wait(waiting, num_returns=1)
-                for task in ended:
-                    try:
-                        yield tasks[task], ray.get(task)
-                    except ray.exceptions.RayError as error:
-                        yield tasks[task], error
+            # Not repeated: a job that took its process down once would do so again.
+            submit = spread(ray, Jobs.run, max_retries=0, num_cpus=num_cpus, num_gpus=num_gpus)
+            items = overrides.items()
+            for (number, _), future in completed(
+                lambda item: submit(jobs, *item), items, lambda: len(items)
+            ):
+                yield number, _result(future, ray.exceptions.RayError)
         finally:
             ray.shutdown()
 
     return run
+
+
+def _result(future: Future[JobReturn], lost: type[Exception]) -> JobReturn | Exception:
+    """Return a job's result, or what its process was lost by."""
+    try:
+        return future.result()
+    except lost as error:
+        return error

@@ -1,9 +1,7 @@
-"""Jobs as one SLURM job array, through submitit.
-
-A job under SLURM that is stopped goes back into the queue and goes on in its own folder.
+"""SLURM: a multirun as one job array, through submitit, and a stopped job that is queued again.
 
 SLURM starts a requeued job with the same command; so the folder of the run that the command began
-is written down under ``OUTPUT_DIR/.slurm``, by job and command.
+is written down under ``OUTPUT_DIR/.slurm``, by job and command, and the job goes on in it.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import logging
 import os
 import re
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,12 +20,15 @@ from hydra.core.utils import JobReturn
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import write_whole
-from dopepp.experiment.launch.jobs import Jobs, Runner
+from dopepp.experiment.launch.jobs import Ended, Jobs, Runner
 
 _log = logging.getLogger(__name__)
 
 _OUTPUT_DIR: Final = "output_dir="
 _TIMEOUT_S: Final = 30
+_ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
+                    "mem_gb", "name")  # fmt: skip
+"""What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
 
 
 def job_id() -> str | None:
@@ -81,11 +82,6 @@ def _note(command: Sequence[str]) -> Path | None:
     return Path(given[-1] if given else "outputs", ".slurm", f"{job}-{digest}")
 
 
-_ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
-                    "mem_gb", "name")  # fmt: skip
-"""What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
-
-
 @dataclass(frozen=True)
 class _Task:
     """A job that submitit can queue again."""
@@ -121,9 +117,7 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
         if value is not None
     }
 
-    def run(
-        jobs: Jobs, overrides: Mapping[int, list[str]]
-    ) -> Iterator[tuple[int, JobReturn | Exception]]:
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
         import submitit
 
         try:

@@ -20,22 +20,22 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import rates_figure
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.reports.tables import (
     Figure,
     PassRate,
     Row,
     csv_text,
     pivot,
-    rate_curve,
+    rate_curves,
     select,
 )
 from dopepp.experiment.runs import display
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
-from dopepp.metrics.row import NOT_AVAILABLE, finite_median
+from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
 
@@ -206,7 +206,7 @@ def record_breakdown(
     if not bins:
         _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
         return
-    what, fields = QUANTITIES[quantity], [rate.field for rate in rates]
+    what = QUANTITIES[quantity]
     by_middle = {one.middle: one for one in bins}
 
     def shown(one: Figure) -> Row:
@@ -218,7 +218,8 @@ def record_breakdown(
         if one.measure == "miss_rate":
             return row
         prefix = f"{one.method} " if len(metrics) > 1 else ""
-        text = _percent(one) if one.measure in fields else one.text
+        interval = [f"{100 * end:.0f}" for end in one.interval or ()]
+        text = f"{one.text} [{', '.join(interval)}]" if interval else one.text
         return {**row, f"{prefix}{one.heading}": text}
 
     def record(one: Figure) -> dict[str, object]:
@@ -232,22 +233,9 @@ def record_breakdown(
     records = pivot(table, attrgetter("condition", "method"), record)
     path = run_dir / f"by_{quantity}"
     write_whole(path.with_suffix(".csv"), csv_text(records).encode())
-    panels = {
-        rate.title: {
-            name: rate_curve(select(table, method=name, measure=rate.field)) for name in metrics
-        }
-        for rate in rates
-    }
+    panels = {rate.title: rate_curves(select(table, measure=rate.field)) for rate in rates}
     # Between two bins lie no instances; the line stands in the middle of the gap.
     gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]
     edges = np.array([bins[0].low, *gaps, bins[-1].high])
     figure = rates_figure(panels, what.heading, len(rates), edges)
     write_png(path.with_suffix(".png"), figure_image(figure))
-
-
-def _percent(rate: Figure) -> str:
-    """Return a rate with its interval, percent."""
-    if rate.interval is None:
-        return NOT_AVAILABLE
-    low, high = (100 * end for end in rate.interval)
-    return f"{rate.text} [{low:.0f}, {high:.0f}]"

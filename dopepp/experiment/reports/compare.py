@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
-from dopepp.drawing.curves import accuracy_figure, save_accuracy_curves
+from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.curves import accuracy_figure, figure_image, save_accuracy_curves
 from dopepp.drawing.panels import grid, lines_figure
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.reports.differences import figures, full, headline, notes
@@ -122,10 +122,7 @@ def compare_paths(
 
 
 def compare_runs(
-    runs: Sequence[Run],
-    folder: Path,
-    baseline: str | None = None,
-    num_pictures: int = NUM_PICTURES,
+    runs: Sequence[Run], folder: Path, baseline: str | None = None, num_pictures: int = NUM_PICTURES
 ) -> list[Entry]:
     """Print and write a comparison of runs into a folder; returns its methods.
 

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.data.sample import Sample, Source
 from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
-from dopepp.drawing.curves import rates_figure
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.experiment.reports.evaluators import FileMethod, Method, image_id
 from dopepp.experiment.reports.report import Measured, Report, accumulators, measure
@@ -36,7 +36,7 @@ from dopepp.experiment.reports.tables import (
     heading,
     markdown_text,
     pivot,
-    rate_curve,
+    rate_curves,
     select,
     shown_rows,
 )
@@ -163,12 +163,7 @@ def record_condition(
 ) -> None:
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
-    Args:
-        run_dir: Where the files go.
-        condition: What was changed.
-        levels: What was measured, ascending.
-        tiles: The examples, image by image, each at all levels.
-        rates: The pass rates.
+    Levels ascend; tiles are the examples, image by image, each at all levels.
     """
     rows = [row for rows in levels[0].rows.values() for row in rows.values()]
     extra = _SYMMETRIC if any(row.num_symmetries > 1 for row in rows) else ()
@@ -226,13 +221,9 @@ def _draw(
     for name in dict.fromkeys(one.object for one in table if one.object != MEAN):
         for rate in rates:
             measured = select(table, object=name, measure=rate.field)
-            curves = {
-                method: rate_curve(select(measured, method=method), condition.per_unit)
-                for method in dict.fromkeys(one.method for one in measured)
-            }
-            panels[f"{name}: {rate.title}"] = {
-                method: curve for method, curve in curves.items() if len(curve.x)
-            }
+            curves = rate_curves(measured, condition.per_unit)
+            shown = {method: curve for method, curve in curves.items() if len(curve.x)}
+            panels[f"{name}: {rate.title}"] = shown
     figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
     write_png(path, figure_image(figure))
 
@@ -273,7 +264,7 @@ def measure_shading(
         source: The test set.
         shares: Of the visible area of every instance, without 0.
         seed: Of the patches.
-        unmasked: What was measured on the images as they are.
+        unmasked: What was measured at 0.
         num_examples: How many images are shown.
 
     Returns:
@@ -333,14 +324,15 @@ def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
 def _around_masks(sample: Sample) -> tuple[slice, slice]:
     """Return the image's rows and columns around all masks, with a margin."""
     masks = [one.mask for one in sample.instances if one.mask is not None]
-    slices = []
-    for axis, size in ((1, sample.image.shape[0]), (0, sample.image.shape[1])):
-        shown = np.any(masks, axis=0).any(axis=axis) if masks else np.ones(size, bool)
-        hit = np.flatnonzero(shown) if np.any(shown) else np.arange(size)
-        first, last = int(hit[0]), int(hit[-1])
-        margin = round(_MARGIN * (last - first + 1))
-        slices.append(slice(max(0, first - margin), last + 1 + margin))
-    return slices[0], slices[1]
+    shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
+    rows, columns = (_widened(hit) for hit in np.nonzero(shown if shown.any() else ~shown))
+    return rows, columns
+
+
+def _widened(places: Int[np.ndarray, "n"]) -> slice:
+    first, end = int(places.min()), int(places.max()) + 1
+    margin = round(_MARGIN * (end - first))
+    return slice(max(0, first - margin), end + margin)
 
 
 def measure_scales(

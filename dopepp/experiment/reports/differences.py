@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from typing import Final
 
@@ -39,19 +39,7 @@ _WITH_INTERVAL: Final = ("add_01d", "auc_10cm", "median_rotation_deg")
 _FIELDS: Final = {column.field for column in COLUMNS}
 
 Counted = Callable[[Report, str], Float[np.ndarray, "instances"]]
-
-
-@dataclass(frozen=True)
-class Compared:
-    """A measure as a statistic of what every instance of an object counts.
-
-    Attributes:
-        counted: A report and an object's name to a number per instance.
-        statistic: Of these numbers.
-    """
-
-    counted: Counted
-    statistic: StatisticName = "mean"
+"""A report and an object's name to what each instance of it counts."""
 
 
 def _passes(threshold: float) -> Counted:
@@ -59,14 +47,14 @@ def _passes(threshold: float) -> Counted:
     return lambda report, name: (report.errors[name] < threshold).astype(np.float64)
 
 
-COMPARED: Final[dict[str, Compared]] = {
-    "add_01d": Compared(lambda report, name: _passes(0.1 * report.diameters[name])(report, name)),
-    "pass_5cm": Compared(_passes(0.05)),
-    "pass_10cm": Compared(_passes(0.1)),
-    "auc_10cm": Compared(lambda report, name: np.clip(1 - report.errors[name] / 0.1, 0, 1)),
-    "median_rotation_deg": Compared(lambda report, name: report.rotation_deg[name], "median"),
+COMPARED: Final[dict[str, tuple[Counted, StatisticName]]] = {
+    "add_01d": (lambda one, name: _passes(0.1 * one.diameters[name])(one, name), "mean"),
+    "pass_5cm": (_passes(0.05), "mean"),
+    "pass_10cm": (_passes(0.1), "mean"),
+    "auc_10cm": (lambda one, name: np.clip(1 - one.errors[name] / 0.1, 0, 1), "mean"),
+    "median_rotation_deg": (lambda one, name: one.rotation_deg[name], "median"),
 }
-"""Measures with a Δ, by their field of ``PoseRow``."""
+"""Measures with a Δ, by their field of ``PoseRow``, as a statistic of what instances count."""
 
 
 def comparable(entry: Entry, baseline: Entry) -> bool:
@@ -89,13 +77,13 @@ def differences(entry: Entry, baseline: Entry, name: str) -> dict[str, Differenc
         not unknown and sorted(map(str, entry.seeds)) == sorted(map(str, baseline.seeds))
     )
     found = {}
-    for field, one in COMPARED.items():
+    for field, (counted, statistic) in COMPARED.items():
         mine, theirs = (
-            [np.stack([one.counted(report, part) for report in method]) for part in objects]
+            [np.stack([counted(report, part) for report in method]) for part in objects]
             for method in (first, second)
         )
-        difference = paired_difference(mine, theirs, one.statistic, same_seeds=same)
-        if difference is not None and one.statistic == "mean":
+        difference = paired_difference(mine, theirs, statistic, same_seeds=same)
+        if difference is not None and statistic == "mean":
             # Few seeds may have stretched the interval beyond what two shares can differ by.
             low, high = max(difference.low, -1.0), min(difference.high, 1.0)
             difference = replace(difference, low=low, high=high)
@@ -209,7 +197,7 @@ def full(table: Sequence[Figure]) -> list[Row]:
 def summary(one: Figure) -> str:
     """Return a mean with its deviation; Δ with its interval and, where it may be chance, that."""
     if one.difference is not None:
-        low, high = _ends(one.difference, one)
+        low, high = one.ends
         unsure = f" {WITHIN}" if one.difference.within_noise else ""
         return f"{one.text} [{low}, {high}]{unsure}"
     return one.text if one.deviation is None else f"{one.text} ± {_deviation(one)}"
@@ -235,26 +223,42 @@ def _interval_cells(one: Figure) -> Row:
     if one.difference is None:
         return dict.fromkeys(headings, one.text)
     verdict = WITHIN if one.difference.within_noise else BEYOND
-    return dict(zip(headings, (*_ends(one.difference, one), verdict), strict=True))
-
-
-def _ends(difference: Difference, one: Figure) -> tuple[str, str]:
-    """Return the ends of an interval in the table's unit."""
-    return (one.column.shown(difference.low, signed=True),
-            one.column.shown(difference.high, signed=True))  # fmt: skip
+    return dict(zip(headings, (*one.ends, verdict), strict=True))
 
 
 def notes(entries: Sequence[Entry], table: Sequence[Figure]) -> list[str]:
     """Return a sentence or two for each thing that the table alone does not say."""
-    baseline = next((entry for entry in entries if entry.reports), None)
-    found = []
-    if baseline is not None:
-        others = [entry for entry in entries if entry.reports and entry is not baseline]
-        compared = [entry for entry in others if comparable(entry, baseline)]
-        if compared:
-            found += [_how(baseline, compared), *noise(table), *_unpaired(baseline, compared)]
-        found += _not_compared(baseline, others)
-    return found + _narrowed(entries)
+    found: list[str] = []
+    measured = [entry for entry in entries if entry.reports]
+    if len(measured) > 1:
+        found += _compared(measured[0], measured[1:], noise(table))
+    models = [run.config.get("model") for entry in entries for run in entry.runs]
+    widths = {float(model.get("width", 1.0)) for model in models if isinstance(model, dict)}
+    if factors := ", ".join(f"{width:g}" for width in sorted(widths - {1.0})):
+        narrowed = f"The networks were narrowed by model.width={factors}"
+        found.append(f"{narrowed}; figures of cost are of these.")
+    return found
+
+
+def _compared(baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]) -> Iterator[str]:
+    """Say what Δ is against, how sure it is, and what has none."""
+    compared = [entry for entry in others if comparable(entry, baseline)]
+    if compared:
+        yield _how(baseline, compared)
+        yield from doubts
+    mine = set(baseline.seeds)
+    several = [one for one in compared if max(len(one.seeds), len(mine)) > 1]
+    if unpaired := [entry.name for entry in several if set(entry.seeds) != mine]:
+        said = f"Not of the same seeds as {baseline.name}, so not paired over them"
+        yield f"{said}: {', '.join(unpaired)}."
+    if not baseline.test_set:
+        yield (
+            f"Without Δ: {baseline.name} does not say which images it was measured on; "
+            "evaluate.py measures it again."
+        )
+    elif unlike := [entry.name for entry in others if not comparable(entry, baseline)]:
+        said = f"Without Δ, because not measured on the same images as {baseline.name}"
+        yield f"{said}: {', '.join(unlike)}."
 
 
 def _how(baseline: Entry, compared: Sequence[Entry]) -> str:
@@ -302,39 +306,3 @@ def _needed(one: Figure) -> str:
     if math.isinf(seeds):
         return " (more images would be needed to tell)"
     return f" (about {seeds:,.0f} seeds would tell)"
-
-
-def _unpaired(baseline: Entry, compared: Sequence[Entry]) -> list[str]:
-    """Name methods whose seeds are not the baseline's."""
-    mine = set(baseline.seeds)
-    others = [
-        entry.name
-        for entry in compared
-        if max(len(entry.seeds), len(mine)) > 1 and set(entry.seeds) != mine
-    ]
-    if not others:
-        return []
-    return [f"Not of the same seeds as {baseline.name}, so not paired over them: "
-            f"{', '.join(others)}."]  # fmt: skip
-
-
-def _not_compared(baseline: Entry, others: Sequence[Entry]) -> list[str]:
-    """Name methods that were measured on something else."""
-    unlike = [entry.name for entry in others if not comparable(entry, baseline)]
-    if not baseline.test_set and others:
-        return [f"Without Δ: {baseline.name} does not say which images it was measured on; "
-                "evaluate.py measures it again."]  # fmt: skip
-    if not unlike:
-        return []
-    return [f"Without Δ, because not measured on the same images as {baseline.name}: "
-            f"{', '.join(unlike)}."]  # fmt: skip
-
-
-def _narrowed(entries: Sequence[Entry]) -> list[str]:
-    """Say it when networks were narrowed."""
-    models = [run.config.get("model") for entry in entries for run in entry.runs]
-    widths = {float(model.get("width", 1.0)) for model in models if isinstance(model, dict)}
-    factors = ", ".join(f"{width:g}" for width in sorted(widths - {1.0}))
-    if not factors:
-        return []
-    return [f"The networks were narrowed by model.width={factors}; figures of cost are of these."]

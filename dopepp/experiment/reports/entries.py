@@ -73,6 +73,13 @@ class Run:
     pruned: bool = False
 
     @property
+    def alike(self) -> tuple[str, str, str] | None:
+        """What the seeds of a method share: recipe, name and test set; None where unknown."""
+        if self.report is None or self.seed is None or not self.recipe:
+            return None
+        return self.recipe, self.report.name, self.report.test_set
+
+    @property
     def place(self) -> str:
         """The folder's name; of a job, whose name is a number, with its multirun's."""
         folder = self.folder.resolve()
@@ -274,7 +281,8 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     """
     entries: list[Entry] = []
     for run in runs:
-        entry = next((one for one in entries if _is_of_another_seed(run, one)), None)
+        same = (one for one in entries if run.alike and run.alike == one.runs[0].alike)
+        entry = next((one for one in same if run.seed not in one.seeds), None)
         if entry is None:
             entry = Entry("", failure=run.failure, pruned=run.pruned)
             entries.append(entry)
@@ -294,34 +302,13 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     return entries
 
 
-def _is_of_another_seed(run: Run, entry: Entry) -> bool:
-    """Tell whether a run is another seed of what an entry holds."""
-    first = entry.runs[0]
-    return (
-        run.report is not None
-        and first.report is not None
-        and run.seed is not None
-        and run.seed not in entry.seeds
-        and None not in entry.seeds
-        and bool(run.recipe)
-        and run.recipe == first.recipe
-        and (run.report.name, run.report.test_set) == (first.report.name, first.report.test_set)
-    )
-
-
 def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:
     """Tell whether an entry differs from those of a method in nothing but its parts."""
-    first = method[0]
-    if not entry.reports or not first.reports or not entry.runs[0].recipe:
+    mine, theirs = entry.runs[0].alike, method[0].runs[0].alike
+    if mine is None or theirs is None or mine[:2] != theirs[:2]:
         return False
     known = {name for one in method for name in one.reports[0].errors}
-    return (
-        entry.runs[0].recipe == first.runs[0].recipe
-        and entry.reports[0].name == first.reports[0].name
-        and None not in entry.seeds
-        and set(entry.seeds) == set(first.seeds)
-        and known.isdisjoint(entry.reports[0].errors)
-    )
+    return set(entry.seeds) == set(method[0].seeds) and known.isdisjoint(entry.reports[0].errors)
 
 
 def _join(method: Sequence[Entry]) -> Entry:

@@ -158,16 +158,12 @@ class FileMethod:
         """Look the image up; of several times that its lines state, the largest counts."""
         rows = self._used.setdefault(image, self._unused.pop(image, []))
         poses = [
-            FilePose(part.name, one.score, one.T_cam_obj, self._keypoints(part, one, sample))
-            for one in rows
+            FilePose(part.name, one.score, T, project_keypoints(part.cuboid, T, sample.K))
+            for one, T in ((one, one.T_cam_obj) for one in rows)
             if (part := self._parts.get(one.obj_id)) is not None
         ]
         seconds = max((one.seconds for one in rows), default=-1.0)
         return poses, seconds if seconds >= 0 else None
-
-    @staticmethod
-    def _keypoints(part: Part, one: PoseResult, sample: Sample) -> Float[np.ndarray, "9 2"]:
-        return project_keypoints(part.cuboid, one.T_cam_obj, sample.K)
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Return the median of the stated times."""

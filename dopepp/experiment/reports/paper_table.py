@@ -19,9 +19,9 @@ import numpy as np
 from scipy.stats import t
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import figure_image, write_png, write_whole
+from dopepp.core.files import write_png, write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.drawing.curves import RateCurve, rates_figure
+from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
 from dopepp.experiment.reports.conditions import SHADING
 from dopepp.experiment.reports.differences import figures, noise, row_figures, summary
@@ -35,7 +35,7 @@ from dopepp.experiment.reports.tables import (
     csv_text,
     heading,
     markdown_text,
-    rate_curve,
+    rate_curves,
     read_csv,
     select,
 )
@@ -135,16 +135,14 @@ class PaperTable:
 
         The own name serves where the paper's would stand for several.
         """
-        called = [self._label(entry) or entry.name for entry in entries]
+        used = [entry.runs[0].overrides if entry.runs else [] for entry in entries]
+        labels = [" ".join(self.labels[key] for key in self.labels if key in own) for own in used]
+        called = [label or entry.name for label, entry in zip(labels, entries, strict=True)]
         count = Counter(called)
         return {
             label if count[label] == 1 else entry.name: entry
             for label, entry in zip(called, entries, strict=True)
         }
-
-    def _label(self, entry: Entry) -> str:
-        overrides = entry.runs[0].overrides if entry.runs else ()
-        return " ".join(label for key, label in self.labels.items() if key in overrides)
 
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
@@ -214,7 +212,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
             known = layout.paper.get(label, {})
-            own = layout.recomputed.get(label, {}).get(name, {})
+            own = layout.recomputed.get(label, {})
             # The paper's mean is over its own objects.
             is_other_mean = name == MEAN and set(known) != set(objects)
             printed = {} if is_other_mean else known.get(name, {})
@@ -225,8 +223,8 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
             elif entry is not None:
                 reason = f"{label}: {entry.failure or 'not measured on it'}"
                 rows.append(_pose_row(layout, reason, name, {}, printed))
-            elif own or name in known or name in layout.recomputed.get(label, {}):
-                texts = {_field(layout, key): _number(value) for key, value in own.items()}
+            elif name in known or name in own:
+                texts = {_field(layout, k): _number(v) for k, v in own.get(name, {}).items()}
                 rows.append(_pose_row(layout, label, name, texts, printed))
     for name in objects if measured else ():
         for reference, by_object in measured[0].reports[0].references.items():
@@ -248,15 +246,7 @@ def _field(layout: PaperTable, key: str) -> str:
 def _pose_row(
     layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
 ) -> Row:
-    """Return a row: every measure, the paper's figure and Δ behind it.
-
-    Args:
-        layout: The table.
-        method: What was measured, or why it was not.
-        name: The object.
-        texts: By measure.
-        printed: What the paper prints.
-    """
+    """Return a row: the text of every measure, what the paper prints of it, and Δ."""
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
         measure = _field(layout, key)
@@ -285,34 +275,32 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
         for label, own in measured.items()
         if not own
     ]
-    panels: dict[str, dict[str, RateCurve]] = {}
+    panels = {}
     for name in dict.fromkeys(one.object for one in table):
         for measure in (layout.pass_field, _STRICT):
-            baseline: _ByShare = {}
+            baseline: dict[float, list[Figure]] = {}
+            pooled: list[Figure] = []
             head = {_OBJECT: name, _MEASURE: heading(measure)}
             for label in dict.fromkeys(one.method for one in select(table, object=name)):
-                rates = _by_share(select(table, method=label, object=name, measure=measure))
-                means = {f"{100 * share:g} %": _mean(own) for share, own in rates.items()}
+                own = select(table, method=label, object=name, measure=measure)
+                rates = {one.condition: select(own, condition=one.condition) for one in own}
+                levels = {share: SHADING.heading(share) for share in rates}
+                means = {levels[share]: _mean(rates[share]) for share in rates}
                 rows.append({_METHOD: label, **head, **means})
                 if baseline:
-                    changes = {f"{100 * share:g} %": _change(own, baseline.get(share, []))
-                               for share, own in rates.items()}  # fmt: skip
+                    changes = {levels[s]: _change(rates[s], baseline.get(s, [])) for s in rates}
                     rows.append({_METHOD: f"{DELTA}{label}", **head, **changes})
                 baseline = baseline or rates
                 printed = layout.paper.get(label, {}).get(name, {})
                 if printed and measure == layout.pass_field:
                     texts = {share: _number(value) for share, value in printed.items()}
                     rows.append({_METHOD: f"{label}, {_PAPER}", **head, **texts})
-                panel = panels.setdefault(f"{name}: {heading(measure)}", {})
-                panel[label] = rate_curve(map(_pooled, rates.values()), SHADING.per_unit)
+                pooled += map(_pooled, rates.values())
+            panels[f"{name}: {heading(measure)}"] = rate_curves(pooled, SHADING.per_unit)
     if panels:
         figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
     return rows, []
-
-
-_ByShare = dict[float, list[Figure]]
-"""A rate of one method and object, seed by seed, by share."""
 
 
 def _shading(label: str, entry: Entry) -> list[Figure]:
@@ -339,10 +327,6 @@ def _shading(label: str, entry: Entry) -> list[Figure]:
     # The mean is over what all parts have.
     whole = [own for own in alike.values() if len(own) == len(objects)]
     return table + [replace(_pooled(own), object=MEAN) for own in whole]
-
-
-def _by_share(table: Sequence[Figure]) -> _ByShare:
-    return {one.condition: select(table, condition=one.condition) for one in table}
 
 
 def _pooled(rates: Sequence[Figure]) -> Figure:

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.experiment.reports.breakdown import QUANTITIES
-from dopepp.models.registry import check_integer
 
 SHORT_NAMES: Final = {"scale": "scale_factors"}
 """What evaluate.py calls an option on the command line, and the option: ``scale`` alone, without
@@ -47,9 +47,12 @@ class Protocols:
         Raises:
             UserError: One of them is wrong.
         """
+        shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
+        bounds = (1 / _MAX_SCALE, _MAX_SCALE)
+        factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
         return cls(
-            shading=_shares(config["shading"]),
-            scales=_scales(config.get("scale_factors")),
+            shading=_levels("shading", config["shading"], (0, 1), 0, shares),
+            scales=_levels("scale", config.get("scale_factors"), bounds, 1, factors),
             by=_quantities(config["by"]),
             num_bins=check_integer("num_bins", config["num_bins"], 1, _MAX_BINS),
         )
@@ -59,23 +62,10 @@ class Protocols:
         return bool(self.shading or self.scales or self.by)
 
 
-def _shares(given: object) -> tuple[float, ...]:
-    """Read ``shading``: one share or several; 0, the image as it is, is measured anyway."""
-    allowed = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
-    return _levels("shading", given, (0, 1), 0, allowed)
-
-
-def _scales(given: object) -> tuple[float, ...]:
-    """Read ``scale``: one scale or several; 1, the image as it is, is measured anyway."""
-    bounds = (1 / _MAX_SCALE, _MAX_SCALE)
-    allowed = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
-    return _levels("scale", given, bounds, 1, allowed)
-
-
 def _levels(
     option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
 ) -> tuple[float, ...]:
-    """Read a number or several within bounds, some other than that of the images as they are."""
+    """Read one level or several; the usual one, the images as they are, is measured anyway."""
     levels = [] if given is None else given if isinstance(given, list) else [given]
     numbers = [one for one in levels if isinstance(one, int | float) and not isinstance(one, bool)]
     wrong = len(numbers) < len(levels) or not all(bounds[0] <= one <= bounds[1] for one in numbers)

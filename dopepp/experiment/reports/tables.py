@@ -100,6 +100,12 @@ class Figure:
             return None
         return wilson_interval(round(float(self.value) * self.num_instances), self.num_instances)
 
+    @property
+    def ends(self) -> list[str]:
+        """What a table shows of the interval."""
+        signed = self.difference is not None
+        return [self.column.shown(end, signed=signed) for end in self.interval or ()]
+
 
 def heading(measure: str) -> str:
     """Return what stands above a measure in tables, with its unit."""
@@ -133,10 +139,14 @@ def pivot(
     return list(rows.values())
 
 
-def rate_curve(rates: Iterable[Figure], per_unit: float = 1.0) -> RateCurve:
-    """Return rates over the conditions, times ``per_unit``, under which there were instances."""
-    points = [(per_unit * one.condition, one.value, *one.interval) for one in rates if one.interval]
-    return RateCurve(*np.array(points, np.float64).reshape(-1, 4).T)
+def rate_curves(rates: Sequence[Figure], per_unit: float = 1.0) -> dict[str, RateCurve]:
+    """Return, by method, a rate over the conditions, times ``per_unit``, that had instances."""
+    curves = {}
+    for method in dict.fromkeys(one.method for one in rates):
+        own = [one for one in rates if one.method == method and one.interval is not None]
+        points = [(per_unit * one.condition, one.value, *(one.interval or ())) for one in own]
+        curves[method] = RateCurve(*np.array(points, np.float64).reshape(-1, 4).T)
+    return curves
 
 
 def header_of(rows: Sequence[Mapping[str, object]]) -> list[str]:

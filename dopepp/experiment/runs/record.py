@@ -86,7 +86,7 @@ def write_environment(
         past = before.pop("earlier", [])
         earlier = [*(past if isinstance(past, list) else []), before]
     present = environment(seed, data_fingerprint)
-    diff = _working_tree_diff()
+    diff = _git("diff", "--binary", "HEAD")
     if present["git"] is not None and diff:
         digest = hashlib.sha256(diff).hexdigest()
         present["git"]["diff_sha256"] = digest
@@ -147,10 +147,13 @@ def _memory_bytes() -> int | None:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def _git(*arguments: str) -> bytes:
-    folder = str(Path(dopepp.__file__).parent)
-    command = ["git", "-C", folder, *arguments]
-    return subprocess.run(command, check=True, capture_output=True, timeout=10).stdout
+def _git(*arguments: str) -> bytes | None:
+    """Return what git says where the package is; None where it refuses, or is not installed."""
+    command = ["git", "-C", str(Path(dopepp.__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, check=True, capture_output=True, timeout=10).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def _git_state() -> dict[str, Any] | None:
@@ -158,19 +161,14 @@ def _git_state() -> dict[str, Any] | None:
 
     A package that is installed below somebody's own repository is not part of it.
     """
-    try:
-        _git("ls-files", "--error-unmatch", "__init__.py")
-        commit = _git("rev-parse", "HEAD").decode().strip()
-        status = _git("status", "--porcelain").decode(errors="replace").splitlines()
-    except (OSError, subprocess.SubprocessError):
+    is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
+    commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    if not is_part or commit is None or status is None:
         return None
-    untracked = [line[3:] for line in status if line.startswith("??")]
-    return {"commit": commit, "dirty": bool(status), "untracked": untracked[:_MAX_UNTRACKED]}
-
-
-def _working_tree_diff() -> bytes:
-    """Return the difference of the working tree to its commit; empty where there is none."""
-    try:
-        return _git("diff", "--binary", "HEAD")
-    except (OSError, subprocess.SubprocessError):
-        return b""
+    lines = status.decode(errors="replace").splitlines()
+    untracked = [line[3:] for line in lines if line.startswith("??")]
+    return {
+        "commit": commit.decode().strip(),
+        "dirty": bool(lines),
+        "untracked": untracked[:_MAX_UNTRACKED],
+    }

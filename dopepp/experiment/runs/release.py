@@ -9,7 +9,7 @@ from typing import Any, Final
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.experiment.reports.report import Report
-from dopepp.experiment.reports.tables import markdown_text
+from dopepp.experiment.reports.tables import markdown_text, shown_rows
 from dopepp.experiment.runs import record
 from dopepp.metrics.row import COLUMNS
 from dopepp.models.checkpoint.released import SUFFIX, write_content
@@ -59,8 +59,7 @@ def _card(name: str, trained: Checkpoint, report: Report) -> str:
     rows = [
         {"object": row.object, "method": row.method, **_measures(row)}
         for rows in [report.rows, *report.references.values()]
-        for row in rows.values()
-        if row.object != "mean" or len(rows) > 2
+        for row in shown_rows(rows).values()
     ]
     width, height = trained.input_size
     parameters = sum(value.numel() for value in trained.state_dict.values())

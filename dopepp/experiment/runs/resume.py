@@ -72,7 +72,7 @@ class ConfigDifference:
 def check_resume(
     run: Path, config: RunConfig, saved: Checkpoint, payload: Mapping[str, Any]
 ) -> list[ConfigDifference]:
-    """Compare a run with what is to go on with it.
+    """Compare a run's folder and checkpoint with the config that is to go on with it.
 
     Args:
         run: Its folder.
@@ -100,7 +100,9 @@ def check_resume(
             f"leave them as they were, or start anew with init_from={run / record.BEST_CHECKPOINT}"
             " where the network is the same",
         )
-    learnt = [one for one in found if _is_learnt_from(one.key)]
+    learnt = [
+        one for one in found if below(one.key, LEARNT_FROM) and not below(one.key, _NOT_LEARNT_FROM)
+    ]
     if not learnt:  # else the images are others for that reason
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and not config.resume_anyway:
@@ -207,10 +209,6 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 def _text(entries: Mapping[str, object], key: str) -> str:
     return str(entries[key]) if key in entries else _ABSENT
-
-
-def _is_learnt_from(key: str) -> bool:
-    return below(key, LEARNT_FROM) and not below(key, _NOT_LEARNT_FROM)
 
 
 def _listed(differences: Sequence[ConfigDifference]) -> str:

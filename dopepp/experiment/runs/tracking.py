@@ -30,8 +30,7 @@ from dopepp.experiment.reports.compare import (
 from dopepp.experiment.reports.entries import overrides_of
 from dopepp.experiment.reports.paper_table import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.reports.report import Report
-from dopepp.experiment.reports.tables import read_csv
-from dopepp.metrics.pose import MEAN
+from dopepp.experiment.reports.tables import read_csv, shown_rows
 from dopepp.metrics.row import COLUMNS, PoseRow
 from dopepp.models.registry import TARGET
 from dopepp.training.loggers import GuardedLogger
@@ -114,10 +113,9 @@ def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path)
 
 def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
     """Return every measure there is by a name with slashes; of one object, no mean beside it."""
-    named = {name: row for name, row in rows.items() if name != MEAN or len(rows) > 2}
     return {
         f"{prefix}/{name}/{column.field}": value
-        for name, row in named.items()
+        for name, row in shown_rows(rows).items()
         for column in COLUMNS
         if (value := getattr(row, column.field)) is not None
     }

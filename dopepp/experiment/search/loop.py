@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.experiment.runs import display
 from dopepp.experiment.search.study import (
@@ -32,7 +34,6 @@ from dopepp.experiment.search.study import (
     overrides,
     read_space,
 )
-from dopepp.models.registry import check_integer
 from dopepp.training.callbacks.trial import MOST
 
 _MAX_PARALLEL = 10_000
@@ -73,9 +74,9 @@ def search(
     facts = facts_of(_plain(config, resolve=False), space.texts)
     with alone(folder, str(options["study"])):
         study = open_study(options, facts, int(config.seed))
-        _check_folder(folder, study)
+        trials = _Trials(study, space, launcher, folder)
         OmegaConf.save(config, folder / "multirun.yaml")
-        returns = _run_trials(study, space, launcher, folder, wanted, at_a_time)
+        returns = trials.run(wanted, at_a_time)
         _report(study, options)
     return returns
 
@@ -86,86 +87,69 @@ def _plain(node: DictConfig, resolve: bool) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
-def _check_folder(folder: Path, study: optuna.Study) -> None:
-    """A trial must not go on in the folder of another study's."""
-    known = {trial.number for trial in study.get_trials(deepcopy=False)}
-    foreign = [p.name for p in folder.iterdir() if p.name.isdigit() and int(p.name) not in known]
-    if foreign:
-        raise UserError(
-            f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
-            f"a folder of the study {study.study_name} alone",
-            "choose another search.study=NAME, or move the folder away",
-        )
+class _Trials:
+    """The trials of a study, each a job in a folder of its number."""
+
+    def __init__(self, study: optuna.Study, space: Space, launcher: Launcher, folder: Path) -> None:
+        self._study, self._space, self._launcher, self._folder = study, space, launcher, folder
+        known = {trial.number for trial in study.get_trials(deepcopy=False)}
+        names = [path.name for path in folder.iterdir() if path.name.isdigit()]
+        foreign = [name for name in names if int(name) not in known]
+        if foreign:  # a trial must not go on in the folder of another study's
+            raise UserError(
+                f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
+                f"a folder of the study {study.study_name} alone",
+                "choose another search.study=NAME, or move the folder away",
+            )
+
+    def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
+        """Finish what an earlier command has left, then run new ones until so many are finished."""
+        returns: list[JobReturn] = []
+        self._tell(self._running())
+        left = self._running()
+        if left:
+            numbers = ", ".join(str(trial.number) for trial in left)
+            display.console.print(f"study {self._study.study_name} goes on with trials {numbers}")
+        for trials in _consecutive(left, at_a_time):
+            returns += self._launch(trials)
+        while (missing := wanted - self._num_finished()) > 0:
+            asked = range(min(missing, at_a_time))
+            numbers_asked = {self._study.ask(self._space.varied).number for _ in asked}
+            returns += self._launch([one for one in self._running() if one.number in numbers_asked])
+        return returns
+
+    def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
+        """Run trials of consecutive numbers and tell the study how they ended."""
+        jobs = [overrides(self._space, trial.params) for trial in trials]
+        returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
+        self._tell(trials)
+        numbers = {trial.number for trial in trials}
+        for trial in self._running():
+            if trial.number in numbers:  # its process died without a word
+                self._study.tell(trial.number, state=TrialState.FAIL)
+        return returns
+
+    def _tell(self, trials: Sequence[FrozenTrial]) -> None:
+        """Tell the study about those trials whose jobs have ended."""
+        for trial in trials:
+            state, value = outcome(self._folder / str(trial.number))
+            if state != TrialState.RUNNING:
+                self._study.tell(trial.number, value, state=state)
+
+    def _running(self) -> list[FrozenTrial]:
+        return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+
+    def _num_finished(self) -> int:
+        trials = self._study.get_trials(deepcopy=False)
+        return sum(trial.state.is_finished() for trial in trials)
 
 
-def _run_trials(
-    study: optuna.Study,
-    space: Space,
-    launcher: Launcher,
-    folder: Path,
-    wanted: int,
-    at_a_time: int,
-) -> list[JobReturn]:
-    """Finish what an earlier command has left, then run new trials."""
-    returns: list[JobReturn] = []
-    _tell(study, folder, _running(study))
-    left = _running(study)
-    if left:
-        numbers = ", ".join(str(trial.number) for trial in left)
-        display.console.print(f"study {study.study_name} goes on with trials {numbers}")
-    for trials in _consecutive(left, at_a_time):
-        returns += _launch(study, space, launcher, folder, trials)
-    while (missing := wanted - _num_finished(study)) > 0:
-        asked = [study.ask(space.varied) for _ in range(min(missing, at_a_time))]
-        numbers_asked = {trial.number for trial in asked}
-        trials = [trial for trial in _running(study) if trial.number in numbers_asked]
-        returns += _launch(study, space, launcher, folder, trials)
-    return returns
-
-
-def _launch(
-    study: optuna.Study,
-    space: Space,
-    launcher: Launcher,
-    folder: Path,
-    trials: Sequence[FrozenTrial],
-) -> list[JobReturn]:
-    """Run trials of consecutive numbers and tell the study how they ended."""
-    jobs = [overrides(space, trial.params) for trial in trials]
-    returns = launcher.launch(jobs, initial_job_idx=trials[0].number)
-    _tell(study, folder, trials)
-    for trial in _running(study):
-        if trial.number in {one.number for one in trials}:  # its process died without a word
-            study.tell(trial.number, state=TrialState.FAIL)
-    return list(returns)
-
-
-def _tell(study: optuna.Study, folder: Path, trials: Sequence[FrozenTrial]) -> None:
-    """Tell the study about those trials whose jobs have ended."""
-    for trial in trials:
-        state, value = outcome(folder / str(trial.number))
-        if state != TrialState.RUNNING:
-            study.tell(trial.number, value, state=state)
-
-
-def _running(study: optuna.Study) -> list[FrozenTrial]:
-    return study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-
-
-def _num_finished(study: optuna.Study) -> int:
-    return sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
-
-
-def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[list[FrozenTrial]]:
+def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequence[FrozenTrial]]:
     """Yield runs of consecutive numbers: a launcher counts up from the first one's."""
-    batch: list[FrozenTrial] = []
-    for trial in sorted(trials, key=lambda one: one.number):
-        if batch and (trial.number != batch[-1].number + 1 or len(batch) == at_most):
-            yield batch
-            batch = []
-        batch.append(trial)
-    if batch:
-        yield batch
+    for _, run in groupby(enumerate(trials), lambda pair: pair[1].number - pair[0]):
+        left = [trial for _, trial in run]
+        for first in range(0, len(left), at_most):
+            yield left[first : first + at_most]
 
 
 def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
-"""The study behind a search: opened once, by one command at a time, and never mixed.
+"""What a search varies, as Optuna's distributions, and the study behind it.
 
-What a search varies: Hydra's sweeps, ``key=interval(0, 1)``, as Optuna's distributions.
+An option is varied by a sweep of Hydra's, ``key=interval(0, 1)``. A study is opened by one command
+at a time, and trials of different configurations are never mixed in it.
 
 To vary another option, write it into ``search.space`` or on the command line.
 """
@@ -37,6 +38,16 @@ from dopepp.training.callbacks.trial import open_storage
 
 _FORMS: Final = "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)"
 _LOG: Final = "log"
+_LOCK_FILE: Final = ".search.lock"
+_FACTS: Final = "configuration"
+_NUM_SHOWN: Final = 3
+_DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
+_NO_PART: Final = (
+    "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
+    "search.space", "callbacks.trial.storage", "data.virtual",
+)  # fmt: skip
+"""What may differ between two commands of one study; of the space, its texts are compared, and
+``data.virtual`` is where earlier versions say again what the node ``virtual`` says."""
 
 
 @dataclass(frozen=True)
@@ -118,10 +129,11 @@ def examples(space: Space) -> list[list[str]]:
 
 
 def _ends(distribution: BaseDistribution) -> list[object]:
+    """Return every choice, or one number of a range: another one composes as well."""
     if isinstance(distribution, CategoricalDistribution):
         return list(distribution.choices)
     assert isinstance(distribution, (FloatDistribution, IntDistribution))
-    return [distribution.low]  # another number composes as well
+    return [distribution.low]
 
 
 def overrides(space: Space, params: dict[str, object]) -> list[str]:
@@ -134,23 +146,10 @@ def chosen(params: dict[str, object]) -> list[str]:
 
     Four digits of a drawn number are enough, and fit into a table.
     """
-    texts = {
-        key: f"{value:.4g}" if isinstance(value, float) else str(value)
+    return [
+        f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
         for key, value in params.items()
-    }
-    return [f"{key}={text}" for key, text in texts.items()]
-
-
-_LOCK_FILE: Final = ".search.lock"
-_FACTS: Final = "configuration"
-_NUM_SHOWN: Final = 3
-_DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
-_NO_PART: Final = (
-    "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
-    "search.space", "callbacks.trial.storage", "data.virtual",
-)  # fmt: skip
-"""What may differ between two commands of one study; of the space, its texts are compared, and
-``data.virtual`` is where earlier versions say again what the node ``virtual`` says."""
+    ]
 
 
 @contextmanager

@@ -29,7 +29,6 @@ from dopepp.metrics.functional.rates import (
     pass_rate,
     wilson_interval,
 )
-from dopepp.metrics.functional.visible_surface import vsd
 
 __all__ = [
     "BOP_MSPD_THRESHOLDS",
@@ -48,6 +47,5 @@ __all__ = [
     "reprojection_error",
     "rotation_error_deg",
     "translation_error",
-    "vsd",
     "wilson_interval",
 ]

@@ -1,9 +1,4 @@
-"""Distances between the surfaces of an object at two poses: ADD, ADD-S, MSSD; metres.
-
-Distances between the images of an object at two poses; pixels.
-
-How far a pose is off in orientation and in position.
-"""
+"""How far a pose is off: on the object's surface, in its image, in orientation and position."""
 
 from __future__ import annotations
 

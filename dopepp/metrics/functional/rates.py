@@ -1,11 +1,4 @@
-"""Rates over many errors: pass rate, area under the curve, average recall.
-
-How well a share of few trials is known.
-
-Whether scores mean what they say.
-
-Which prediction belongs to which instance, and how well scores tell right from wrong.
-"""
+"""Rates over many errors, how sure they are, and which prediction belongs to which instance."""
 
 from __future__ import annotations
 
@@ -25,7 +18,7 @@ from dopepp.metrics.functional.inputs import nan_is_miss, to_float64
 AucMethod = Literal["exact", "voc"]
 
 BOP_THRESHOLDS: Final = tuple(round(0.05 * k, 2) for k in range(1, 11))
-"""0.05 to 0.5: of VSD's error and, times the diameter, of VSD's tolerance and of MSSD (BOP)."""
+"""0.05 to 0.5: of MSSD, times the diameter (BOP)."""
 
 BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
 """5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
@@ -77,8 +70,7 @@ def average_recall(errors: Float[Tensor, "n"], thresholds: Sequence[float]) -> f
     """Mean of the pass rates at several thresholds: BOP's AR of one error function.
 
     AR_MSSD takes :data:`BOP_THRESHOLDS` times the diameter, AR_MSPD
-    :data:`BOP_MSPD_THRESHOLDS` times width/640. AR_VSD is the mean over VSD's tolerances of the
-    average recall at :data:`BOP_THRESHOLDS`. A data set's AR is the mean of the three.
+    :data:`BOP_MSPD_THRESHOLDS` times width/640.
 
     Args:
         errors: One error per instance that is to be found; a miss is infinite.

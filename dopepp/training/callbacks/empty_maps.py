@@ -14,11 +14,11 @@ from typing import Any, Final
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from dopepp.core.checks import check_integer
 from dopepp.data.batch import PADDING, Batch
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.losses import MapMSE
-from dopepp.models.registry import check_integer
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 _log = logging.getLogger(__name__)

@@ -2,15 +2,13 @@
 
 Whether a step is taken must be known before it is taken, so the processor waits for the device once
 per optimiser step: three numbers, as often as torch's own gradient scaler does it.
-
-A batch on disk, to compute with and to look at.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,54 +18,21 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 from torch.optim import Optimizer
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import RunError
 from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
 from dopepp.drawing.overlay import GREEN, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.models.checkpoint.storage import write_atomic
-from dopepp.models.registry import check_integer
 
 _log = logging.getLogger(__name__)
-
-_MAX_TILES: Final = 64
-
-
-def dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write ``path.pt`` and ``path.png``; a disk that takes neither is reported, not raised.
-
-    Args:
-        path: Where, without suffix.
-        batch: The images and their poses.
-        facts: Plain values stored with them. The file is a mapping of these and of the batch's
-            fields, and loads under ``weights_only=True``.
-    """
-    plain = {entry.name: getattr(batch, entry.name) for entry in fields(batch)}
-    content = {
-        name: value.detach().cpu() if isinstance(value, Tensor) else value
-        for name, value in plain.items()
-    }
-    try:
-        write_atomic({**facts, **content}, path.with_name(f"{path.name}.pt"))
-        write_png(path.with_name(f"{path.name}.png"), contact_sheet(_tiles(batch)))
-    except OSError as error:
-        _log.warning("the batch could not be written to %s: %s", path.parent, error)
-
-
-def _tiles(batch: Batch) -> list[Tile]:
-    images = batch.images[:_MAX_TILES].permute(0, 2, 3, 1).cpu().numpy()
-    return [
-        Tile(overlay(image, [Wireframe(points, GREEN, "true") for points in truths]), key)
-        for image, truths, key in zip(
-            images, batch.keypoints.cpu().numpy(), batch.keys, strict=False
-        )
-    ]
-
 
 FOLDER: Final = "nonfinite"
 """Where in the run folder the batch that ended a run is left."""
 
 _MAX_IN_A_ROW: Final = 10**6
+_MAX_TILES: Final = 64
 _CHECKED: Final = ("loss", "gradient", "batch norm's statistics")
 """What is looked at after every backward pass, in this order."""
 
@@ -214,6 +179,31 @@ class FiniteSteps(Callback):
             name = f"step_{trainer.global_step}_rank_{trainer.global_rank}"
             dump_batch(folder / name, own[0].batch, facts)
         return folder
+
+
+def dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
+    """Write ``path.pt`` and ``path.png``; a disk that takes neither is reported, not raised.
+
+    Args:
+        path: Where, without suffix.
+        batch: The images and their poses.
+        facts: Plain values stored with them. The file is a mapping of these and of the batch's
+            fields, and loads under ``weights_only=True``.
+    """
+    try:
+        write_atomic({**facts, **vars(batch.to("cpu"))}, path.with_name(f"{path.name}.pt"))
+        write_png(path.with_name(f"{path.name}.png"), contact_sheet(_tiles(batch)))
+    except OSError as error:
+        _log.warning("the batch could not be written to %s: %s", path.parent, error)
+
+
+def _tiles(batch: Batch) -> list[Tile]:
+    shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
+    images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
+    return [
+        Tile(overlay(image, [Wireframe(points, GREEN, "true") for points in keypoints]), key)
+        for image, keypoints, key in zip(images, truths, shown.keys, strict=True)
+    ]
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:

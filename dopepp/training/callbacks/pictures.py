@@ -1,15 +1,8 @@
-"""A contact sheet of validation images with predicted (yellow) and true (green) wireframes.
+"""Pictures of every validation, as files in the run folder and in the loggers that take pictures.
 
-Pictures to whichever logger can take them, and to files that a run can do without.
-
-The validation's accuracy-threshold curves (paper Fig. 4), as a picture and as numbers.
-
-A contact sheet of the first validation images, drawn anew in every validation.
-
-To draw another one, a subclass with a ``name`` and :meth:`ValidationSheet.tiles`, and an entry in
-``conf/callbacks``.
-
-A contact sheet of validation images under the belief maps that the network gives.
+To draw another sheet of the first validation images, a subclass of :class:`ValidationSheet` with a
+``name`` and :meth:`~ValidationSheet.tiles`, a line in ``dopepp/experiment/build/registries.py`` and
+an entry in ``conf/callbacks``.
 """
 
 from __future__ import annotations
@@ -27,9 +20,9 @@ import torch
 from jaxtyping import Float, UInt8
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from dopepp.core.files import figure_image, write_png
+from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
-from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
@@ -38,22 +31,6 @@ from dopepp.training.loggers import GuardedLogger
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 _log = logging.getLogger(__name__)
-
-
-def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
-    for logger in trainer.loggers:
-        if isinstance(logger, GuardedLogger):
-            logger.log_picture(name, image, trainer.global_step)
-
-
-@contextmanager
-def best_effort(what: str) -> Iterator[None]:
-    """Report it in a line where a file cannot be written, and go on."""
-    try:
-        yield
-    except OSError as error:
-        _log.warning("cannot write %s: %s", what, error.strerror or error)
 
 
 class AUCCurves(Callback):
@@ -80,7 +57,7 @@ class AUCCurves(Callback):
 
 
 class ValidationSheet(Callback):
-    """Writes ``val_NAME.png`` after every validation and logs it as ``val/NAME``.
+    """A contact sheet, written as ``val_NAME.png`` and logged as ``val/NAME``.
 
     Args:
         num_images: Images on the sheet, the first ones of the validation set.
@@ -88,7 +65,7 @@ class ValidationSheet(Callback):
 
     name: ClassVar[str]
 
-    def __init__(self, num_images: int) -> None:
+    def __init__(self, num_images: int = 12) -> None:
         self.num_images = num_images
         self._tiles: list[Tile] = []
         self._num_drawn = 0
@@ -129,14 +106,28 @@ class ValidationSheet(Callback):
         log_picture(trainer, f"val/{self.name}", sheet)
 
 
+class Overlays(ValidationSheet):
+    """Wireframes, the predicted ones yellow and the true ones green: ``val_overlay.png``."""
+
+    name: ClassVar[str] = "overlay"
+
+    def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
+        """Return each image with its wireframes."""
+        images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
+        truths = batch.keypoints.cpu().numpy()
+        tiles = []
+        for row, detections in enumerate(system.recover(outputs, batch)):
+            wireframes = [Wireframe(points, GREEN, "true") for points in truths[row]]
+            wireframes += [Wireframe(one.keypoints, YELLOW, "predicted") for one in detections]
+            tiles.append(Tile(overlay(images[row], wireframes), batch.keys[row]))
+        return tiles
+
+
 class BeliefMaps(ValidationSheet):
-    """Writes ``val_belief.png`` after every validation and logs it as ``val/belief``.
+    """The images under the network's belief maps: ``val_belief.png``.
 
-    Two pictures per image, with their maxima: the strongest belief of any corner, and of the
+    Each image is there twice, with the maxima: the strongest belief of any corner, and of the
     centroid, over all objects.
-
-    Args:
-        num_images: Images on the sheet, the first ones of the validation set.
     """
 
     name: ClassVar[str] = "belief"
@@ -180,25 +171,17 @@ def heat_picture(
     return np.asarray(np.rint(blended), np.uint8)
 
 
-class Overlays(ValidationSheet):
-    """Writes ``val_overlay.png`` after every validation and logs it as ``val/overlay``.
+def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
+    for logger in trainer.loggers:
+        if isinstance(logger, GuardedLogger):
+            logger.log_picture(name, image, trainer.global_step)
 
-    Args:
-        num_images: Images on the sheet, the first ones of the validation set.
-    """
 
-    name: ClassVar[str] = "overlay"
-
-    def __init__(self, num_images: int = 12) -> None:
-        super().__init__(num_images)
-
-    def tiles(self, system: PoseSystem, outputs: ValidationOutput, batch: Batch) -> Sequence[Tile]:
-        """Return each image with its wireframes."""
-        images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
-        truths = batch.keypoints.cpu().numpy()
-        tiles = []
-        for row, detections in enumerate(system.recover(outputs, batch)):
-            wireframes = [Wireframe(points, GREEN, "true") for points in truths[row]]
-            wireframes += [Wireframe(one.keypoints, YELLOW, "predicted") for one in detections]
-            tiles.append(Tile(overlay(images[row], wireframes), batch.keys[row]))
-        return tiles
+@contextmanager
+def best_effort(what: str) -> Iterator[None]:
+    """Report it in a line where a file cannot be written, and go on."""
+    try:
+        yield
+    except OSError as error:
+        _log.warning("cannot write %s: %s", what, error.strerror or error)

@@ -1,6 +1,7 @@
-"""The end of a training whose validation no longer improves.
+"""Validation in poses, and the end of a training whose validation no longer improves.
 
-Validation in poses: recovery on the maps, then the accumulator that every evaluation uses.
+Poses are recovered from the maps and go into the accumulator that every evaluation uses. To log
+another metric, a field of :class:`~dopepp.metrics.row.PoseRow` and its name in :data:`LOGGED`.
 """
 
 from __future__ import annotations

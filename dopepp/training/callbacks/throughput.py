@@ -1,33 +1,40 @@
-"""The progress bar: of the present epoch, with the time left for the whole run.
+"""Where a training's time goes: its speed, the time that is left, and Lightning's profilers.
 
-How fast training runs and what it waits for.
-
-Where a training's time goes: Lightning's profilers, written into the run's folder.
-
-To add one, a subclass of Lightning's ``Profiler`` with :meth:`totals`, and a line in
-:func:`make_profiler`.
+To add a profiler, a subclass of Lightning's and a line in :func:`make_profiler` and in
+:func:`profile_rows`.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.profilers import Profiler, PyTorchProfiler, SimpleProfiler
 from torch.profiler import profile
 
-from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
 
 _log = logging.getLogger(__name__)
 
+FOLDER: Final = "profile"
+"""Where in the run folder the full report is, and with ``pytorch`` the traces for a browser."""
+
 _STARVED: Final = 0.2
 """A larger share of waiting is worth a hint."""
+_REFRESH_EVERY: Final = 5
+"""Batches; drawing the bar costs more than a small network's step."""
+_FILE: Final = "report"
+_US: Final = 1e-6
+_SHOWN: Final = 12
+
+Total = tuple[str, int, float]
+"""What took time, how often it was called, and seconds of all calls."""
 
 
 class Throughput(Callback):
@@ -96,10 +103,6 @@ class Throughput(Callback):
             )  # fmt: skip
 
 
-_REFRESH_EVERY = 5
-"""Batches; drawing the bar costs more than a small network's step."""
-
-
 class RunProgress(TQDMProgressBar):
     """Adds ``left``, the time until the run's last step, to the bar of the epoch.
 
@@ -128,38 +131,13 @@ class RunProgress(TQDMProgressBar):
         return {"left": str(timedelta(seconds=round(seconds))), **metrics}
 
 
-FOLDER: Final = "profile"
-"""Where in the run folder the full report is, and with ``pytorch`` the traces for a browser."""
-
-_FILE: Final = "report"
-_US: Final = 1e-6
-_SHOWN: Final = 12
-
-Total = tuple[str, int, float]
-"""What took time, how often it was called, and seconds of all calls."""
-
-
-class Hooks(SimpleProfiler):
-    """The hooks of the training loop, over the whole training.
-
-    Args:
-        folder: Where the report is written to.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(dirpath=folder, filename=_FILE)
-
-    def totals(self) -> list[Total]:
-        """Return every hook; one that calls another one contains its time."""
-        recorded = self.recorded_durations.items()
-        return [(name, len(seconds), sum(seconds)) for name, seconds in recorded]
-
-
 class Operators(PyTorchProfiler):
     """Torch's operators in a few steps of training and of validation, without what they call.
 
+    Lightning's own report is of the last recording alone, a validation.
+
     Args:
-        folder: Where the report and a trace of each are written to.
+        folder: Where the report and a trace of each recording are written to.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -168,7 +146,7 @@ class Operators(PyTorchProfiler):
         self._totals: dict[str, tuple[int, float]] = {}
 
     def _collect(self, recorded: profile) -> None:
-        """Add a recording; Lightning's own report is of the last one alone, a validation."""
+        """Add a recording."""
         self._folder.mkdir(parents=True, exist_ok=True)
         recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
         self._num_traces += 1
@@ -181,37 +159,30 @@ class Operators(PyTorchProfiler):
             self._totals[one.key] = (calls + one.count, seconds + spent)
 
     def totals(self) -> list[Total]:
-        """Return every operator; of a GPU's, launching and running together."""
-        return [(name, *total) for name, total in self._totals.items()]
+        """Return every operator, the slowest first; of a GPU's, launching and running together."""
+        return _slowest_first((name, *total) for name, total in self._totals.items())
 
     def summary(self) -> str:
         """Return the report."""
         self._delete_profilers()
-        lines = [
-            f"{seconds:12.6f} s {calls:8d} calls  {name}"
-            for name, calls, seconds in sorted(self.totals(), key=_seconds, reverse=True)
-        ]
-        return "\n".join(lines) + "\n"
+        return "".join(
+            f"{seconds:12.6f} s {calls:8d} calls  {name}\n"
+            for name, calls, seconds in self.totals()
+        )
 
 
-def make_profiler(kind: object, run_dir: Path) -> Profiler | None:
+def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
     """Build the profiler that ``trainer.profiler`` names.
 
     Args:
         kind: ``simple`` (hooks of the training loop), ``pytorch`` (operators, a few steps) or None.
         run_dir: The run's folder.
-
-    Raises:
-        UserError: It is something else.
     """
     if kind is None:
         return None
-    kinds: dict[str, type[Hooks] | type[Operators]] = {"simple": Hooks, "pytorch": Operators}
-    if not isinstance(kind, str) or kind not in kinds:
-        raise UserError(
-            f"trainer.profiler={kind!r:.100}", f"null, {', '.join(kinds)}", "choose one of them"
-        )
-    return kinds[kind](run_dir / FOLDER)
+    if kind == "simple":
+        return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
+    return Operators(run_dir / FOLDER)
 
 
 def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
@@ -221,9 +192,12 @@ def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
         profiler: Of :func:`make_profiler`, after the training; of any other nothing is known.
         limit: Rows, at most.
     """
-    if not isinstance(profiler, Hooks | Operators):
-        return []
-    totals = sorted(profiler.totals(), key=_seconds, reverse=True)
+    totals: list[Total] = []
+    if isinstance(profiler, Operators):
+        totals = profiler.totals()
+    elif isinstance(profiler, SimpleProfiler):  # a hook that calls another one contains its time
+        recorded = profiler.recorded_durations.items()
+        totals = _slowest_first((name, len(seconds), sum(seconds)) for name, seconds in recorded)
     return [
         {
             "what": name,
@@ -235,5 +209,5 @@ def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
     ]
 
 
-def _seconds(total: Total) -> float:
-    return total[2]
+def _slowest_first(totals: Iterable[Total]) -> list[Total]:
+    return sorted(totals, key=lambda total: total[2], reverse=True)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
-from dopepp.models.registry import check_integer
 
 if TYPE_CHECKING:
     from optuna import Study

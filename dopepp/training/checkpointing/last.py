@@ -2,9 +2,7 @@
 
 A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
 metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
-``docs/reliability.md``.
-
-Ctrl-C and SIGTERM while training: remembered, and answered between two steps.
+``docs/reliability.md``. Ctrl-C and SIGTERM are remembered and answered between two steps.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from dopepp.core.interrupts import Interruption
 from dopepp.data.batch import Batch
 from dopepp.data.loader import PoseLoader
 from dopepp.training.checkpointing import resume_point
-from dopepp.training.checkpointing import resume_point as random_state
 from dopepp.training.checkpointing.files import (
     FOLDER,
     LAST,
@@ -36,62 +33,12 @@ from dopepp.training.checkpointing.files import (
     sweep,
 )
 
-
-class StopRequest:
-    """Takes the signals that ask a run to stop, so that it can save before it does.
-
-    The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
-    that is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
-    the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
-
-    Attributes:
-        number: The signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
-    """
-
-    def __init__(self) -> None:
-        self.number: int | None = None
-        self._process = os.getpid()
-        self._kept: dict[int, Any] = {}
-
-    def listen(self) -> None:
-        """Take the signals over from whoever had them; in the main thread only."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        for number in _numbers():
-            self._kept[number] = signal.signal(number, self._remember)
-
-    def end(self) -> None:
-        """Give the signals back."""
-        for number, handler in self._kept.items():
-            signal.signal(number, handler)
-        self._kept = {}
-
-    def _remember(self, number: int, _: FrameType | None) -> None:
-        if os.getpid() != self._process:  # a loader's worker: its parent decides
-            return
-        if number == signal.SIGINT and self.number is not None:
-            raise Interruption(number)
-        first = self.number is None
-        self.number = signal.SIGINT if number == signal.SIGINT else signal.SIGTERM
-        if first:
-            # Not through a stream or a logger: the signal may have come in the middle of its own.
-            os.write(2, _ANSWERS[self.number])
-
+_log = logging.getLogger(__name__)
 
 _ANSWERS: Final = {
     int(signal.SIGINT): b"\nsaving after this step; Ctrl-C again ends at once\n",
     int(signal.SIGTERM): b"\nasked to stop: saving after this step\n",
 }
-
-
-def _numbers() -> list[int]:
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if "SLURM_JOB_ID" in os.environ:
-        numbers.append(signal.SIGUSR1)
-    return [int(number) for number in numbers]
-
-
-_log = logging.getLogger(__name__)
 
 Cut = Callable[[dict[str, Any]], None]
 """Sets a loop state's counters to a moment that can be resumed from."""
@@ -127,7 +74,7 @@ class LastCheckpoint(Checkpoint):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the random generators' states; in a validation, those at its beginning."""
-        return {"random": self._random or random_state.capture()}
+        return {"random": self._random or resume_point.capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Keep the states until training starts."""
@@ -147,7 +94,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take up the random states and the signals; tidy up after the run that was cut off."""
         if self._random is not None:
-            random_state.restore(self._random)
+            resume_point.restore(self._random)
             self._random = None
         _find_place(trainer)
         if trainer.is_global_zero:
@@ -168,7 +115,7 @@ class LastCheckpoint(Checkpoint):
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remember the random states that a repeated validation has to begin with."""
-        self._random = random_state.capture()
+        self._random = resume_point.capture()
 
     def on_validation_batch_start(
         self,
@@ -194,7 +141,9 @@ class LastCheckpoint(Checkpoint):
         self._stop.end()
         self._save(trainer, resume_point.between_epochs)
         if trainer.is_global_zero:
-            _files(trainer).finish()
+            files = trainer.strategy.checkpoint_io
+            assert isinstance(files, AtomicCheckpointIO)
+            files.finish()
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -235,6 +184,48 @@ class LastCheckpoint(Checkpoint):
         self._saved = _state(trainer)
 
 
+class StopRequest:
+    """Takes the signals that ask a run to stop, so that it can save before it does.
+
+    The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
+    that is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
+    the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
+
+    Attributes:
+        number: The signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._process = os.getpid()
+        self._kept: dict[int, Any] = {}
+
+    def listen(self) -> None:
+        """Take the signals over from whoever had them; in the main thread only."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        requeued = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
+        for number in (signal.SIGINT, signal.SIGTERM, *requeued):
+            self._kept[number] = signal.signal(number, self._remember)
+
+    def end(self) -> None:
+        """Give the signals back."""
+        for number, handler in self._kept.items():
+            signal.signal(number, handler)
+        self._kept = {}
+
+    def _remember(self, number: int, _: FrameType | None) -> None:
+        if os.getpid() != self._process:  # a loader's worker: its parent decides
+            return
+        if number == signal.SIGINT and self.number is not None:
+            raise Interruption(number)
+        first = self.number is None
+        self.number = signal.SIGINT if number == signal.SIGINT else signal.SIGTERM
+        if first:
+            # Not through a stream or a logger: the signal may have come in the middle of its own.
+            os.write(2, _ANSWERS[self.number])
+
+
 def _set_aside_damaged(trainer: Trainer) -> None:
     """Keep a damaged file from taking the place of the whole one that is resumed from."""
     last = Path(trainer.default_root_dir) / FOLDER / LAST
@@ -258,8 +249,7 @@ def _find_place(trainer: Trainer) -> None:
 
 def _state(trainer: Trainer) -> tuple[int, float | None]:
     """Return the step and the best score: what a checkpoint that is worth saving differs in."""
-    best = _best(trainer)
-    score = None if best is None else best.best_model_score
+    score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
 
 
@@ -288,9 +278,3 @@ def _forget_later_best(trainer: Trainer) -> None:
     best.best_k_models, best.kth_value = {}, fresh.kth_value
     best.best_model_path = best.kth_best_model_path = ""
     best.best_model_score = None
-
-
-def _files(trainer: Trainer) -> AtomicCheckpointIO:
-    files = trainer.strategy.checkpoint_io
-    assert isinstance(files, AtomicCheckpointIO)
-    return files

@@ -13,7 +13,7 @@ from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.body import Body
-from dopepp.virtual.scene import NEAR, SceneObject
+from dopepp.virtual.scene import NEAR
 
 _TARGET_TRIES: Final = 200
 """Poses of a target to try; four of five first ones of the preset ``paper`` are accepted."""
@@ -102,17 +102,13 @@ def _place_distractor(composition: Composition, reference: float) -> None:
 
 def _is_clear(composition: Composition, body: Body, T_cam_obj: Float[np.ndarray, "4 4"]) -> bool:
     """Tell whether no target reaches into the core of a new object."""
-    core = _CORE * body.surface.radius
-    return not any(
-        _reaches(item, T_cam_obj[:3, 3], core) for item in composition.objects if item.is_target
-    )
-
-
-def _reaches(target: SceneObject, centre: Float[np.ndarray, "3"], radius: float) -> bool:
-    assert target.part is not None
-    away = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))
-    if away > radius + target.surface.radius:
-        return False
-    probes = target.part.points[:: max(len(target.part.points) // _NUM_PROBES, 1)]
-    points = transform(target.T_cam_obj, probes)
-    return bool(np.linalg.norm(points - centre, axis=1).min() < radius)
+    centre, core = T_cam_obj[:3, 3], _CORE * body.surface.radius
+    for target in composition.objects:
+        away = float(np.linalg.norm(target.T_cam_obj[:3, 3] - centre))
+        if target.part is None or away > core + target.surface.radius:
+            continue
+        probes = target.part.points[:: max(len(target.part.points) // _NUM_PROBES, 1)]
+        points = transform(target.T_cam_obj, probes)
+        if np.linalg.norm(points - centre, axis=1).min() < core:
+            return False
+    return True

@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32, Int
 from dopepp.geometry.camera import make_transform
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.body import Body
-from dopepp.virtual.presets.table import Table, inverse_depth_of, plane_of
+from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 
@@ -111,7 +111,7 @@ class _Setting:
         # A heap needs fine cells but little room; on a free table it is the other way round.
         reach = self._radius + 2 * diameter if table.heaped else 2 * distance
         self._map = HeightMap(max(_CELL_SHARE * diameter, reach / _MAX_HALF_CELLS), reach)
-        self._inverse_depth = inverse_depth_of(plane_of(self.T_cam_table), composition.K)
+        self._inverse_depth = inverse_depth_row(plane_of(self.T_cam_table), composition.K)
 
     def place(self, body: Body) -> bool:
         """Lay a body down; tell whether it found a place."""

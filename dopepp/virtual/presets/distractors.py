@@ -46,11 +46,11 @@ class Distractors:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_counts(self, "number", 0, 100)
-        check_range(self, "image_share", 1e-3, 10.0, "image widths")
-        check_range(self, "depth", 0.01, 100.0, "depths of the first target")
-        check_number(self, "lookalike_share", 0.0, 1.0, "share")
-        check_range(self, "lookalike_scale", 0.01, 100.0, "factor")
+        check_counts("number", self.number, 0, 100, of=self)
+        check_range("image_share", self.image_share, 1e-3, 10.0, "image widths", of=self)
+        check_range("depth", self.depth, 0.01, 100.0, "depths of the first target", of=self)
+        check_number("lookalike_share", self.lookalike_share, 0.0, 1.0, "share", of=self)
+        check_range("lookalike_scale", self.lookalike_scale, 0.01, 100.0, "factor", of=self)
 
     def draw(
         self, rng: np.random.Generator, width_at_depth: float, negatives: Sequence[Body]

@@ -62,14 +62,14 @@ class Lighting:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_counts(self, "num_lights", 0, 8)
+        check_counts("num_lights", self.num_lights, 0, 8, of=self)
         for name in ("key_intensity", "fill_intensity", "ambient_intensity"):
-            check_range(self, name, 0.0, 10.0, "1 = white")
-        check_number(self, "max_angle_deg", 0.0, 180.0, "degrees")
-        check_range(self, "distance", 0.1, 1000.0, "camera distances")
-        check_range(self, "temperature_k", _COLDEST_K, _HOTTEST_K, "kelvin")
-        check_number(self, "tint", 0.0, 0.9, "share")
-        check_range(self, "ground_share", 0.0, 1.0, "share")
+            check_range(name, getattr(self, name), 0.0, 10.0, "1 = white", of=self)
+        check_number("max_angle_deg", self.max_angle_deg, 0.0, 180.0, "degrees", of=self)
+        check_range("distance", self.distance, 0.1, 1000.0, "camera distances", of=self)
+        check_range("temperature_k", self.temperature_k, _COLDEST_K, _HOTTEST_K, "kelvin", of=self)
+        check_number("tint", self.tint, 0.0, 0.9, "share", of=self)
+        check_range("ground_share", self.ground_share, 0.0, 1.0, "share", of=self)
 
     def draw(
         self,

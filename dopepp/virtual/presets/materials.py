@@ -77,17 +77,17 @@ class Materials:
             "print_share",
             "alike_share",
         ):
-            check_number(self, name, 0.0, 1.0, "share")
+            check_number(name, getattr(self, name), 0.0, 1.0, "share", of=self)
         for name in ("albedo", "saturation", "specular", "metal_albedo", "noise"):
-            check_range(self, name, 0.0, 1.0, "share")
+            check_range(name, getattr(self, name), 0.0, 1.0, "share", of=self)
         for name in ("roughness", "metal_roughness"):
-            check_range(self, name, 0.02, 1.0, "GGX roughness")
-        check_range(self, "texture_gain", 0.0, 4.0, "factor")
-        check_range(self, "noise_pitch", 1e-3, 10.0, "radii")
+            check_range(name, getattr(self, name), 0.02, 1.0, "GGX roughness", of=self)
+        check_range("texture_gain", self.texture_gain, 0.0, 4.0, "factor", of=self)
+        check_range("noise_pitch", self.noise_pitch, 1e-3, 10.0, "radii", of=self)
         for name in ("brush_pitch", "layer_pitch"):
-            check_range(self, name, 1e-6, 0.1, "metres")
+            check_range(name, getattr(self, name), 1e-6, 0.1, "metres", of=self)
         for name in ("brush_slope", "layer_slope"):
-            check_range(self, name, 0.0, 2.0, "tangent")
+            check_range(name, getattr(self, name), 0.0, 2.0, "tangent", of=self)
 
     def draw(self, rng: np.random.Generator, surface: Surface) -> Material:
         """Draw what a surface is made of."""

@@ -101,7 +101,7 @@ class FacingTurning:
     def __post_init__(self) -> None:
         """Check the angles."""
         for name in ("in_plane_deg", "tilt_deg"):
-            check_number(self, name, 0.0, 180.0, "degrees")
+            check_number(name, getattr(self, name), 0.0, 180.0, "degrees", of=self)
 
     def draw(self, rng: np.random.Generator) -> Matrix:
         """Return a rotation from the object to the camera frame."""
@@ -134,7 +134,7 @@ class OffsetPlacement(Placement):
     def __post_init__(self) -> None:
         """Check that the box lies before the camera."""
         for name in ("distance", "axial", "lateral"):
-            check_number(self, name, 0.0, _FARTHEST, "metres")
+            check_number(name, getattr(self, name), 0.0, _FARTHEST, "metres", of=self)
         if not self.axial < self.distance:
             raise UserError(
                 f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
@@ -174,8 +174,8 @@ class DistancePlacement(Placement):
     def __post_init__(self) -> None:
         """Check the range."""
         for name in ("nearest", "farthest"):
-            check_number(self, name, 1e-6, _FARTHEST, "metres")
-        check_number(self, "margin", 0.0, 0.49, "share")
+            check_number(name, getattr(self, name), 1e-6, _FARTHEST, "metres", of=self)
+        check_number("margin", self.margin, 0.0, 0.49, "share", of=self)
         if self.nearest > self.farthest:
             raise UserError(
                 f"nearest={self.nearest} and farthest={self.farthest} of DistancePlacement",
@@ -210,7 +210,7 @@ class FillPlacement(Placement):
     def __post_init__(self) -> None:
         """Check the range."""
         for name in ("smallest", "largest"):
-            check_number(self, name, 1e-3, 1.0, "share of the image")
+            check_number(name, getattr(self, name), 1e-3, 1.0, "share of the image", of=self)
         if self.smallest > self.largest:
             raise UserError(
                 f"smallest={self.smallest} and largest={self.largest} of FillPlacement",

@@ -83,11 +83,11 @@ class Preset:
 
     def __post_init__(self) -> None:
         """Check what a user may have replaced."""
-        check_counts(self, "targets_per_image", 0, 100)
+        check_counts("targets_per_image", self.targets_per_image, 0, 100, of=self)
         for name in ("width", "height"):
-            check_number(self, name, 8, 16384, "pixels")
-        check_number(self, "min_visible_fraction", 0.0, 0.95, "share")
-        check_number(self, "horizontal_fov_deg", 5.0, 150.0, "degrees")
+            check_number(name, getattr(self, name), 8, 16384, "pixels", of=self)
+        check_number("min_visible_fraction", self.min_visible_fraction, 0.0, 0.95, "share", of=self)
+        check_number("horizontal_fov_deg", self.horizontal_fov_deg, 5.0, 150.0, "degrees", of=self)
         if self.intrinsics_px is not None and len(self.intrinsics_px) != 4:
             raise UserError(
                 f"intrinsics_px={self.intrinsics_px} of preset {self.name}",

@@ -56,14 +56,14 @@ class Table:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        check_range(self, "distance", 0.02, 100.0, "metres")
-        check_range(self, "elevation_deg", 10.0, 90.0, "degrees")
-        check_number(self, "roll_deg", 0.0, 180.0, "degrees")
-        check_number(self, "tilted_share", 0.0, 1.0, "share")
-        check_range(self, "tilt_deg", 0.0, 90.0, "degrees")
-        check_flag(self, "heaped")
-        check_range(self, "heap_radius", 0.0, 10.0, "diameters")
-        check_range(self, "picture_width", 0.1, 20.0, "camera distances")
+        check_range("distance", self.distance, 0.02, 100.0, "metres", of=self)
+        check_range("elevation_deg", self.elevation_deg, 10.0, 90.0, "degrees", of=self)
+        check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
+        check_number("tilted_share", self.tilted_share, 0.0, 1.0, "share", of=self)
+        check_range("tilt_deg", self.tilt_deg, 0.0, 90.0, "degrees", of=self)
+        check_flag("heaped", self.heaped, of=self)
+        check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
+        check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
 
     def draw_view(self, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
@@ -156,7 +156,7 @@ def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
     return Plane(triple(T_cam_table[:3, 2]), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
 
 
-def inverse_depth_of(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def inverse_depth_row(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Return what a homogeneous pixel is multiplied with to give the plane's 1/depth, 1/m.
 
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
@@ -180,7 +180,7 @@ def _beyond(
 ) -> Bool[np.ndarray, "height width"] | None:
     """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
     width, height = size
-    slope = inverse_depth_of(plane_of(T_cam_table), K)
+    slope = inverse_depth_row(plane_of(T_cam_table), K)
     across, down = slope[0] * np.arange(width), slope[1] * np.arange(height) + slope[2]
     if across.min() + down.min() >= 1 / end:
         return None

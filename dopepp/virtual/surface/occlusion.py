@@ -60,6 +60,7 @@ class OpenSky:
 
 
 _BAKED: Final[dict[bytes, OpenSky]] = {}
+"""What this process has baked, by a hash of the mesh."""
 
 
 def bake_open_sky(
@@ -91,6 +92,7 @@ def bake_open_sky(
 
 
 def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> OpenSky:
+    """Draw a mesh from all around and look its points up in the depth maps."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)

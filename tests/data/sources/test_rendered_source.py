@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -74,16 +71,6 @@ def test_bounds_description_and_objects(factory: Factory) -> None:
     assert info.identity["parts"] == {servoholder().name: servoholder().mesh_hash}
     (other,) = RenderedSource(Factory(factory.parts, factory.preset, 4), 3).describe()
     assert other.identity != info.identity
-
-
-def test_the_render_path_loads_neither_torch_nor_lightning() -> None:
-    code = (
-        "import sys, dopepp.data.sources.rendered, dopepp.data.formats.ycb_video.source; "
-        "import dopepp.data.sources.hybrid, dopepp.data.sources.cache, dopepp.data.transforms; "
-        "import dopepp.data.transforms.masking, dopepp.data.transforms.augment; "
-        "sys.exit(bool({'torch', 'lightning'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_another_scale_is_the_same_test_set_from_elsewhere(factory: Factory) -> None:

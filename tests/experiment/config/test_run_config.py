@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,7 @@ Composer = Callable[..., dict[str, Any]]
         ("+virtual.colour=red", "virtual.colour='red'"),
         ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
         ("~data.batch_size", "no data.batch_size"),
+        ("~trainer", "no trainer.max_epochs"),
         ("job=mow", "job='mow'"),
         ("seed=-1", "seed=-1"),
         ("seed=1.5", "seed=1.5"),
@@ -63,6 +65,7 @@ Composer = Callable[..., dict[str, Any]]
         ("lr_finder.num_steps=9", "lr_finder.num_steps=9"),
         ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
         ("trainer.max_epochs=0", "trainer.max_epochs=0"),
+        ("+trainer.num_nodes=0", "trainer.num_nodes=0"),
         ("trainer.ddp_timeout_s=0", "trainer.ddp_timeout_s=0"),
         ("trainer.profiler=slow", "trainer.profiler='slow'"),
     ],
@@ -121,7 +124,7 @@ def test_an_older_runs_config_is_no_other_one(composed: Composer, tmp_path: Path
     plain = composed()
     former = {present: name for name, present in FORMER_TARGETS.items()}
     older = with_present_names(plain)
-    older["data"] = {**older["data"], "virtual": dict(older["virtual"])}
+    older["data"] = {**older["data"], "virtual": copy.deepcopy(older["virtual"])}
     for node in (older["data"]["masking"], older["data"]["augment"], *older["callbacks"].values()):
         node["_target_"] = former.get(node["_target_"], node["_target_"])
     assert "dopepp.training.finite.FiniteSteps" in dict(flat(older)).values()

@@ -63,11 +63,23 @@ def check_two_done_and_one_failed(folder: Path, out: str, err: str) -> None:
 
 
 @pytest.mark.slow
-def test_joblib(sweep: Callable[..., Called], tmp_path: Path) -> None:
-    pytest.importorskip("joblib")
-    code, out, err = sweep("hydra/launcher=joblib", SWEPT, END_1="raise")
+@pytest.mark.parametrize(
+    ("package", "options"),
+    [
+        ("joblib", ["hydra/launcher=joblib"]),
+        ("submitit", ["hydra/launcher=submitit_slurm", "hydra.launcher.cluster=local",
+                      "hydra.launcher.gpus_per_node=0"]),
+    ],
+)  # fmt: skip
+def test_processes_of_this_machine(
+    package: str, options: list[str], sweep: Callable[..., Called], tmp_path: Path
+) -> None:
+    pytest.importorskip(package)
+    code, out, err = sweep(*options, SWEPT, END_1="raise")
     assert code == 0, err
     check_two_done_and_one_failed(tmp_path, out, err)
+    logs = list((tmp_path / "sweep" / ".submitit").glob("*/*_log.out"))
+    assert bool(logs) == (package == "submitit")
 
 
 @pytest.mark.slow
@@ -75,29 +87,14 @@ def test_joblib_with_a_process_that_is_lost(sweep: Callable[..., Called], tmp_pa
     pytest.importorskip("joblib")
     code, out, err = sweep("hydra/launcher=joblib", "seed=0,1,2,3,4", END_1="kill")
     assert code == 0, err
-    lost = [
-        number for number in range(5) if (tmp_path / "sweep" / f"{number}/failed.json").exists()
-    ]
+    lost = {number for number in range(5) if (tmp_path / f"sweep/{number}/failed.json").exists()}
     assert 1 in lost
     assert len(lost) <= 2  # and at most the one beside it
-    for number in range(5):
-        if number in lost:
-            assert reason(tmp_path, number).startswith(
-                "its process was lost: TerminatedWorkerError"
-            )
-        else:
-            assert (tmp_path / "sweep" / str(number) / "metrics.json").is_file()
+    for number in lost:
+        assert reason(tmp_path, number).startswith("its process was lost: TerminatedWorkerError")
+    for number in {0, 1, 2, 3, 4} - lost:
+        assert (tmp_path / f"sweep/{number}/metrics.json").is_file()
     assert "ended, 5 of 5" in out
-
-
-@pytest.mark.slow
-def test_submitit_on_this_machine(sweep: Callable[..., Called], tmp_path: Path) -> None:
-    pytest.importorskip("submitit")
-    here = ("hydra/launcher=submitit_slurm", "hydra.launcher.cluster=local")
-    code, out, err = sweep(*here, "hydra.launcher.gpus_per_node=0", SWEPT, END_1="raise")
-    assert code == 0, err
-    check_two_done_and_one_failed(tmp_path, out, err)
-    assert list((tmp_path / "sweep" / ".submitit").glob("*/*_log.out"))
 
 
 SBATCH = """#!/bin/bash

@@ -28,16 +28,22 @@ def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(
     assert slurm.begun_run(["seed=1"]) is None
 
 
-def test_an_array_job_is_named_as_scontrol_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "10")
-    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
-    assert slurm.job_id() == "10_3"
-
-
-@pytest.mark.parametrize("text", ["", "1; rm", "--help"])
-def test_what_is_no_job_id_is_none(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SLURM_JOB_ID", text)
-    assert slurm.job_id() is None
+@pytest.mark.parametrize(
+    ("variables", "named"),
+    [
+        ({}, "12"),
+        ({"SLURM_ARRAY_JOB_ID": "10", "SLURM_ARRAY_TASK_ID": "3"}, "10_3"),  # as scontrol does
+        ({"SLURM_JOB_ID": ""}, None),
+        ({"SLURM_JOB_ID": "1; rm"}, None),
+        ({"SLURM_JOB_ID": "--help"}, None),
+    ],
+)
+def test_a_job_is_named(
+    variables: dict[str, str], named: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert slurm.job_id() == named
 
 
 def test_a_refused_or_missing_scontrol_is_told(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,18 @@ from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.cost import COST_FILE
-from dopepp.experiment.reports.compare.compare import (
+from dopepp.experiment.reports.compare import (
     compare_paths,
     compare_reports,
     compare_runs,
     write_comparison,
 )
-from dopepp.experiment.reports.compare.entries import Entry, differences, group, ordered
-from dopepp.experiment.reports.compare.pictures import logged
-from dopepp.experiment.reports.compare.runs import find_runs, read_run
-from dopepp.experiment.reports.compare.table import full, headline, lines
+from dopepp.experiment.reports.differences import differences, figures, full, headline
+from dopepp.experiment.reports.entries import Entry, find_runs, group, ordered, read_run
 from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.pictures import logged
 from dopepp.experiment.reports.report import Report
+from dopepp.experiment.reports.tables import DELTA, read_csv
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
 from dopepp.metrics.pose import MEAN
@@ -59,11 +58,6 @@ def report(
 
 
 GOOD, BAD = [0.005] * 30 + [np.inf] * 2, [0.004] * 10 + [0.02] * 20 + [np.inf] * 2
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def entry(name: str, *reports: Report, seeds: Sequence[int | None] | None = None) -> Entry:
@@ -125,10 +119,10 @@ def test_differences_are_those_of_the_rows() -> None:
 
 def test_seeds_become_mean_and_deviation() -> None:
     mine = entry("dopepp", report("dopepp", GOOD), report("dopepp", BAD), seeds=[2, 1])
-    row = full(lines([mine]))[0]
+    row = full(figures([mine]))[0]
     assert (row["seeds"], row["ADD-0.1d %"]) == ("1, 2", "62.5")
     assert row["± ADD-0.1d %"] == f"{100 * np.std([30 / 32, 10 / 32], ddof=1):.1f}"
-    assert headline(lines([mine]))[0]["ADD-0.1d %"] == "62.5 ± 44.2"
+    assert headline(figures([mine]))[0]["ADD-0.1d %"] == "62.5 ± 44.2"
 
 
 def test_seeds_are_paired_by_number_not_by_order() -> None:
@@ -178,12 +172,11 @@ def test_other_images_are_not_set_off(known: str, tmp_path: Path) -> None:
 def test_a_mean_over_other_objects_is_not_set_off() -> None:
     base = entry("dope", report("dope", BAD, num_objects=2))
     mine = report("x", GOOD, num_objects=3)
-    table = lines([base, entry("x", mine)])
-    by_object = {line.object: line.differences for line in table if line.method == "x"}
-    assert by_object["part0"]
-    assert not by_object["part2"]
-    assert not by_object[MEAN]
-    assert {line.object for line in table if line.method == "dope"} == {"part0", "part1", MEAN}
+    table = figures([base, entry("x", mine)])
+    changes = [one for one in table if one.method == "x" and one.measure.startswith(DELTA)]
+    assert {one.object for one in changes} == {"part0", "part1", "part2", MEAN}
+    assert {one.object for one in changes if one.value != ""} == {"part0", "part1"}
+    assert {one.object for one in table if one.method == "dope"} == {"part0", "part1", MEAN}
 
 
 def test_an_object_without_instances_has_no_difference() -> None:
@@ -194,11 +187,11 @@ def test_an_object_without_instances_has_no_difference() -> None:
 
 def test_all_missed_is_no_angle() -> None:
     base, mine = report("dope", BAD), report("x", [np.inf] * 32)
-    row = full(lines([entry("dope", base), entry("x", mine)]))[1]
+    row = full(figures([entry("dope", base), entry("x", mine)]))[1]
     assert (row["rotation °"], row["Δ rotation °"]) == ("n/a", "n/a")
     assert row["Δ ADD-0.1d % verdict"] == "beyond noise"
     seeds = entry("x", mine, report("x", GOOD))
-    assert seeds.row("part0").median_rotation_deg is None  # one seed's alone would flatter
+    assert full(figures([seeds]))[0]["rotation °"] == "n/a"  # one seed's alone would flatter
 
 
 def test_a_baseline_that_is_asked_for_stands_before_dope(tmp_path: Path) -> None:
@@ -264,6 +257,13 @@ def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
     assert names == ["dope optimizer=adam", "dopepp optimizer=sgd", f"dopepp {tmp_path.name}/10"]
 
 
+def test_no_two_methods_have_one_name(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
+    names = [one.name for one in group(find_runs(folders))]
+    assert names == [f"dope run {folder}" for folder in folders]
+    assert len(headline(figures(group(find_runs(folders))))) == 2
+
+
 def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path: Path) -> None:
     for seed in (1, 2):
         run = write_run(
@@ -309,7 +309,7 @@ def test_a_job_that_measures_costs_has_nothing_else(tmp_path: Path) -> None:
     record.write_json(write_run(tmp_path / "0") / COST_FILE, stored)
     (one,) = group(find_runs([tmp_path]))
     assert one.failure == ""
-    for table in (headline(lines([one])), full(lines([one]))):
+    for table in (headline(figures([one])), full(figures([one]))):
         (row,) = table
         assert (row["object"], row["parameters"], row["ms/frame"]) == ("cost only", "1,234", "12.0")
     write_comparison([entry("dope", report("dope", BAD)), one], tmp_path)

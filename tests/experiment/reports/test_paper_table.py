@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from dopepp.experiment.reports.compare.compare import compare_paths
 from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
+from dopepp.experiment.reports.compare import compare_paths
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import Report
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
 from dopepp.experiment.train import do_job
@@ -70,8 +70,7 @@ def end(folder: Path, table: dict[str, Any]) -> None:
 
 
 def read_table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "table.csv").open(newline="") as stream:
-        return list(csv.DictReader(stream))
+    return read_csv(folder / "table.csv")
 
 
 def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path: Path) -> None:
@@ -139,8 +138,7 @@ def test_one_network_a_part_is_one_method_with_a_mean(tmp_path: Path) -> None:
     assert found["without", "mean"]["the paper: ADD<5cm %"] == "85.2"
     assert found["with", "mean"]["the paper: ADD<5cm %"] == ""  # a mean of other parts
     assert found["with", "bolt"]["the paper: ADD<5cm %"] == "92.35"
-    with (tmp_path / "compare.csv").open(newline="") as stream:
-        compared = list(csv.DictReader(stream))
+    compared = read_csv(tmp_path / "compare.csv")
     assert {row["seeds"] for row in compared if row["method"].startswith("x ")} == {"1, 2"}
 
 
@@ -204,27 +202,25 @@ def test_shading_of_one_network_a_part_has_a_mean(tmp_path: Path) -> None:
     assert rows["nut", "ADD-0.1d %"] == "60.0"
 
 
-@pytest.mark.parametrize("experiment", ["table4_parameters", "table8_time"])
-def test_costs(composed: Composer, tmp_path: Path, experiment: str) -> None:
+def test_costs(composed: Composer, tmp_path: Path) -> None:
     small = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=3", "cost.batch_size=2")
-    config = composed(f"experiment={experiment}", *small)
     for number, name in enumerate(("dope", "dopepp")):
         folder = tmp_path / str(number)
         job(folder, [f"model={name}"], None)
         (folder / record.FAILURE_FILE).unlink()
-        do_job(composed(f"experiment={experiment}", f"model={name}", *small), folder)
-    printed = {"DOPE++": {"network": {"ms/frame": 33, "backbone weights": 1106696}}}
-    end(tmp_path, {**config["table"], "labels": LABELS, "paper": {**printed, "DRNet": {}}})
-    dope, dopepp, *others = read_table(tmp_path)
+        do_job(composed("experiment=table8_time", f"model={name}", *small), folder)
+    printed = {"DOPE++": {"network": {"ms/frame": 33, "backbone weights": 1106696}}, "DRNet": {}}
+    end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS, "paper": printed})
+    dope, dopepp = read_table(tmp_path)
     assert (dope["method"], dopepp["method"]) == ("DOPE", "DOPE++")
-    if experiment == "table4_parameters":
-        assert int(dope["parameters"].replace(",", "")) > int(dopepp["parameters"].replace(",", ""))
-        assert (dope["the paper"], dopepp["the paper"]) == ("", "1,106,696")
-    else:
-        assert float(dope["ms/frame"]) > float(dope["network ms"]) > 0
-        assert dopepp["the paper: ms/frame"] == "33"
-        assert [row["method"] for row in others] == ["DRNet"]
-    assert (tmp_path / "frame_rate.png").exists() == (experiment == "table8_time")
+    assert int(dope["parameters"].replace(",", "")) > int(dopepp["parameters"].replace(",", ""))
+    assert (dope["the paper"], dopepp["the paper"]) == ("", "1,106,696")
+    assert not (tmp_path / "frame_rate.png").exists()
+    end(tmp_path, {"title": "8", "kind": "time", "labels": LABELS, "paper": printed})
+    dope, dopepp, other = read_table(tmp_path)
+    assert float(dope["ms/frame"]) > float(dope["network ms"]) > 0
+    assert (dopepp["the paper: ms/frame"], other["method"]) == ("33", "DRNet")
+    assert (tmp_path / "frame_rate.png").exists()
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -249,12 +245,16 @@ def test_tables_train_as_the_paper_does_at_its_scale_and_as_we_do_on_a_laptop(
     assert paper["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
     assert paper["scheduler"]["_target_"] is None
     assert (paper["data"]["batch_size"], paper["trainer"]["max_epochs"]) == (32, 60)
-    ours = composed(f"experiment={experiment}", "recipe=ours")
+    ours = composed(f"experiment={experiment}", "scale=laptop")
     assert ours["recipe"] == "ours"
     assert ours["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
-    assert composed(f"experiment={experiment}", "scale=laptop")["recipe"] == "ours"
-    assert composed("experiment=paper")["optimizer"] == paper["optimizer"]
+
+
+def test_recipes_are_ours_unless_the_papers_are_asked_for(composed: Composer) -> None:
     assert composed()["recipe"] == "ours"
+    assert composed("experiment=paper")["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
+    table = composed("experiment=table6_dope_vs_dopepp", "recipe=ours")
+    assert table["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
 
 
 @pytest.mark.parametrize(
@@ -275,9 +275,7 @@ def test_finished_runs_in_another_tables_layout(tmp_path: Path) -> None:
     job(tmp_path / "sweep" / "0", ["model=dope"], [0.04, 0.06])
     job(tmp_path / "sweep" / "1", ["model=dopepp"], [0.04, 0.04])
     out = compare_paths(
-        [tmp_path / "sweep"],
-        tmp_path / "out",
-        table=FOLDER / "table6_dope_vs_dopepp.yaml",
+        [tmp_path / "sweep"], tmp_path / "out", table=FOLDER / "table6_dope_vs_dopepp.yaml"
     )
     measured = [row for row in read_table(out) if row["object"] == "part"]
     assert [row["method"] for row in measured] == ["DOPE", "DOPE++", "best constant pose"]

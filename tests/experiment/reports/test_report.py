@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.core.errors import UserError
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report
 from dopepp.experiment.runs import record
@@ -64,15 +61,6 @@ def test_a_report_of_an_earlier_version_is_read() -> None:
     assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
 
 
-def test_a_run_records_what_it_ran_with(tmp_path: Path) -> None:
-    environment: dict[str, Any] = record.environment(7, "abc")
-    record.write_json(tmp_path / record.VERSIONS_FILE, environment)
-    assert record.read_json(tmp_path / record.VERSIONS_FILE) == environment
-    assert (environment["seed"], environment["data_fingerprint"]) == (7, "abc")
-    assert environment["packages"]["torch"] == version("torch")
-    assert set(environment) >= {"dopepp", "python", "platform", "git", "hardware", "command"}
-
-
 def test_the_config_is_written_as_it_was(tmp_path: Path) -> None:
     config = {"b": {"x": [1, 2.5, None]}, "a": "größer"}
     record.write_config(tmp_path, config)
@@ -87,12 +75,3 @@ def test_json_that_nobody_else_could_read_is_not_written(tmp_path: Path) -> None
     with pytest.raises(ValueError, match="JSON"):
         record.write_json(path, {"a": float("nan")})
     assert record.read_json(path) == {"a": 1}
-
-
-@pytest.mark.parametrize("content", ["", "{", "[1]", None])
-def test_a_damaged_record_is_a_users_error(content: str | None, tmp_path: Path) -> None:
-    path = tmp_path / "metrics.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(UserError, match=r"metrics\.json"):
-        record.read_json(path)

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import os
-import pickle
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -106,25 +104,17 @@ def test_pretrained_weights_path_is_neither_written_nor_read(make_spec, part, tm
     assert loaded.backbone.out_channels == 16
 
 
-def test_a_missing_file(tmp_path):
-    for path in (tmp_path / "none.ckpt", tmp_path):
-        with pytest.raises(UserError, match=r"which is no file; allowed: a checkpoint \(\.ckpt\)"):
-            read(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", bytes(range(256)) * 40])
-def test_a_file_that_is_no_torch_file(tmp_path, content):
-    path = tmp_path / "a.ckpt"
-    path.write_bytes(content)
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"PK\x03\x04", bytes(range(256)) * 40, 0.5, 0.99]
+)
+def test_a_file_that_is_no_torch_file_or_was_cut_short(saved, content):
+    whole = saved.read_bytes()
+    cut = whole[: int(len(whole) * content)] if isinstance(content, float) else content
+    saved.write_bytes(cut)
     with pytest.raises(UserError, match="not a torch file or was cut short"):
-        read(path)
-
-
-@pytest.mark.parametrize("keep", [0.1, 0.5, 0.99])
-def test_a_truncated_file(saved, keep):
-    content = saved.read_bytes()
-    saved.write_bytes(content[: int(len(content) * keep)])
-    with pytest.raises(UserError, match="not a torch file or was cut short"):
+        read(saved)
+    saved.unlink()
+    with pytest.raises(UserError, match=r"which is no file; allowed: a checkpoint \(\.ckpt\)"):
         read(saved)
 
 
@@ -145,38 +135,6 @@ def test_a_zip_that_is_not_torchs(tmp_path):
         archive.writestr("a.txt", "hello")
     with pytest.raises(UserError, match="torch refuses to load"):
         read(tmp_path / "a.ckpt")
-
-
-class Malicious:
-    """Unpickling it creates the file that its argument names."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        return os.mkdir, (str(self.path),)
-
-
-def test_pickled_code_does_not_run(checkpoint, tmp_path):
-    trap = tmp_path / "executed"
-    content = checkpoint.to_file()
-    content["dopepp"]["data"] = {"x": Malicious(trap)}
-    torch.save(content, tmp_path / "a.ckpt")
-    with pytest.raises(UserError, match="torch refuses to load"):
-        read(tmp_path / "a.ckpt")
-    (tmp_path / "b.ckpt").write_bytes(pickle.dumps(Malicious(trap)))
-    with pytest.raises(UserError, match="not a torch file"):
-        read(tmp_path / "b.ckpt")
-    assert not trap.exists()
-
-
-def test_a_decompression_bomb_is_not_unpacked(tmp_path, monkeypatch):
-    path = tmp_path / "bomb.ckpt"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("archive/data.pkl", bytes(10_000_000))
-    monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("was loaded"))
-    with pytest.raises(UserError, match="which unpacks to 10000000 bytes"):
-        read(path)
 
 
 def test_a_file_over_the_limit(saved, monkeypatch):
@@ -253,14 +211,17 @@ def test_an_inconsistent_file_is_refused_in_one_line(saved, edit, message):
     assert "best.ckpt" in str(caught.value)
 
 
-def test_views_that_repeat_stored_numbers_are_refused(make_spec, part, tmp_path):
+def test_views_that_repeat_stored_numbers_are_refused(small_spec, part, tmp_path):
     """A file of kilobytes must not fill gigabytes: its tensors must hold what they span."""
-    spec = make_spec(backbone_width=4.0, head_width=4.0, head_stages=12)
-    with torch.device("meta"):
-        shapes = build_network(spec).state_dict()
-    state = {name: torch.zeros(()).expand(value.shape) for name, value in shapes.items()}
-    write_atomic(Checkpoint(spec, state, [part], (64, 64), 8, 1.0).to_file(), tmp_path / "a.ckpt")
-    assert (tmp_path / "a.ckpt").stat().st_size < 1_000_000
+    shapes = build_network(small_spec).state_dict()
+    state = {
+        name: torch.zeros((), dtype=value.dtype).expand(value.shape)
+        for name, value in shapes.items()
+    }
+    content = Checkpoint(small_spec, state, [part], (64, 64), 8, 1.0).to_file()
+    write_atomic(content, tmp_path / "a.ckpt")
+    stored = sum(value.numel() * value.element_size() for value in shapes.values())
+    assert (tmp_path / "a.ckpt").stat().st_size < stored
     with pytest.raises(UserError, match="first their size"):
         read(tmp_path / "a.ckpt")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +17,7 @@ from lightning.pytorch.loggers import Logger
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.metrics.pose import PoseMetrics
+from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.training.callbacks.pictures import AUCCurves, Overlays
 from dopepp.training.callbacks.pose_metrics import LOGGED, PoseMetricsCallback, batch_instances
@@ -74,14 +74,14 @@ class Offline(Logger):
 class Run:
     def __init__(self, folder: Path, system: PoseSystem, data: PoseDataModule) -> None:
         self.folder, self.system, self.data = folder, system, data
-        self.recorder, self.metrics = Recorder(), PoseMetricsCallback()
-        self.overlays = Overlays(num_images=2)
+        self.recorder = Recorder()
+        callbacks = [PoseMetricsCallback(), AUCCurves(), Overlays(2), Throughput(), self.recorder]
         trainer = Trainer(
             accelerator="cpu",
             max_epochs=1,
             default_root_dir=folder,
             logger=[MetricsTable(folder / "metrics.csv"), GuardedLogger(Offline)],
-            callbacks=[self.metrics, AUCCurves(), self.overlays, Throughput(), self.recorder],
+            callbacks=callbacks,
             use_distributed_sampler=False,
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -92,20 +92,16 @@ class Run:
         trainer.fit(system, datamodule=data)
 
 
-@pytest.fixture
-def run(
+def test_figures_pictures_and_throughput(
     make_system: SystemMaker,
     make_datamodule: Callable[[], PoseDataModule],
     tmp_path: Path,
+    read_png: Callable[[Path], np.ndarray],
+    read_csv: Callable[[Path], list[dict[str, str]]],
     caplog: pytest.LogCaptureFixture,
-) -> Run:
-    caplog.set_level(logging.INFO)
-    return Run(tmp_path, make_system(system_class=Displaced), make_datamodule())
-
-
-def test_figures_pictures_and_throughput(
-    run: Run, read_png: Callable[[Path], np.ndarray], caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
+    run = Run(tmp_path, make_system(system_class=Displaced), make_datamodule())
     # The logged figures are PoseMetrics' on the same poses and the samples' own ground truth.
     metrics = PoseMetrics(run.system.parts)
     for index, detections in enumerate(run.recorder.detections):
@@ -122,8 +118,7 @@ def test_figures_pictures_and_throughput(
 
     # Curves and sheet are whole pictures, the curve's table agrees with the figures.
     assert read_png(run.folder / "val_auc.png").std() > 0
-    with (run.folder / "val_auc.csv").open(newline="") as stream:
-        curve = list(csv.DictReader(stream))
+    curve = read_csv(run.folder / "val_auc.csv")
     assert curve[0]["threshold_m"] == "0"
     assert float(curve[-1]["pivconnector"]) == pytest.approx(mean.pass_10cm)
     # Green for the truth and yellow for the prediction are on the sheet (BGR here).
@@ -133,8 +128,7 @@ def test_figures_pictures_and_throughput(
     assert ((green > 180) & (red > 180) & (blue < 80)).any()
 
     # Throughput is in the table.
-    with (run.folder / "metrics.csv").open(newline="") as stream:
-        last = list(csv.DictReader(stream))[-1]
+    last = read_csv(run.folder / "metrics.csv")[-1]
     assert float(last["throughput/images_per_s"]) > 0
     assert 0 <= float(last["throughput/loader_wait"]) <= 1
     assert float(last["val/auc_10cm"]) == pytest.approx(mean.auc_10cm, rel=1e-4)
@@ -142,25 +136,23 @@ def test_figures_pictures_and_throughput(
     assert 0 < float(last["val/ar_mspd"]) < 1
 
     # … and said in a line per epoch.
-    said = [r.getMessage() for r in caplog.get_records("setup") if "images/s" in r.getMessage()]
+    said = [r.getMessage() for r in caplog.records if "images/s" in r.getMessage()]
     assert len(said) == len({line.partition(":")[0] for line in said}) > 0
     assert "% of the time waiting for the loader" in said[0]
 
     # A logger without its service did not end the run, and said so once.
-    complaints = [r for r in caplog.get_records("setup") if "a logger failed" in r.getMessage()]
+    complaints = [r for r in caplog.records if "a logger failed" in r.getMessage()]
     assert len(complaints) == 1
     assert complaints[0].levelno == logging.WARNING
 
 
 def test_batches_give_back_the_samples_instances(
-    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule]
+    part: Part, batch: Batch, make_datamodule: Callable[[], PoseDataModule]
 ) -> None:
-    data, system = make_datamodule(), make_system()
-    batch: Batch = next(iter(data.val_dataloader()))
     batch = replace(batch, object_index=torch.tensor([[0], [-1]]))
-    first, second = batch_instances(batch, system.parts)
+    first, second = batch_instances(batch, (part,))
     assert second == []
-    truth = data.val_item(0, 0).instances[0]
+    truth = make_datamodule().val_item(0, 0).instances[0]
     assert first[0].label == truth.label
     np.testing.assert_allclose(first[0].T_cam_obj, truth.T_cam_obj, atol=1e-6)
     np.testing.assert_allclose(first[0].keypoints, truth.keypoints, atol=1e-4)
@@ -168,14 +160,14 @@ def test_batches_give_back_the_samples_instances(
 
 
 def test_no_counted_instance_still_gives_a_number_to_select_by(
-    make_system: SystemMaker, make_datamodule: Callable[[], PoseDataModule], tmp_path: Path
+    make_system: SystemMaker, make_noise: Callable[[], PoseDataModule], tmp_path: Path
 ) -> None:
     class Blind(Displaced):
         def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
             batch.object_index[:] = -1
             return super().validation_step(batch, batch_idx)
 
-    run = Run(tmp_path, make_system(system_class=Blind), make_datamodule())
+    run = Run(tmp_path, make_system(system_class=Blind), make_noise())
     assert np.isnan(run.recorder.logged["val/auc_10cm"])
     assert np.isnan(run.recorder.logged["val/selection"])
     assert "val/median_rotation_deg" not in run.recorder.logged

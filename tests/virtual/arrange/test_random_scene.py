@@ -34,16 +34,10 @@ class Waves:
         return (127 + 120 * np.stack(channels, axis=-1)).astype(np.uint8)
 
 
-FAR = {
-    "horizontal_fov_deg": 20.0,
-    "placement": {"nearest": 1.0, "farthest": 2.0, "margin": 0.3},
-    "distractors": {"number": [0, 0]},
-}
 PRESETS = {
     "wide": customised_preset("wide", {}),
     "paper": customised_preset("paper", {}).resized(160, 120),
     "table": customised_preset("table", {}).resized(160, 120),
-    "far": customised_preset("wide", FAR),
 }
 
 
@@ -72,16 +66,6 @@ def test_a_part_keeps_its_place_and_its_distance_is_divided(scale: float) -> Non
         np.testing.assert_allclose(near.keypoints(there), pixels[:, :2] / pixels[:, 2:])
         same_place = scene.keypoints(index)[CENTROID]
         np.testing.assert_allclose(near.keypoints(there)[CENTROID], same_place)
-
-
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_a_small_part_appears_so_many_times_as_large(scale: float) -> None:
-    for index in range(NUM_SCENES):
-        usual, near = (factory("far").render(0, index, one) for one in (1.0, scale))
-        box, larger = (np.ptp(one.scene.keypoints(0), axis=0) for one in (usual, near))
-        np.testing.assert_allclose(larger, scale * box, rtol=0.12)  # 0.12 m across, 1 m away
-        seen, more = ((one.instances == 0).sum() for one in (usual, near))
-        assert more == pytest.approx(scale**2 * seen, rel=0.25)
 
 
 @pytest.mark.parametrize("name", ["wide", "table"])

@@ -187,11 +187,12 @@ def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None
         preset = replace(
             PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
         )
-        scenes = [Factory(parts, preset, 0).scene(0, index) for index in range(2)]
+        factory = Factory(parts, preset, 0)
+        scenes = [factory.scene(0, index) for index in range(2)]
         assert all(scene.targets == () for scene in scenes)
         assert sum(len(scene.objects) for scene in scenes) >= 4
-        empty = replace(preset, distractors=Distractors((0, 0)))
-        assert Factory(parts, empty, 0).render(0, 1).scene.objects == ()
+        factory.preset = replace(preset, distractors=Distractors((0, 0)))
+        assert factory.render(0, 1).scene.objects == ()
 
 
 @pytest.mark.parametrize("preset", [PRESETS["table"], PRESETS["bin"]])

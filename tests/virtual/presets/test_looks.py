@@ -57,12 +57,6 @@ def test_black_body_colours_follow_plancks_law(temperature: float) -> None:
     np.testing.assert_allclose(black_body_rgb(temperature), planck_rgb(temperature), atol=0.05)
 
 
-def test_black_bodies_are_white_at_daylight_and_redder_below() -> None:
-    np.testing.assert_allclose(black_body_rgb(6500), 1.0, atol=0.06)
-    ratios = [np.divide(*black_body_rgb(t)[[0, 2]]) for t in (2000, 3000, 5000, 8000, 20000)]
-    assert (np.diff(ratios) < 0).all()
-
-
 def test_lights_stand_above_their_plane() -> None:
     ranges, rng = Lighting(num_lights=(1, 3)), np.random.default_rng(0)
     normal = np.array([0.3, -0.6, -0.5]) / np.linalg.norm([0.3, -0.6, -0.5])

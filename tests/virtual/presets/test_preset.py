@@ -78,13 +78,6 @@ def test_quickstart_fill(quickstart_scenes: list[Scene]) -> None:
     assert 0.90 < max(shares) < 0.953
 
 
-def test_targets_stay_visible(parts: list[Part]) -> None:
-    preset = replace(PRESETS["quickstart"], distractors=Distractors((3, 5), (0.3, 0.7), (0.5, 0.9)))
-    factory = Factory(parts, preset, seed=1)
-    fractions = [visible_fractions(factory.scene(0, index))[0] for index in range(60)]
-    assert preset.min_visible_fraction <= min(fractions) < 0.95
-
-
 def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(
     parts: list[Part],
 ) -> None:

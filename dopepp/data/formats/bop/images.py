@@ -160,7 +160,8 @@ def decode_runs(
     counts, size = fields.get("counts"), fields.get("size")
     whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
     if size != list(shape):
-        got, allowed = f"size {size!r:.40}", f"[{shape[0]}, {shape[1]}], the image's"
+        got = "missing" if record is None else f"size {size!r:.40}"
+        allowed = f"runs of size [{shape[0]}, {shape[1]}], the image's"
     elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
         got = f"counts {counts!r:.40}"
         allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
@@ -305,7 +305,11 @@ def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
     """
     textured = texture_name is not None and mesh.uv is not None
     names = ["x", "y", "z", "nx", "ny", "nz"]
-    columns = [mesh.vertices * MM, vertex_normals(mesh.vertices, mesh.faces)]
+    import trimesh  # takes a while: only for those who write models
+
+    # Weighted by the angles of the faces around a vertex, as BOP's are (Thürmer, Wüthrich 1998).
+    normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
+    columns = [mesh.vertices * MM, np.asarray(normals)]
     if textured:
         names += ["texture_u", "texture_v"]
         columns.append(np.asarray(mesh.uv))
@@ -324,23 +328,3 @@ def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
         "",
     ]
     return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
-    """Return unit normals, weighted by the angles of the faces around a vertex as BOP's are.
-
-    Source: Thürmer and Wüthrich, "Computing vertex normals from polygonal facets", 1998.
-    """
-    corners = vertices[faces]
-    edges = corners[:, [1, 2, 0]] - corners
-    across = np.cross(edges[:, 0], edges[:, 1])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
-    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), np.finfo(float).tiny)
-    angles = np.arccos(np.clip(-(unit * unit[:, [2, 0, 1]]).sum(axis=2), -1, 1))
-    normals = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], angles[:, corner, None] * across)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(normals / np.maximum(lengths, 1e-12))

@@ -2,8 +2,6 @@
 
 ``SPLIT/NNNNNN/`` are scenes with ``scene_camera.json``, ``scene_gt.json``, ``scene_gt_info.json``
 and the folders ``rgb`` (or ``gray``), ``depth`` and ``mask_visib``. Lengths are millimetres there.
-
-Which of a data set's images a source takes: a share of them, or an evaluation's targets.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
+from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import ESTIMATED, make_instance
@@ -33,27 +32,6 @@ from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
-
-
-def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return which of ``num_items`` items a share given in fractions is.
-
-    Both bounds are rounded alike, so shares that meet in a fraction neither overlap nor leave out.
-
-    Raises:
-        ValueError: The fractions are not ascending in [0, 1].
-        UserError: No item falls into the share.
-    """
-    first, last = part_of
-    if not 0 <= first < last <= 1:
-        raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
-    chosen = slice(round(first * num_items), round(last * num_items))
-    if chosen.start == chosen.stop:
-        raise UserError(
-            f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images",
-            "a folder with more images", "give every split a folder of its own",
-        )  # fmt: skip
-    return chosen
 
 
 def read_targets(path: Path) -> set[tuple[int, int]]:

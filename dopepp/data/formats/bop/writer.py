@@ -2,29 +2,37 @@
 
 ``train_pbr/000012/`` holds images 12,000 – 12,999: rgb, depth, mask and mask_visib as PNG, and
 ``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json``. An image's records lie in the
-scene's hidden folder ``.items`` until the scene is finalized.
+scene's hidden folder ``.items`` until the scene is finalized. They are defined as in BOP's own
+toolkit, see :func:`make_labels`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
 from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
 from dopepp.data.formats import STAGING, finalizing, stage, staged_items
-from dopepp.data.formats.bop.images import encode_png
-from dopepp.data.formats.bop.labels import Labels, make_labels
+from dopepp.data.formats.bop.images import depth_units, encode_png
 from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS, write_models
+from dopepp.data.formats.bop.records import MM
 from dopepp.data.formats.bop.scene import MAX_SCENE_BYTES
-from dopepp.data.sample import Sample
+from dopepp.data.formats.tolerances import Box
+from dopepp.data.sample import Instance, Sample
 from dopepp.parts.part import Part
+from dopepp.virtual.renderers.raster.rasteriser import Silhouette, silhouette
+from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
 IMAGES_A_SCENE: Final = 1000
@@ -39,39 +47,8 @@ SCENE_FILES: Final = {
 finalized, so it is written last."""
 
 
-class PartSurfaces:
-    """The parts a writer numbers 1, 2, …, with the surfaces that give their silhouettes."""
-
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self.parts = tuple(parts)
-
-    @cached_property
-    def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        return {
-            part.name: (part, make_surface(part.mesh))
-            for part in self.parts
-            if part.mesh is not None
-        }
-
-    def labels(self, sample: Sample) -> Labels:
-        """Annotate a sample, see :func:`~dopepp.data.formats.bop.labels.make_labels`."""
-        ids = {part.name: number for number, part in enumerate(self.parts, start=1)}
-        return make_labels(sample, ids, self._surfaces)
-
-
-def prepare_models(root: Path, split: str, parts: Sequence[Part]) -> None:
-    """Write the models, unless the split holds images that were made without them.
-
-    Raises:
-        UserError: The folder holds something else.
-    """
-    if (root / split).exists() and not (root / MODEL_FOLDERS[0] / INFO_FILE).exists():
-        raise UserError(
-            f"{root}, which has {split}/ and no {MODEL_FOLDERS[0]}/{INFO_FILE}",
-            "an empty folder, or one that this layout was begun in",
-            "choose another folder",
-        )
-    write_models(root, parts)
+Record = dict[str, Any]
+NO_BOX = [-1, -1, -1, -1]
 
 
 class BopFolder:
@@ -86,16 +63,32 @@ class BopFolder:
     chunk_size = IMAGES_A_SCENE
 
     def __init__(self, root: str | Path, parts: Sequence[Part], split: str = "train_pbr") -> None:
-        self.root, self.split = Path(root), split
-        self._parts = PartSurfaces(parts)
+        self.root, self.split, self._parts = Path(root), split, tuple(parts)
 
     def prepare(self) -> None:
-        """Write the models.
+        """Write the models, unless the split holds images that were made without them.
 
         Raises:
             UserError: The folder holds something else, or a part has no mesh.
         """
-        prepare_models(self.root, self.split, self._parts.parts)
+        info = self.root / MODEL_FOLDERS[0] / INFO_FILE
+        if (self.root / self.split).exists() and not info.exists():
+            raise UserError(
+                f"{self.root}, which has {self.split}/ and no {MODEL_FOLDERS[0]}/{INFO_FILE}",
+                "an empty folder, or one that this layout was begun in",
+                "choose another folder",
+            )
+        write_models(self.root, self._parts)
+
+    @cached_property
+    def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
+        meshes = {part.name: (part, part.mesh) for part in self._parts}
+        return {n: (part, make_surface(mesh)) for n, (part, mesh) in meshes.items() if mesh}
+
+    def labels(self, sample: Sample) -> Labels:
+        """Annotate a sample, see :func:`make_labels`."""
+        ids = {part.name: number for number, part in enumerate(self._parts, start=1)}
+        return make_labels(sample, ids, self._surfaces)
 
 
 class BopWriter(BopFolder):
@@ -105,7 +98,7 @@ class BopWriter(BopFolder):
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an image's files, its records last."""
-        labels = self._parts.labels(sample)
+        labels = self.labels(sample)
         chunk, image = divmod(index, self.chunk_size)
         scene = self._scene(chunk)
         write_whole(scene / "rgb" / f"{image:06d}.png", encode_png(sample.image))
@@ -114,11 +107,7 @@ class BopWriter(BopFolder):
             for number, mask in enumerate(masks):
                 path = scene / folder / f"{image:06d}_{number:06d}.png"
                 write_whole(path, encode_png(mask.astype("uint8") * 255))
-        item = {
-            "camera": labels.camera,
-            "gt": labels.truths,
-            "gt_info": labels.infos,
-        }
+        item = {"camera": labels.camera, "gt": labels.truths, "gt_info": labels.infos}
         stage(scene / STAGING / f"{image:06d}.json", json.dumps(item).encode())
 
     def written(self, chunk: int) -> set[int]:
@@ -178,3 +167,127 @@ def _by_image(records: Mapping[int, object]) -> bytes:
     """Return one line an image, in order: the bytes do not depend on who wrote what first."""
     lines = [f'  "{image}": {json.dumps(record)}' for image, record in sorted(records.items())]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+
+
+@dataclass(frozen=True)
+class Labels:
+    """An image's annotation as BOP's JSON and images hold it.
+
+    Attributes:
+        camera: ``cam_K`` and ``depth_scale``.
+        truths: One ``scene_gt`` record per instance.
+        infos: One ``scene_gt_info`` record per instance.
+        depth: Units of ``depth_scale`` mm, 0 where unknown.
+        masks: Whole silhouettes within the image.
+        visible_masks: Visible pixels.
+    """
+
+    camera: Record
+    truths: list[Record]
+    infos: list[Record]
+    depth: UInt16[np.ndarray, "height width"]
+    masks: list[Bool[np.ndarray, "height width"]]
+    visible_masks: list[Bool[np.ndarray, "height width"]]
+
+
+def make_labels(
+    sample: Sample, object_ids: Mapping[str, int], parts: Mapping[str, tuple[Part, Surface]]
+) -> Labels:
+    """Annotate a sample as BOP's toolkit does.
+
+    A box is (x, y, width, height) with width and height the differences of the outermost pixels'
+    coordinates (a single pixel has width 0), −1 for an object of which no pixel is visible; the
+    silhouette counts beyond the image's border.
+
+    Args:
+        sample: An image with depth and masks.
+        object_ids: BOP's object number by label.
+        parts: Part and surface by label.
+
+    Raises:
+        ValueError: The sample has no depth, an instance has no mask, or a label is unknown.
+    """
+    unknown = sorted({item.label for item in sample.instances} - object_ids.keys())
+    if unknown:
+        raise ValueError(f"instances of {unknown}, parts {sorted(object_ids)}")
+    if sample.depth is None:
+        raise ValueError(f"a sample without depth: {sample.key}")
+    visible = [_mask(item) for item in sample.instances]
+    covered = np.zeros(sample.depth.shape, bool)
+    for mask in visible:
+        covered |= mask
+    depth, scale = depth_units(sample.depth, covered)
+    wholes = [
+        silhouette(SceneObject(surface, item.T_cam_obj, part=part), sample.K, sample.size)
+        for item in sample.instances
+        for part, surface in [parts[item.label]]
+    ]
+    infos = [
+        _info(item, mask, whole, depth)
+        for item, mask, whole in zip(sample.instances, visible, wholes, strict=True)
+    ]
+    return Labels(
+        {"cam_K": np.asarray(sample.K, np.float64).ravel().tolist(), "depth_scale": scale},
+        [_truth(item, object_ids[item.label]) for item in sample.instances],
+        infos,
+        depth,
+        [whole.mask for whole in wholes],
+        visible,
+    )
+
+
+def _mask(instance: Instance) -> Bool[np.ndarray, "height width"]:
+    if instance.mask is None:
+        raise ValueError(f"an instance of {instance.label} without a mask")
+    return instance.mask
+
+
+def _truth(instance: Instance, object_id: int) -> Record:
+    T: Float[np.ndarray, "4 4"] = np.asarray(instance.T_cam_obj, np.float64)
+    return {
+        "cam_R_m2c": T[:3, :3].ravel().tolist(),
+        "cam_t_m2c": (T[:3, 3] * MM).tolist(),
+        "obj_id": object_id,
+    }
+
+
+def _info(
+    instance: Instance,
+    visible: Bool[np.ndarray, "height width"],
+    whole: Silhouette,
+    depth: UInt16[np.ndarray, "height width"],
+) -> Record:
+    seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
+    return {
+        "bbox_obj": NO_BOX if seen is None else _bop_box(_beyond_the_border(inside, whole)),
+        "bbox_visib": _bop_box(seen),
+        # A silhouette around the camera has no finite size: its pixels within the image stand.
+        "px_count_all": int(whole.num_px if math.isfinite(whole.num_px) else whole.mask.sum()),
+        "px_count_valid": int(np.count_nonzero(depth[whole.mask])),
+        "px_count_visib": int(np.count_nonzero(visible)),
+        "visib_fract": float(instance.visible_fraction),
+    }
+
+
+def _bop_box(box: Box | None) -> list[int]:
+    """Return BOP's (x, y, width, height)."""
+    if box is None:
+        return NO_BOX
+    return [int(n) for n in (box.left, box.top, box.right - box.left, box.bottom - box.top)]
+
+
+def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
+    """Return the outermost pixels of a silhouette, those beyond the image included.
+
+    Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
+    """
+    if inside is None or whole.box is None:
+        return inside
+    height, width = whole.mask.shape
+    left, top, right, bottom = whole.box[0], whole.box[1], whole.box[2] - 1, whole.box[3] - 1
+    return Box(
+        left if left < 0 else inside.left,
+        top if top < 0 else inside.top,
+        right if right >= width else inside.right,
+        bottom if bottom >= height else inside.bottom,
+    )

@@ -1,13 +1,18 @@
-"""How an NDDS data set writes its poses: found by reprojecting the cuboid, because names mislead.
+"""Which pose convention an NDDS data set follows, found by trying all of them on its own images.
 
-In the wild, ``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT)
-or metres (nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's; and
-the pose is that of the mesh or of a frame that ``fixed_model_transform`` turns the mesh into (FAT).
-Each combination is a hypothesis. It predicts where the part's cuboid appears, and the right one
-puts it on ``projected_cuboid``. To allow for one more habit, add it to
-:mod:`dopepp.data.formats.ndds.conventions`.
+Files of this format look alike and mean different things. ``quaternion_xyzw`` holds x, y, z, w or
+w, x, y, z; lengths are centimetres (NDDS, FAT), metres (nvisii) or millimetres; camera axes are
+OpenCV's or, in old nvisii files, OpenGL's; and the pose is the mesh's own or that of a frame into
+which ``fixed_model_transform`` turns the mesh (FAT). No field says which.
 
-A pose as an NDDS file writes it, under any of the conventions that occur in the wild.
+But every object states ``projected_cuboid``, where its box appears on the image in pixels. So each
+combination (a :class:`PoseConvention`) is applied to some objects whose meshes are known: it gives
+a pose, the pose puts the mesh's box somewhere on the image, and under the right combination that is
+where the file says (:func:`find_convention`). Later every object that is read is held against its
+own ``projected_cuboid`` (:func:`check_observation`).
+
+To allow for one more way of writing poses, add its value to the ``Literal`` and the tuple of its
+kind below, and what it means to :meth:`Observation.T_cam_obj`.
 """
 
 from __future__ import annotations
@@ -39,10 +44,16 @@ METRES: Final[dict[Unit, float]] = {"cm": 0.01, "m": 1.0, "mm": 0.001}
 QUATERNIONS: Final[tuple[Quaternion, ...]] = ("xyzw", "wxyz")
 CAMERAS: Final[tuple[CameraAxes, ...]] = ("opencv", "opengl")
 FRAMES: Final[tuple[Frame, ...]] = ("mesh", "mesh, front x", "centred", "fixed", "fixed, centred")
-"""Whose pose it is: ``mesh``: the mesh's. ``mesh, front x``: the mesh's, but corners are listed as
-seen along its x axis with z up (nvisii). ``centred``: of the mesh moved so that its box's centre is
-at ``cuboid_centroid``, or at ``location`` without one. ``fixed``: of the mesh transformed by
-``fixed_model_transform``. ``fixed, centred``: of the mesh rotated by it, then centred."""
+"""What the stated pose moves.
+
+- ``mesh``: the mesh as it is.
+- ``mesh, front x``: the mesh as it is, with the corners listed as seen along its x axis, z up
+  (nvisii).
+- ``centred``: the mesh after its box's centre was moved into the origin; the pose then puts that
+  centre at ``cuboid_centroid``, or at ``location`` where there is none.
+- ``fixed``: the mesh after ``fixed_model_transform``.
+- ``fixed, centred``: the mesh after the rotation of ``fixed_model_transform``, then centred.
+"""
 
 _FRONT_X: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Rotation of a mesh with x forward, y left, z up into NDDS axes (x right, y down, z forward)."""
@@ -52,7 +63,7 @@ _OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """One way to write poses; the defaults are NDDS's own."""
+    """One way to write poses, a choice in each of four questions; the defaults are NDDS's own."""
 
     quaternion: Quaternion = "xyzw"
     unit: Unit = "cm"
@@ -74,12 +85,12 @@ POSE_CONVENTIONS: Final = tuple(
     for unit in METRES
     for quaternion in QUATERNIONS
 )
-"""All hypotheses, the documented ones first: of two that fit alike, the first one counts."""
+"""All combinations, the documented ones first: of two that fit alike, the first one counts."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """An object of the data set whose part is known.
+    """An annotated object whose part is known: what a convention can be tried on.
 
     Attributes:
         item: What the annotation says.
@@ -97,7 +108,7 @@ class Observation:
     path: Path
 
     def T_cam_obj(self, convention: PoseConvention) -> Float[np.ndarray, "4 4"] | None:  # noqa: N802
-        """Return the pose of the part's mesh, metres, or None where the convention cannot apply."""
+        """Return the mesh's pose, metres, under a convention; None where it cannot apply."""
         fixed = convention.frame.startswith("fixed")
         if fixed and self.fixed is None:
             return None
@@ -158,30 +169,38 @@ def _turned_corners(part: Part, rotation: Float[np.ndarray, "3 3"]) -> Float[np.
 
 
 MAX_ERROR_PX: Final = 5.0
-"""Of the right hypothesis in three quarters of the instances: annotations of photos are this good.
-"""
+"""The right convention puts three quarters of the instances this close to ``projected_cuboid``;
+annotations of photos are no better."""
 
 _MAX_SHARE: Final = 0.05
-"""Of the longer side of its projected cuboid, an instance may be off, where that is more than
-``MAX_ERROR_PX``: annotations of photos are worse on what is near."""
+"""An instance may be off by this share of its projected cuboid's longer side, where that is more
+than ``MAX_ERROR_PX``: annotations of photos are worse on what is near."""
 
 _MOST: Final = 0.75
+"""Share of the instances that must fit: a few damaged ones decide nothing."""
+
 _RATIO: Final = 3.0
+"""Any convention with other poses must fit this many times worse."""
+
 _ROUNDING_PX: Final = 0.05
+"""Between two fits that count as equally good: files round to a few digits."""
+
 _SAME_POSE: Final = 0.05
-"""Hypotheses whose corners differ by less than this many diameters are no rivals: the better fit of
-them counts even where noise leaves it less than three times better."""
+"""Two conventions whose corners lie closer than this many diameters give the same poses: it matters
+not which of them is taken, so neither has to fit three times better than the other."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The convention of a data set.
+    """The convention of a data set, and how sure it is.
 
     Attributes:
         convention: The one that fits.
-        error_px: Its reprojection error in three quarters of the instances.
-        rival_px: The error of the best one that gives other poses.
-        undecided: Other orders, units or axes that give the same poses in these instances.
+        error_px: Three quarters of the instances are no farther than this from
+            ``projected_cuboid``.
+        rival_px: The same of the best convention that gives other poses.
+        undecided: Conventions that give the same poses in these instances, e.g. of a turn whose
+            quaternion reads the same in both orders.
         num_instances: How many instances were compared.
     """
 

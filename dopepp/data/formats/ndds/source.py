@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.source import share
+from dopepp.data.formats import share
 from dopepp.data.formats.ndds.conventions import (
     Finding,
     Observation,

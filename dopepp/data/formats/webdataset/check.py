@@ -5,11 +5,11 @@ A shard is walked from its first to its last member; one image's members are in 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.check_image import (
@@ -19,17 +19,9 @@ from dopepp.data.formats.bop.check_image import (
     check_image,
     load_models,
 )
-from dopepp.data.formats.bop.images import DEPTH_MODES, decode_runs, one_channel_of
-from dopepp.data.formats.bop.records import pair_infos
-from dopepp.data.formats.problems import (
-    CheckReport,
-    attempt,
-    decode_json,
-    entries,
-    load_object,
-    mapping,
-    picture_shape,
-)
+from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
+from dopepp.data.formats.problems import CheckReport, attempt, load_object, picture_shape
+from dopepp.data.formats.webdataset.source import ShardRecords
 from dopepp.data.formats.webdataset.tar import (
     KEY_FILE,
     MAX_MEMBER_BYTES,
@@ -65,7 +57,7 @@ def check_webdataset(report: CheckReport) -> None:
                 got = "its members are not together" if same else f"also in {keys[key]}"
                 report.report(f"{path}/{key}", "key", got)
             keys[key] = path.name
-            _Image(report, f"{path}/{key}", _content(report, path, group), models).check()
+            _check_image(report, f"{path}/{key}", _content(report, path, group), models)
             report.count_image()
         staged = len(list((path.parent / STAGING).glob("**/[0-9]*.tar")))
         if staged:
@@ -96,73 +88,36 @@ def _content(report: CheckReport, path: Path, group: Iterator[TarMember]) -> Con
     return content
 
 
-class _Image:
-    """The members of one key."""
+def _check_image(report: CheckReport, start: str, content: Content, models: Models | None) -> None:
+    """Check the members of one key."""
+    names = {field_of(name): name for name in reversed(content)}
+    shape: tuple[int, int] | None = None
+    if "image" in names:
+        name = names["image"]
+        shape = picture_shape(report, f"{start}.{name}", content[name])
+    else:
+        report.report(f"{start}.rgb.png", "member", "missing")
+    if "depth" in names:
+        name = names["depth"]
+        one_channel_of(report, f"{start}.{name}", shape, content[name], DEPTH_MODES)
+    if "camera.json" not in content:
+        report.report(f"{start}.camera.json", "member", "missing")
+    if "gt.json" not in content:
+        report.note("some keys have no gt.json: their poses are not published")
+    records = ShardRecords(start, lambda name: content.get(f"{name}.json"), report)
 
-    def __init__(
-        self, report: CheckReport, start: str, content: Content, models: Models | None
-    ) -> None:
-        self._report, self._start, self._content, self._models = report, start, content, models
+    def silhouette(name: str) -> Callable[[int], Mask | None]:
+        is_known = shape is not None and records.json(name) is not None
+        return lambda n: records.mask(name, n, shape) if is_known and shape else None
 
-    def check(self) -> None:
-        report, shape = self._report, None
-        name = self._name_of("image")
-        if name is None:
-            report.report(f"{self._start}.rgb.png", "member", "missing")
-        else:
-            shape = picture_shape(report, f"{self._start}.{name}", self._content[name])
-        depth = self._name_of("depth")
-        if depth is not None:
-            path = f"{self._start}.{depth}"
-            one_channel_of(report, path, shape, self._content[depth], DEPTH_MODES)
-        if "camera.json" not in self._content:
-            report.report(f"{self._start}.camera.json", "member", "missing")
-        if "gt.json" not in self._content:
-            report.note("some keys have no gt.json: their poses are not published")
-        truths, infos = self._entries("gt"), self._entries("gt_info")
-        path = f"{self._start}.gt_info.json"
-        check_image(
-            report,
-            lambda what, n: (f"{self._start}.{what}.json", "" if what == "camera" else f"[{n}]"),
-            self._json("camera"),
-            truths,
-            pair_infos(truths, infos, path, "", report)
-            if "gt_info.json" in self._content
-            else [None] * len(truths),
-            shape,
-            depth is not None,
-            self._models,
-            Silhouettes(self._masks("mask", shape), self._masks("mask_visib", shape)),
-        )
-
-    def _name_of(self, field: str) -> str | None:
-        return next((name for name in self._content if field_of(name) == field), None)
-
-    def _json(self, name: str) -> Any:
-        content = self._content.get(f"{name}.json")
-        path = f"{self._start}.{name}.json"
-        return None if content is None else decode_json(self._report, path, content)
-
-    def _entries(self, name: str) -> list[Any]:
-        records = self._json(name)
-        path = f"{self._start}.{name}.json"
-        return [] if records is None else entries(self._report, path, "", records)
-
-    def _masks(self, name: str, shape: tuple[int, int] | None) -> Any:
-        """Return a function that reads an object's mask by its number."""
-        runs, path = self._json(name), f"{self._start}.{name}.json"
-        # Objects by number, or (older shards) a list of them.
-        by_number = (
-            {str(n): record for n, record in enumerate(runs)} if isinstance(runs, list) else runs
-        )
-
-        def read(number: int) -> Mask | None:
-            if runs is None or shape is None:
-                return None
-            record = mapping(by_number).get(f"{number}")
-            if record is None:
-                self._report.report(path, f"{number}", "missing")
-                return None
-            return decode_runs(record, shape, path, f"{number}", self._report)
-
-        return read
+    check_image(
+        report,
+        records.place,
+        records.json("camera"),
+        records.truths,
+        records.infos,
+        shape,
+        "depth" in names,
+        models,
+        Silhouettes(silhouette("mask"), silhouette("mask_visib")),
+    )

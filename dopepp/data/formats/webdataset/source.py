@@ -7,28 +7,29 @@ Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.j
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool
 
 from dopepp.core.errors import UserError
-from dopepp.core.json import MAX_BYTES, parse_json
+from dopepp.core.json import MAX_BYTES
+from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import (
     ESTIMATED,
     BopPoses,
-    Place,
     Record,
     make_instance,
     pair_infos,
     read_cameras,
     read_poses,
 )
-from dopepp.data.formats.bop.source import share
-from dopepp.data.formats.problems import STRICT, entries, mapping
+from dopepp.data.formats.problems import STRICT, Problems, decode_json, entries, mapping
 from dopepp.data.formats.webdataset.shards import find_shards
 from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard
 from dopepp.data.sample import Sample, SourceInfo
@@ -93,43 +94,33 @@ class WebdatasetSource:
             UserError: A member is damaged, sizes differ, or a pose or K is impossible.
         """
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
-        where = f"{shard.path}/{shard.keys[image]}"
+        records = self._records(shard, image)
         content = shard.read(image, "image")
         assert content is not None  # the index holds no image without
-        picture = decode_rgb(content, where)
+        picture = decode_rgb(content, records.start)
         shape: tuple[int, int] = picture.shape[:2]
-        K, scales = read_cameras([_json(shard, image, "camera")], _place(where))
-        camera = check_camera(K[0], (shape[1], shape[0]), where)
-        masks = _json(shard, image, "mask_visib")
-        poses = self._poses(shard, image)
+        K, scales = read_cameras([records.json("camera")], records.place)
+        camera = check_camera(K[0], (shape[1], shape[0]), records.start)
+        has_masks = records.json("mask_visib") is not None
+        poses = self._poses(records)
         instances = []
         for number in self._chosen(poses):
-            mask = None
-            if masks is not None:
-                record = mapping(masks).get(f"{number}")
-                mask = decode_runs(record, shape, f"{where}.mask_visib.json", f"{number}")
+            mask = records.mask("mask_visib", number, shape) if has_masks else None
             part = self._parts[int(poses.obj_ids[number])]
             T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
             instances.append(make_instance(part, T, camera, fraction, mask, shape))
         encoded = shard.read(image, "depth") if self._read_depth else None
         depth = None
         if encoded is not None:
-            depth = decode_depth(encoded, f"{where}.depth", float(scales[0]), shape)
+            depth = decode_depth(encoded, f"{records.start}.depth", float(scales[0]), shape)
         return Sample(picture, camera, instances, depth, self.name, shard.keys[image])
 
-    def _poses(self, shard: ShardIndex, image: int) -> BopPoses:
+    def _records(self, shard: ShardIndex, image: int) -> ShardRecords:
+        return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
+
+    def _poses(self, records: ShardRecords) -> BopPoses:
         """Read an image's ground truth; empty where it has none."""
-        where = f"{shard.path}/{shard.keys[image]}"
-        records = {
-            name: entries(STRICT, f"{where}.{name}.json", "", found)
-            for name in ("gt", "gt_info")
-            if (found := _json(shard, image, name)) is not None
-        }
-        truths = records.get("gt", [])
-        infos: list[Record | None] = [None] * len(truths)
-        if "gt_info" in records:
-            infos = pair_infos(truths, records["gt_info"], f"{where}.gt_info.json", "")
-        return read_poses(truths, infos, _place(where))
+        return read_poses(records.truths, records.infos, records.place)
 
     def _chosen(self, poses: BopPoses) -> list[int]:
         """Return the numbers of the objects of interest before the camera."""
@@ -142,7 +133,7 @@ class WebdatasetSource:
         if not wanted:
             return False
         for number, image in self._items.tolist():
-            poses = self._poses(self._shards[number], image)
+            poses = self._poses(self._records(self._shards[number], image))
             if any(int(poses.obj_ids[k]) in wanted for k in self._chosen(poses)):
                 return True
         return False
@@ -165,19 +156,61 @@ class WebdatasetSource:
         return [SourceInfo(self.name, len(self), identity)]
 
 
-def _place(where: str) -> Place:
-    return lambda what, n: (f"{where}.{what}.json", "" if what == "camera" else f"[{n}]")
+class ShardRecords:
+    """The JSON members of one image, each parsed when it is first asked for.
 
+    Args:
+        start: What the members' paths begin with, ``SHARD/KEY``.
+        read: Returns a member's content by its name, e.g. ``gt``; None where there is none.
+        problems: Takes what is wrong.
+    """
 
-def _json(shard: ShardIndex, image: int, field: str) -> Any:
-    """Parse a JSON member; None where the image has none."""
-    content = shard.read(image, field)
-    if content is None:
+    def __init__(
+        self, start: str, read: Callable[[str], bytes | None], problems: Problems = STRICT
+    ) -> None:
+        self.start, self._read, self._problems = start, read, problems
+        self.json = cache(self._json)
+
+    def place(self, what: str, number: int) -> tuple[str, str]:
+        """Return where a record stands: member and start of the field."""
+        return f"{self.start}.{what}.json", "" if what == "camera" else f"[{number}]"
+
+    def _json(self, name: str) -> Any:
+        """Return what a member holds, None where there is none or it cannot be read."""
+        content, path = self._read(name), f"{self.start}.{name}.json"
+        if content is None or len(content) <= MAX_BYTES:
+            return None if content is None else decode_json(self._problems, path, content)
+        allowed = f"at most {MAX_BYTES / 1e6:.0f} MB"
+        self._problems.report(path, "member", f"{len(content) / 1e6:.0f} MB", allowed)
         return None
-    where = f"{shard.path}/{shard.keys[image]}.{field}.json"
-    if len(content) > MAX_BYTES:
-        raise _bad(f"{where} of {len(content) / 1e6:.0f} MB", f"at most {MAX_BYTES / 1e6:.0f} MB")
-    return parse_json(content, where)
+
+    def _entries(self, name: str) -> list[Any]:
+        found = self.json(name)
+        path = f"{self.start}.{name}.json"
+        return [] if found is None else entries(self._problems, path, "", found)
+
+    @cached_property
+    def truths(self) -> list[Record]:
+        """The ``gt`` records of the objects, none where there are none."""
+        return self._entries("gt")
+
+    @cached_property
+    def infos(self) -> list[Record | None]:
+        """The ``gt_info`` record of each object, None where there is none."""
+        if self.json("gt_info") is None:
+            return [None] * len(self.truths)
+        path = f"{self.start}.gt_info.json"
+        return pair_infos(self.truths, self._entries("gt_info"), path, "", self._problems)
+
+    def mask(
+        self, name: str, number: int, shape: tuple[int, int]
+    ) -> Bool[np.ndarray, "height width"] | None:
+        """Return an object's mask in ``mask`` or ``mask_visib``, None where it is damaged."""
+        runs, path = self.json(name), f"{self.start}.{name}.json"
+        # Objects by number, or (older shards) a list of them.
+        listed = dict(enumerate(runs)) if isinstance(runs, list) else {}
+        record = listed.get(number, mapping(runs).get(f"{number}"))
+        return decode_runs(record, shape, path, f"{number}", self._problems)
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:

@@ -39,7 +39,7 @@ class WebdatasetWriter(BopFolder):
 
     def write(self, index: int, sample: Sample) -> None:
         """Stage an image."""
-        labels = self._parts.labels(sample)
+        labels = self.labels(sample)
         content = {
             "rgb.png": encode_png(sample.image),
             "depth.png": encode_png(labels.depth),

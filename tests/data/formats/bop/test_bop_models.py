@@ -14,7 +14,6 @@ from dopepp.data.formats.bop.models import (
     bop_parts,
     parts_by_id,
     read_models,
-    vertex_normals,
     write_models,
 )
 from dopepp.parts.catalogue import pivconnector, servoholder
@@ -68,11 +67,14 @@ def test_ply_is_read_by_trimesh_in_millimetres(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_mesh(path, unit="mm").vertices, mesh.vertices, atol=1e-7)
 
 
-def test_vertex_normals_are_weighted_by_angle() -> None:
-    box: Any = trimesh.creation.box((2, 2, 2))
-    normals = vertex_normals(np.asarray(box.vertices), np.asarray(box.faces))
+def test_vertex_normals_are_weighted_by_angle(tmp_path: Path) -> None:
+    box: Any = trimesh.creation.box((0.02, 0.02, 0.02))
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32))
+    write_models(tmp_path, [make_part("box", mesh)])
+    content = (tmp_path / "models" / "obj_000001.ply").read_bytes().partition(b"end_header\n")[2]
+    columns = np.frombuffer(content, "<f4", 6 * 8).reshape(8, 6)
     # Two triangles or one at a corner of a face: only the angle makes all three axes equal.
-    np.testing.assert_allclose(normals, box.vertices / np.sqrt(3), atol=1e-12)
+    np.testing.assert_allclose(columns[:, 3:], box.vertices / (0.01 * np.sqrt(3)), atol=1e-6)
 
 
 def test_texture_round_trip(ycb_root: Path, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import json
 import pickle
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb, encode_png
-from dopepp.data.formats.bop.source import BopSource, share
+from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.sample import Sample
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
@@ -219,74 +219,12 @@ def test_matrices_may_be_nested_and_numbers_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
 
 
-BAD: list[tuple[str, object, str]] = [
-    (
-        "scene_gt",
-        {"3": [truth(2) | {"cam_R_m2c": [1] * 9}]},
-        r"scene_gt.json: 3\[0\].cam_R_m2c: no rotation",
-    ),
-    ("scene_gt", {"3": [truth(2) | {"cam_R_m2c": [1] * 8}]}, r"cam_R_m2c: .*9 finite numbers"),
-    ("scene_gt", {"3": [truth(2) | {"cam_R_m2c": [1e300] * 9}]}, r"cam_R_m2c: .*9 finite numbers"),
-    ("scene_gt", {"3": [truth(2) | {"cam_t_m2c": ["0", "0", "1"]}]}, r"cam_t_m2c: .*3 finite"),
-    (
-        "scene_gt",
-        {"3": [truth(2) | {"cam_t_m2c": [0, 0, 1e30]}]},
-        r"cam_t_m2c: .*finite numbers up to",
-    ),
-    ("scene_gt", {"3": [truth(2), {"obj_id": 2}]}, r"3\[1\].cam_R_m2c: missing"),
-    ("scene_gt", {"3": [truth(2) | {"obj_id": 1.5}]}, r"obj_id: 1.5"),
-    ("scene_gt", {"3": [truth(2) | {"obj_id": [10**400]}]}, r"obj_id: .*1 finite"),
-    ("scene_gt", {"3": [7]}, r"3\[0\]: 7"),
-    ("scene_gt", {"3": {"a": 1}}, r"scene_gt.json: 3: {'a': 1}; .*a list"),
-    ("scene_gt", {"a": []}, r"scene_gt.json: 'a'"),
-    ("scene_gt", {"3": [], "03": []}, r"scene_gt.json: '03'.*once"),
-    ("scene_gt", [], r"scene_gt.json: top level: .*images by number"),
-    ("scene_gt_info", {"3": [{"visib_fract": 1}]}, r"3: 1 objects; .* 2, as many"),
-    ("scene_gt_info", {"11": []}, r"scene_gt_info.json: 3: missing"),
-    ("scene_gt_info", {"3": [{"visib_fract": 1.5}] * 2, "11": []}, r"visib_fract: 1.5"),
-    ("scene_camera", {"3": {"cam_K": K[:8]}}, r"scene_camera.json: 3.cam_K: .*9 finite"),
-    ("scene_camera", {"3": {"cam_K": K, "depth_scale": 0}}, r"depth_scale: 0"),
-    ("scene_camera", {"3": {"cam_K": K, "depth_scale": "1"}}, r"depth_scale: .*1 finite"),
-]
-
-
-@pytest.mark.parametrize(("name", "value", "message"), BAD)
-def test_bad_annotation_is_refused_at_opening(
-    scene: Scene, name: str, value: object, message: str
-) -> None:
-    if name == "scene_gt":
-        (scene.folder / "scene_gt_info.json").unlink()
-    scene.json(name, value)
-    with pytest.raises(UserError, match=message) as caught:
-        BopSource(scene.root, [block(2)], "test")
-    assert f"{scene.folder}" in str(caught.value)
-    assert len(str(caught.value)) < 500
-
-
-@pytest.mark.parametrize("text", ['{"3": NaN}', "[" * 5000, '{"3": [], "3": []}', '{"3'])
-@pytest.mark.parametrize("name", ["scene_camera", "scene_gt", "scene_gt_info"])
-def test_hostile_json(scene: Scene, name: str, text: str) -> None:
-    (scene.folder / f"{name}.json").write_text(text)
-    with pytest.raises(UserError, match=f"{name}.json"):
-        BopSource(scene.root, [block(2)], "test")
-
-
-def test_bad_images_are_named(scene: Scene) -> None:
+def test_what_contradicts_an_image_is_named(scene: Scene) -> None:
     def refused(match: str, **options: Any) -> None:
         with pytest.raises(UserError, match=match):
             BopSource(scene.root, [block(2)], "test", **options).sample(0)
 
-    small = np.zeros((10, 10), np.uint8)
-    scene.image("mask_visib/000003_000001.png", small)
-    refused(r"mask_visib/000003_000001.png: size: 10×10 pixels; allowed: 64×48")
-    (scene.folder / "mask_visib" / "000003_000001.png").unlink()
-    scene.image("depth/000003.png", small)
-    refused(r"depth/000003.png: size: 10×10 pixels; allowed: 64×48")
-    (scene.folder / "depth" / "000003.png").unlink()
-    refused(r"depth/000003.png: No such file")
     content = (scene.folder / "rgb" / "000003.png").read_bytes()
-    (scene.folder / "rgb" / "000003.png").write_bytes(content[:-40])
-    refused(r"rgb/000003.png: .* bytes")
     (scene.folder / "rgb" / "000003.jpg").write_bytes(content)
     refused(r"rgb/000003.*: image 3 twice, also as 000003.*one file an image")
     (scene.folder / "rgb" / "000003.png").unlink()
@@ -320,18 +258,6 @@ def _saved(image: Image.Image, name: str, **options: Any) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
-@pytest.mark.parametrize("name", ["PNG", "JPEG", "TIFF"])
-def test_an_image_cut_short_is_refused(name: str) -> None:
-    rng = np.random.default_rng(0)
-    picture = Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8))
-    content = _saved(picture, name)
-    assert decode_rgb(content, "x").shape == (40, 50, 3)
-    for length in (0, 1, 10, len(content) // 2, len(content) - 30):
-        with pytest.raises(UserError, match=r"some/file\.x: image"):
-            decode_rgb(content[:length], "some/file.x")
-
-
-@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
 def test_other_formats_channels_and_bombs_are_refused() -> None:
     grey = Image.fromarray(np.zeros((4, 5), np.uint8))
     with pytest.raises(UserError, match="cannot identify"):
@@ -347,17 +273,6 @@ def test_other_formats_channels_and_bombs_are_refused() -> None:
     assert decode_rgb(_saved(grey.convert("P"), "PNG"), "x").shape == (4, 5, 3)
     assert decode_rgb(_saved(grey.convert("RGBA"), "PNG"), "x").shape == (4, 5, 3)
     assert not decode_mask(_saved(grey.convert("1"), "PNG"), "x", (4, 5)).any()
-
-
-@pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
-@settings(max_examples=60, deadline=None)
-@given(st.binary(max_size=80), st.sampled_from([decode_rgb]))
-def test_any_bytes_are_an_image_or_a_user_error(
-    content: bytes, decode: Callable[[bytes, str], np.ndarray]
-) -> None:
-    for prefix in (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0"):
-        with pytest.raises(UserError):
-            decode(prefix + content, "x")
 
 
 def test_samples_are_plain(scene: Scene) -> None:

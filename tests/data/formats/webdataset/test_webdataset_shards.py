@@ -4,11 +4,9 @@ import http.server
 import io
 import json
 import pickle
-import subprocess
-import sys
 import tarfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from dopepp.core.errors import UserError
@@ -28,26 +25,13 @@ from dopepp.data.formats.webdataset.source import WebdatasetSource
 from dopepp.data.formats.webdataset.tar import FIELDS, index_shard, members
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 from dopepp.data.sample import Sample
-from dopepp.data.sources.rendered import rendered_sample
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
-from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
 
 NUM_IMAGES = 4
+Contents = Callable[[Path], dict[str, bytes]]
+
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
-
-
-@pytest.fixture(scope="module")
-def parts() -> list[Part]:
-    return [servoholder(), pivconnector()]
-
-
-@pytest.fixture(scope="module")
-def samples(parts: list[Part]) -> list[Sample]:
-    factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=4)
-    return [rendered_sample(factory.render(0, i), "virtual", str(i)) for i in range(NUM_IMAGES)]
 
 
 @pytest.fixture
@@ -63,27 +47,13 @@ def written(parts: list[Part], samples: list[Sample], tmp_path: Path) -> Path:
     return root
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
-
-
-def test_round_trip(written: Path, samples: list[Sample]) -> None:
+def test_round_trip(written: Path, samples: list[Sample], assert_read_back: Any) -> None:
     source = WebdatasetSource(written, bop_parts(written), "train_pbr")
     assert len(source) == NUM_IMAGES
     source = pickle.loads(pickle.dumps(source))
     for index in (2, 0, 3, 1):  # at random
         sample, read = samples[index], source.sample(index, epoch=5)
-        np.testing.assert_array_equal(read.image, sample.image)
-        np.testing.assert_array_equal(read.K, sample.K)
-        assert read.depth is not None
-        assert sample.depth is not None
-        assert np.abs(read.depth - sample.depth).max() <= 0.5001e-4
-        for instance, expected in zip(read.instances, sample.instances, strict=True):
-            assert instance.label == expected.label
-            np.testing.assert_allclose(instance.T_cam_obj, expected.T_cam_obj, atol=1e-12)
-            np.testing.assert_allclose(instance.keypoints, expected.keypoints, atol=1e-4)
-            np.testing.assert_array_equal(instance.mask, expected.mask)
-            assert instance.visible_fraction == expected.visible_fraction
+        assert_read_back(read, sample)
     keys = [source.sample(index).key for index in range(4)]
     assert keys == ["000000_000998", "000000_000999", "000001_000000", "000001_000001"]
     assert source.contains("servoholder")
@@ -129,7 +99,11 @@ def test_the_library_and_tarfile_read_the_shards(written: Path, samples: list[Sa
 
 
 def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
-    written: Path, parts: list[Part], samples: list[Sample], monkeypatch: pytest.MonkeyPatch
+    written: Path,
+    parts: list[Part],
+    samples: list[Sample],
+    contents: Contents,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def die(*_: object) -> None:
         raise KeyboardInterrupt
@@ -155,25 +129,6 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
     assert contents(root) == contents(written)
 
 
-def test_staging_needs_no_torch(tmp_path: Path) -> None:
-    code = (
-        "import sys, numpy as np\n"
-        "from dopepp.data.formats.webdataset.writer import WebdatasetWriter\n"
-        "from dopepp.data.formats.webdataset.source import WebdatasetSource\n"
-        "from dopepp.data.formats.bop.source import BopSource\n"
-        "from dopepp.data.formats.bop.writer import BopWriter\n"
-        "from dopepp.data.sample import Sample\n"
-        "from dopepp.parts.catalogue import servoholder\n"
-        f"writer = WebdatasetWriter({str(tmp_path)!r}, [servoholder()])\n"
-        "writer.prepare()\n"
-        "image, depth = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)\n"
-        "writer.write(0, Sample(image, np.eye(3), [], depth))\n"
-        "assert writer.written(0) == {0}\n"
-        "sys.exit(bool({'torch', 'lightning', 'webdataset'} & set(sys.modules)))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 @settings(max_examples=60, deadline=None)
 @given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
 def test_runs_round_trip(mask: np.ndarray) -> None:
@@ -191,13 +146,13 @@ def test_runs_go_down_the_columns_and_begin_with_zeros() -> None:
 @pytest.mark.parametrize(
     ("record", "message"),
     [
-        ({"counts": [6], "size": [3, 2]}, r"x: size \[3, 2\]; allowed: \[2, 3\]"),
+        ({"counts": [6], "size": [3, 2]}, r"x: size \[3, 2\]; allowed: runs of size \[2, 3\]"),
         ({"counts": [5], "size": [2, 3]}, r"counts \[5\]"),
         ({"counts": [-1, 7], "size": [2, 3]}, "counts"),
         ({"counts": [1.0, 5.0], "size": [2, 3]}, "counts"),
         ({"counts": "abc", "size": [2, 3]}, "counts 'abc'"),
         ({"counts": [10**20], "size": [2, 3]}, "counts"),
-        (None, "size None"),
+        (None, "missing"),
     ],
 )
 def test_damaged_runs(record: object, message: str) -> None:
@@ -324,23 +279,6 @@ def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) ->
         index.read(1, "image")
 
 
-@settings(max_examples=40, deadline=None)
-@given(place=st.integers(0, 6000), noise=st.binary(min_size=1, max_size=12))
-def test_any_damage_is_a_user_error_or_harmless(
-    place: int, noise: bytes, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.mktemp("noise") / "shard-000000.tar"
-    whole = bytearray(Shard(path).write(image_files("000000_000000")).read_bytes())
-    whole[place : place + len(noise)] = noise
-    path.write_bytes(bytes(whole))
-    try:
-        source = WebdatasetSource(path.parent, [block()])
-        source.sample(0)
-    except UserError:
-        return
-    assert len(source) == 1
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -349,7 +287,7 @@ def test_any_damage_is_a_user_error_or_harmless(
         ({"gt_json": {"a": 1}}, r"gt\.json: .*a list"),
         ({"gt_info_json": [{"visib_fract": 1}]}, r"gt_info\.json: 1 objects; allowed: 3"),
         ({"gt_info_json": [{"visib_fract": "1"}] * 3}, r"gt_info\.json: \[0\]\.visib_fract"),
-        ({"mask_visib_json": {"0": {}}}, r"mask_visib\.json: 1: size None"),
+        ({"mask_visib_json": {"0": {}}}, r"mask_visib\.json: 1: missing"),
         ({"mask_visib_json": {"1": {"size": [48, 64], "counts": [1]}}}, r"counts \[1\]"),
     ],
 )
@@ -410,7 +348,7 @@ def address(tmp_path: Path) -> Iterator[str]:
 
 
 def test_shards_are_downloaded_once_and_within_bounds(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    address: str, tmp_path: Path, contents: Contents, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for n in (0, 1):
         Shard(tmp_path / "served" / f"shard-{n:06d}.tar").write(image_files(f"00000{n}_000000"))

@@ -28,7 +28,6 @@ from dopepp.virtual import (
     Surface,
     make_surface,
     render,
-    visible_fractions,
 )
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.renderers.raster import shadow as shadow_module
@@ -262,11 +261,6 @@ def test_a_huge_silhouette_is_counted_at_a_reduced_scale(
     near_face = 0.02 - 0.5e-4
     area = (600 * 0.10 / near_face) * (1.02 * 600 * 0.06 / near_face)
     assert fraction == pytest.approx(640 * 480 / area, rel=0.01)
-
-
-def test_preview_agrees_with_rendering(scene_of: MakeScene, plate: Surface) -> None:
-    scene = scene_of(at(plate, 0.05, 0, 0.2), at(plate, 0, 0.01, 0.3), **LARGE)
-    np.testing.assert_array_equal(visible_fractions(scene), render(scene).visible_fractions)
 
 
 def without_casters(*arguments: object) -> ShadowMap:

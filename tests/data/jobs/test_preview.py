@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,9 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.jobs.job import make_job
-from dopepp.data.jobs.progress import preview_sheet, scene_tiles
-from dopepp.data.jobs.render_dataset import write_preview
+from dopepp.data.jobs import preview
+from dopepp.data.jobs.job import Job, make_job
+from dopepp.data.jobs.preview import preview_sheet, scene_tiles, write_preview
 
 SMALL = ("width=96", "height=72")
 
@@ -51,12 +52,14 @@ def test_no_target_is_said_so() -> None:
     assert depth.caption == "no depth"
 
 
-def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(tmp_path: Path) -> None:
-    job = make_job(["servoholder"], preset="quickstart", size="32x24")
-    beside = write_preview(job, tmp_path / "data")
-    named = write_preview(job, tmp_path / "sheet.png")
-    assert beside == tmp_path / "data.preview.png"
-    assert beside.read_bytes() == named.read_bytes()
+def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(
+    small_job: Callable[..., Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sheet = np.zeros((5, 7, 3), np.uint8)
+    monkeypatch.setattr(preview, "preview_sheet", lambda factory: sheet)
+    assert write_preview(small_job(), tmp_path / "data") == tmp_path / "data.preview.png"
+    named = write_preview(small_job(), tmp_path / "sheet.png")
     assert {path.name for path in tmp_path.iterdir()} == {"data.preview.png", "sheet.png"}
+    assert cv2.imread(str(named)).shape == sheet.shape
     with pytest.raises(UserError, match=r"sheet .*sheet\.png.*a folder that can be written"):
-        write_preview(job, named / "x")
+        write_preview(small_job(), named / "x")

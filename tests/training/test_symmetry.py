@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,8 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.part import Part
 from dopepp.training.symmetry import FACING, SymmetryHandling, SymmetryOptions
-from dopepp.training.system import PoseSystem, draw_maps
+from dopepp.training.system import PoseSystem
+from dopepp.training.targets import draw_maps
 
 SystemMaker = Callable[..., PoseSystem]
 K = camera_matrix(110.0, 110.0, 63.5, 63.5)
@@ -66,6 +67,18 @@ def random_poses(count: int, seed: int) -> np.ndarray:
     return np.stack([make_transform(*pair) for pair in zip(rotations, shifts, strict=True)])
 
 
+def face_on(angles_deg: Sequence[float]) -> np.ndarray:
+    """Poses in the reference orientation, turned in the image plane."""
+    return np.stack(
+        [
+            make_transform(
+                Rotation.from_euler("z", one, degrees=True).as_matrix() @ FACING, (0, 0, 0.3)
+            )
+            for one in angles_deg
+        ]
+    )
+
+
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
 def test_poses_that_look_alike_get_the_same_keypoints(part: Part) -> None:
     handling = SymmetryHandling([part], SymmetryOptions())
@@ -87,21 +100,13 @@ def test_the_first_choice_is_the_best_of_the_whole_group(part: Part) -> None:
     poses[:, :3, 3] = (0, 0, 0.3) - poses[:, :3, :3] @ fixed
     found = handling.equivalents(make_batch(poses, part)).keypoints[:, 0, 0].numpy()
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, np.pi / 360)
+    # A round part's axis, +z, is to point up in the image: to −y.
     reference = FACING if part is PLATE else np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     for T, keypoints in zip(poses, found, strict=True):
         equivalents = T @ group
-        if part is PLATE:
-            score = np.trace(reference.T @ equivalents[:, :3, :3], axis1=1, axis2=2)
-        else:  # the axis up in the image counts, then whatever turns the part least from there
-            score = np.trace(_upright(handling).T @ equivalents[:, :3, :3], axis1=1, axis2=2)
+        score = np.trace(reference.T @ equivalents[:, :3, :3], axis1=1, axis2=2)
         best = project_keypoints(part.cuboid, equivalents[score.argmax()], K)
         assert np.abs(best - keypoints).max() < 0.6
-
-
-def _upright(handling: SymmetryHandling) -> np.ndarray:
-    reference: np.ndarray = handling._tables["references"][0].numpy()
-    assert np.allclose(reference @ (0, 0, 1), (0, -1, 0))
-    return reference
 
 
 def test_choices_of_a_box_are_permutations_of_its_corners() -> None:
@@ -136,9 +141,7 @@ def test_parts_without_symmetries_and_padding_are_left_bit_by_bit() -> None:
 
 def test_the_border_is_as_wide_as_asked() -> None:
     """Face on, a plate at θ in the image plane is |θ| and 180° − |θ| from the reference."""
-    angles = np.array([0.0, 70.0, 80.0, 95.0, 120.0])
-    turned = Rotation.from_euler("z", angles[:, None], degrees=True).as_matrix() @ FACING
-    poses = np.stack([make_transform(R, np.array([0, 0, 0.3])) for R in turned])
+    poses = face_on((0.0, 70.0, 80.0, 95.0, 120.0))
     handling = SymmetryHandling([PLATE], SymmetryOptions(border_deg=30.0))
     allowed = handling.equivalents(make_batch(poses, PLATE)).allowed[:, 0]
     assert allowed[:, 1].tolist() == [False, False, True, True, False]
@@ -154,9 +157,7 @@ def plate_system(make_system: SystemMaker) -> PoseSystem:
 
 
 def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system: PoseSystem) -> None:
-    turned = Rotation.from_euler("z", [[0.0], [85.0]], degrees=True).as_matrix() @ FACING
-    poses = np.stack([make_transform(R, np.array([0, 0, 0.3])) for R in turned])
-    batch = make_batch(poses, PLATE)
+    batch = make_batch(face_on((0.0, 85.0)), PLATE)
     found = plate_system.symmetry.equivalents(batch)
     geometry = plate_system.geometry
     first, second = (draw_maps(batch, found.keypoints[:, :, n], 1, geometry) for n in (0, 1))
@@ -172,9 +173,8 @@ def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system: PoseS
 
 
 def test_instances_on_one_image_choose_each_for_itself(plate_system: PoseSystem) -> None:
-    turned = Rotation.from_euler("z", [[85.0], [-88.0]], degrees=True).as_matrix() @ FACING
-    places = np.array([[-0.08, 0, 0.4], [0.08, 0, 0.4]])
-    poses = np.stack([make_transform(*pair) for pair in zip(turned, places, strict=True)])
+    poses = face_on((85.0, -88.0))
+    poses[:, :3, 3] = (-0.08, 0, 0.4), (0.08, 0, 0.4)
     alone = make_batch(poses, PLATE)
     both = replace(
         alone.rows(torch.tensor([0])),
@@ -189,12 +189,6 @@ def test_instances_on_one_image_choose_each_for_itself(plate_system: PoseSystem)
         belief, field = draw_maps(both, keypoints, 1, plate_system.geometry)
         stages = [(belief.clamp(min=1e-9).log(), field)]
         assert torch.equal(plate_system.targets(both, stages)[0], belief)
-
-
-def test_rows_of_a_batch_keep_their_names() -> None:
-    batch = make_batch(random_poses(3, seed=9), PLAIN).rows(torch.tensor([2, 0]))
-    assert batch.keys == ["2", "0"]
-    assert len(batch) == len(batch.sources) == len(batch.keypoints) == 2
 
 
 @pytest.mark.parametrize(

@@ -1,33 +1,18 @@
-"""The first images of a job on one sheet, to look at before rendering thousands.
-
-How far a render job is: a bar in a terminal, a line now and then in a log.
-"""
+"""The first images of a job on one sheet, to look at before rendering thousands."""
 
 from __future__ import annotations
 
-import logging
-import time
 from collections import Counter
 from collections.abc import Iterator
-from types import TracebackType
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
 
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_png
+from dopepp.data.jobs.job import Job
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.drawing.overlay import Wireframe, overlay
@@ -37,79 +22,6 @@ from dopepp.geometry.camera import project, resize_points, transform
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
-_log = logging.getLogger(__name__)
-
-_LINE_EVERY_S: Final = 30.0
-
-
-class ProgressDisplay:
-    """Shows counts of images while it is entered.
-
-    It is called as a :data:`~dopepp.data.jobs.render_dataset.Progress`.
-
-    Args:
-        console: Where the bar goes; without a terminal, lines go to the log instead.
-    """
-
-    def __init__(self, console: Console) -> None:
-        self._bar: Progress | None = None
-        if console.is_terminal:
-            self._bar = Progress(
-                TextColumn("rendering"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                RateColumn(),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-                console=console,
-            )
-        self._task: TaskID | None = None
-        self._first, self._start, self._last = 0, 0.0, 0.0
-
-    def __enter__(self) -> ProgressDisplay:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` images are there."""
-        if self._start == 0.0:
-            # What an earlier run made is no part of this one's rate.
-            self._first, self._start = done, time.monotonic()
-            self._last = self._start
-            if self._bar is not None:
-                self._task = self._bar.add_task("", completed=done, total=total)
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=done)
-        else:
-            self._log_line(done, total)
-
-    def _log_line(self, done: int, total: int) -> None:
-        now = time.monotonic()
-        if now - self._last < _LINE_EVERY_S or done == self._first:
-            return
-        self._last = now
-        rate = (done - self._first) / (now - self._start)
-        left = (total - done) / rate / 60
-        _log.info("%s of %s images, %.1f/s, %.0f min left", f"{done:,}", f"{total:,}", rate, left)
-
-
-class RateColumn(ProgressColumn):
-    """Images per second, of the last half minute."""
-
-    def render(self, task: Task) -> Text:
-        """Return the rate, or nothing while it is unknown."""
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:.1f}/s" if speed else "", style="progress.data.speed")
-
-
 NUM_SCENES: Final = 8
 
 _PANELS: Final = 4
@@ -118,6 +30,31 @@ _LISTED: Final = 4
 
 _AXIS_LENGTH: Final = 0.5
 """Of the part's diameter."""
+
+
+def write_preview(job: Job, out: Path) -> Path:
+    """Write a contact sheet of the job's first images.
+
+    Args:
+        job: The job.
+        out: A PNG file, or the data set's folder: the sheet then lies beside it.
+
+    Returns:
+        Where the sheet is.
+
+    Raises:
+        UserError: The preset cannot show the part, or the sheet cannot be written.
+    """
+    out = out.resolve()
+    path = out if out.suffix.lower() == ".png" else out.parent / f"{out.name}.preview.png"
+    sheet = preview_sheet(job.factory)
+    try:
+        write_png(path, sheet)
+    except OSError as error:
+        raise UserError(
+            f"sheet {path}: {error.strerror}", "a folder that can be written", "change --out"
+        ) from error
+    return path
 
 
 def preview_sheet(

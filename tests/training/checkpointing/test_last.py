@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 import random
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,6 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.parts.part import Part
 from dopepp.training.callbacks.averaging import TRAINED, AveragedWeights
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import Throughput
@@ -30,7 +29,6 @@ from dopepp.training.system import PoseSystem
 
 SystemMaker = Callable[..., PoseSystem]
 TIMES = ("throughput/images_per_s", "throughput/loader_wait")
-SIZE = 32
 
 
 class CutError(Exception):
@@ -64,30 +62,6 @@ class Cut(Callback):
             raise CutError
 
 
-class Noise:
-    """A source of pictures that are others in every epoch and cost nothing."""
-
-    name = "noise"
-
-    def __init__(self, num_images: int, part: Part) -> None:
-        self.num_images, self.part = num_images, part
-
-    def __len__(self) -> int:
-        return self.num_images
-
-    def sample(self, index: int, epoch: int = 0) -> Sample:
-        rng = np.random.default_rng([epoch, index])
-        image = rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8)
-        keypoints = rng.uniform(0, SIZE, (9, 2))
-        return Sample(image, np.eye(3), [Instance(self.part.name, np.eye(4), keypoints)])
-
-    def describe(self) -> list[SourceInfo]:
-        return []
-
-    def contains(self, label: str) -> bool:
-        return True
-
-
 def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> Any:
     return torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
 
@@ -95,8 +69,8 @@ def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> Any:
 class Runs:
     """Trains in a folder, from its newest checkpoint if there is one."""
 
-    def __init__(self, make_system: SystemMaker, part: Part) -> None:
-        self.make_system, self.part = make_system, part
+    def __init__(self, make_system: SystemMaker, make_noise: Callable[[], PoseDataModule]) -> None:
+        self.make_system, self.make_noise = make_system, make_noise
 
     def __call__(
         self,
@@ -106,31 +80,22 @@ class Runs:
         more: Sequence[Callback] = (),
         **options: Any,
     ) -> PoseSystem:
-        for seed in (random.seed, np.random.seed, torch.manual_seed):
-            seed(3)
         system = self.make_system(system_class=Noisy, make_scheduler=cosine)
         for seed in (random.seed, np.random.seed, torch.manual_seed):
             seed(4)
         table = MetricsTable(folder / "metrics.csv")
         last = last or LastCheckpoint(every_s=0, max_share=1)
-        best = ModelCheckpoint(
-            filename="best", monitor="val/loss", enable_version_counter=False,
-        )  # fmt: skip
-        callbacks = [*more, Throughput(), LearningRateMonitor("step"), cut]
-        options = {"max_epochs": 2, **options}
-        data = [Noise(number, self.part) for number in (8, 4, 1)]
-        datamodule = PoseDataModule(*data, [self.part.name], (SIZE, SIZE), batch_size=2)
+        best = ModelCheckpoint(filename="best", monitor="val/loss", enable_version_counter=False)
         trainer = Trainer(
-            accelerator="cpu", log_every_n_steps=1, default_root_dir=folder,
-            logger=[table], callbacks=[*callbacks, best, last], enable_progress_bar=False,
+            accelerator="cpu", log_every_n_steps=1, default_root_dir=folder, logger=[table],
+            callbacks=[*more, Throughput(), LearningRateMonitor("step"), cut, best, last],
             plugins=[AtomicCheckpointIO(prepare=table.write)], enable_model_summary=False,
-            num_sanity_val_steps=0, use_distributed_sampler=False, **options,
+            num_sanity_val_steps=0, use_distributed_sampler=False, enable_progress_bar=False,
+            **{"max_epochs": 2, **options},
         )  # fmt: skip
         found = newest_checkpoint(folder)
-        trainer.fit(
-            system, datamodule=datamodule, ckpt_path=found and found[0],
-            weights_only=True,
-        )  # fmt: skip
+        path = found and found[0]
+        trainer.fit(system, datamodule=self.make_noise(), ckpt_path=path, weights_only=True)
         return system
 
 
@@ -143,8 +108,8 @@ def quiet() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def runs(make_system: SystemMaker, part: Part) -> Runs:
-    return Runs(make_system, part)
+def runs(make_system: SystemMaker, make_noise: Callable[[], PoseDataModule]) -> Runs:
+    return Runs(make_system, make_noise)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -177,7 +142,7 @@ def assert_ends_as(folder: Path, system: PoseSystem, cut: Path, again: PoseSyste
     assert_same(best(cut)[1], best(folder)[1])
 
 
-@pytest.mark.parametrize("every", [11, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [17, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(
     every: int, runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
 ) -> None:
@@ -212,14 +177,34 @@ def test_the_clock_and_the_share_of_time_decide(runs: Runs, tmp_path: Path) -> N
     assert saved["global_step"] == 1  # its duration is known from then on
 
 
-@pytest.mark.slow
 def test_accumulated_gradients_are_not_cut_in_two(runs: Runs, tmp_path: Path) -> None:
     whole = runs(tmp_path / "whole", Cut(None), accumulate_grad_batches=2)
-    for at in (6, 9, 12):
+    for at in (6, 9):
         with pytest.raises(CutError):
             runs(tmp_path / str(at), Cut(at), accumulate_grad_batches=2)
         again = runs(tmp_path / str(at), Cut(None), accumulate_grad_batches=2)
         assert_ends_as(tmp_path / "whole", whole, tmp_path / str(at), again)
+
+
+def validations(folder: Path) -> list[str]:
+    return [row["epoch"] for row in rows(folder) if row["val/loss"]]
+
+
+def test_patience_outlives_a_cut(runs: Runs, tmp_path: Path) -> None:
+    def run(name: str, cut: int | None, patience: int = 1) -> PoseSystem:
+        # Nothing counts as an improvement: with a patience of 1 the second validation is the last.
+        stop = EarlyStop("val/loss", min_delta=1e9, patience=patience)
+        return runs(tmp_path / name, Cut(cut), more=[stop], max_epochs=5)
+
+    whole = run("whole", None)
+    assert validations(tmp_path / "whole") == ["0", "1"]
+    with pytest.raises(CutError):
+        run("cut", 36)
+    for _ in range(2):  # what has stopped early stays so …
+        again = run("cut", None)
+        assert_ends_as(tmp_path / "whole", whole, tmp_path / "cut", again)
+    run("cut", None, patience=2)  # … until there is more patience
+    assert validations(tmp_path / "cut") == ["0", "1", "2"]
 
 
 class Recorder(Callback):
@@ -240,52 +225,65 @@ def last_state(folder: Path, name: str) -> dict[str, torch.Tensor]:
     return dict(content[name])
 
 
-@pytest.mark.slow
-def test_an_average_and_patience_outlive_cuts(runs: Runs, tmp_path: Path) -> None:
-    def more() -> list[Callback]:
-        # Nothing counts as an improvement: the third validation is the last one.
-        patience = EarlyStop("val/loss", min_delta=1e9, patience=2)
-        return [AveragedWeights(0.8), patience]
-
-    recorder = Recorder()
-    whole = runs(tmp_path / "whole", Cut(None), more=[*more(), recorder], max_epochs=6)
-    assert [row["epoch"] for row in rows(tmp_path / "whole") if row["val/loss"]] == ["0", "1", "2"]
-    expected = dict(recorder.states[0])
-    for n, state in enumerate(recorder.states[1:], start=1):
-        decay = min(0.8, n / (n + 9))
+def assert_average(folder: Path, states: Sequence[dict[str, torch.Tensor]]) -> None:
+    """Compare the saved average with its formula in plain arithmetic."""
+    expected = dict(states[0])
+    for n, state in enumerate(states[1:], start=1):
+        decay = min(0.3, n / (n + 9))
         for name, value in state.items():
             moving = value.is_floating_point()
             expected[name] = decay * expected[name] + (1 - decay) * value if moving else value
-    averaged, trained = (last_state(tmp_path / "whole", name) for name in ("state_dict", TRAINED))
-    assert averaged.keys() == expected.keys()
-    for name, value in averaged.items():
+    found = last_state(folder, "state_dict")
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
         torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
-    assert_same(trained, whole.state_dict())  # training has gone on with them, to its end
-    assert any(not torch.equal(averaged[name], trained[name]) for name in trained)
-    for at in (16, 36):  # in the first validation, in the second one
-        cut = tmp_path / str(at)
-        with pytest.raises(CutError):
-            runs(cut, Cut(at), more=more(), max_epochs=6)
-        again = runs(cut, Cut(None), more=more(), max_epochs=6)
-        assert_ends_as(tmp_path / "whole", whole, cut, again)
-        assert_same(last_state(cut, "state_dict"), averaged)
-    # What has stopped early stays so, until there is more patience.
-    again = runs(cut, Cut(None), more=more(), max_epochs=6)
-    assert_ends_as(tmp_path / "whole", whole, cut, again)
-    patient = EarlyStop("val/loss", min_delta=1e9, patience=3)
-    runs(cut, Cut(None), more=[AveragedWeights(0.8), patient], max_epochs=6)
-    assert [row["epoch"] for row in rows(cut) if row["val/loss"]] == ["0", "1", "2", "3"]
 
 
-@pytest.mark.slow
-def test_an_average_may_begin_or_end_with_a_resume(runs: Runs, tmp_path: Path) -> None:
-    whole = runs(tmp_path / "whole", Cut(None))
-    for before, after in (([AveragedWeights(0.8)], []), ([], [AveragedWeights(0.8)])):
-        cut = tmp_path / str(len(before))
-        with pytest.raises(CutError):
-            runs(cut, Cut(9), more=before)
-        again = runs(cut, Cut(None), more=after)
-        assert_same(again.state_dict(), whole.state_dict())
+@pytest.fixture(scope="module")
+def averaged(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PoseSystem]:
+    folder, recorder = tmp_path_factory.mktemp("averaged"), Recorder()
+    system = runs(folder, Cut(None), more=[AveragedWeights(0.3), recorder])
+    assert_average(folder, recorder.states)
+    return folder, system
+
+
+def test_the_trained_weights_stand_beside_the_average(
+    averaged: tuple[Path, PoseSystem], whole: tuple[Path, PoseSystem, int]
+) -> None:
+    average, trained = (last_state(averaged[0], name) for name in ("state_dict", TRAINED))
+    assert_same(trained, averaged[1].state_dict())  # training has gone on with them, to its end
+    assert_same(trained, whole[1].state_dict())  # as it does without an average
+    assert any(not torch.equal(average[name], trained[name]) for name in trained)
+
+
+@pytest.mark.parametrize("at", [9, 16, 36])  # between two steps, in both validations
+def test_an_average_outlives_a_cut_and_may_end_with_it(
+    at: int,
+    averaged: tuple[Path, PoseSystem],
+    runs: Runs,
+    whole: tuple[Path, PoseSystem, int],
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(CutError):
+        runs(tmp_path / "cut", Cut(at), more=[AveragedWeights(0.3)])
+    shutil.copytree(tmp_path / "cut", tmp_path / "copy")
+    again = runs(tmp_path / "cut", Cut(None), more=[AveragedWeights(0.3)])
+    assert_ends_as(*averaged, tmp_path / "cut", again)
+    assert_same(last_state(tmp_path / "cut", "state_dict"), last_state(averaged[0], "state_dict"))
+    without = runs(tmp_path / "copy", Cut(None))
+    assert_same(without.state_dict(), whole[1].state_dict())
+
+
+def test_an_average_may_begin_with_a_resume(
+    runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
+) -> None:
+    with pytest.raises(CutError):
+        runs(tmp_path, Cut(9))
+    begun, recorder = last_state(tmp_path, "state_dict"), Recorder()
+    again = runs(tmp_path, Cut(None), more=[AveragedWeights(0.3), recorder])
+    assert_same(recorder.states[0], begun)
+    assert_average(tmp_path, recorder.states)
+    assert_same(again.state_dict(), whole[1].state_dict())
 
 
 @pytest.mark.parametrize("decay", [1, -0.1, True, "much"])

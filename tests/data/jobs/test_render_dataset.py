@@ -5,14 +5,16 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -20,124 +22,119 @@ from rich.console import Console
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
-from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.jobs.folder import RECORD_FILE
-from dopepp.data.jobs.job import Job, make_job, named_part
-from dopepp.data.jobs.progress import ProgressDisplay
-from dopepp.data.jobs.render_dataset import RenderReport, render_dataset
-from dopepp.data.jobs.work import WRITERS, Outcome, Shard, Task, Worker, plan
+from dopepp.data.jobs.job import WRITERS, Job, make_job, named_part
+from dopepp.data.jobs.pools import Pool
+from dopepp.data.jobs.render_dataset import ProgressDisplay, RenderReport, render_dataset
+from dopepp.data.jobs.work import Outcome, Shard, Task, Worker, plan
 
-LAYOUTS = tuple(WRITERS)
+NUM = 10
+Make = Callable[..., Job]
+Contents = Callable[[Path], dict[str, bytes]]
 
 
-class InlinePool:
+class InlinePool(Pool):
     """Does every task at once, here; dies after some."""
 
-    images_per_task = 3
+    images_per_task = 2
 
     def __init__(self, content: bytes, dies_after: int | None = None) -> None:
         self._worker, self._left = Worker(content), dies_after
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
-        for task in tasks:
-            if self._left == 0:
-                raise KeyboardInterrupt
-            self._left = None if self._left is None else self._left - 1
-            yield self._worker.perform(task)
+    def __exit__(self, *_: object) -> None: ...
+
+    def room(self) -> int:
+        return 1
+
+    def submit(self, task: Task) -> Future[Outcome]:
+        if self._left == 0:
+            raise KeyboardInterrupt
+        self._left = None if self._left is None else self._left - 1
+        future: Future[Outcome] = Future()
+        future.set_result(self._worker.perform(task))
+        return future
 
 
-def inline(content: bytes, num_tasks: int) -> AbstractContextManager[InlinePool]:
-    return nullcontext(InlinePool(content))
+def inline(content: bytes, num_tasks: int) -> Pool:
+    return InlinePool(content)
 
 
-def small_job(layout: str = "bop", **options: Any) -> Job:
-    return make_job(
-        ["servoholder"], **{"preset": "quickstart", "size": "32x24", "layout": layout} | options
-    )
+@pytest.fixture(scope="module", params=WRITERS)
+def layout(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each layout in turn, with small chunks."""
+    module, name = WRITERS[request.param]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{module}.{name}.chunk_size", 4)
+        yield request.param
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()
-    }
+@pytest.fixture(scope="module")
+def job(layout: str, small_job: Make) -> Job:
+    return small_job(layout)
 
 
-@pytest.fixture(autouse=True)
-def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, name in WRITERS.values():
-        monkeypatch.setattr(f"{module}.{name}.chunk_size", 8)
+@pytest.fixture(scope="module")
+def whole(
+    job: Job, contents: Contents, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, bytes]:
+    """The files of a job that nobody stopped."""
+    root = tmp_path_factory.mktemp("whole")
+    report = render_dataset(job, root, NUM, inline)
+    assert (report.num_images, report.num_rendered) == (NUM, NUM)
+    return contents(root)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_whatever_stops_a_job_it_ends_with_the_same_files(layout: str, tmp_path: Path) -> None:
-    job = small_job(layout)
-    whole = render_dataset(job, tmp_path / "whole", 20, inline)
-    assert (whole.num_images, whole.num_rendered, whole.num_unsealed) == (20, 20, 0)
-    root = tmp_path / "stopped"
+def test_whatever_stops_a_job_it_ends_with_the_same_files(
+    job: Job, whole: dict[str, bytes], tmp_path: Path, contents: Contents
+) -> None:
     for dies_after in (0, 2, 3):
         with pytest.raises(KeyboardInterrupt):
-            render_dataset(
-                job,
-                root,
-                20,
-                lambda content, _: nullcontext(InlinePool(content, dies_after)),  # noqa: B023
-            )
-    last = render_dataset(job, root, 20, inline)
-    assert 0 < last.num_rendered < 20
-    assert contents(root) == contents(tmp_path / "whole")
-    again = render_dataset(job, root, 20, inline)
+            render_dataset(job, tmp_path, NUM, lambda work, _: InlinePool(work, dies_after))  # noqa: B023
+    last = render_dataset(job, tmp_path, NUM, inline)
+    assert 0 < last.num_rendered < NUM
+    assert contents(tmp_path) == whole
+    again = render_dataset(job, tmp_path, NUM, inline)
     assert again.num_rendered == 0
-    assert str(again) == "all 20 images were there"
-    assert contents(root) == contents(tmp_path / "whole")
+    assert str(again) == f"all {NUM} images were there"
+    assert contents(tmp_path) == whole
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_job_grows(layout: str, tmp_path: Path) -> None:
-    job = small_job(layout)
-    render_dataset(job, tmp_path / "once", 19, inline)
-    for num in (3, 11, 5, 19):
-        render_dataset(job, tmp_path / "grown", num, inline)
-    assert contents(tmp_path / "grown") == contents(tmp_path / "once")
+def test_a_job_grows(job: Job, whole: dict[str, bytes], tmp_path: Path, contents: Contents) -> None:
+    for num in (2, 5, 3, NUM):
+        render_dataset(job, tmp_path, num, inline)
+    assert contents(tmp_path) == whole
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_shards_share_a_folder_at_the_same_time(layout: str, tmp_path: Path) -> None:
-    job, root = small_job(layout), tmp_path / "shards"
-    render_dataset(job, tmp_path / "whole", 21, inline)
-    reports: list[RenderReport] = []
+def test_shards_share_a_folder_at_the_same_time(
+    job: Job, whole: dict[str, bytes], tmp_path: Path, contents: Contents
+) -> None:
+    # They begin and end within chunks: the last to finish finalizes what it shares with others.
+    others: list[RenderReport] = []
 
-    def others(done: int, total: int) -> None:
-        if done == 3 and not reports:  # the first shard has begun: now run the others
+    def run_others(done: int, total: int) -> None:
+        if done == 2 and not others:  # the first shard has begun
             for number in (2, 1):
-                reports.append(RenderReport(0))
-                reports[-1] = render_dataset(job, root, 21, inline, Shard(number, 3))
+                others.append(RenderReport(0))
+                others[-1] = render_dataset(job, tmp_path, NUM, inline, Shard(number, 3))
 
-    reports.append(render_dataset(job, root, 21, inline, Shard(0, 3), others))
-    assert [report.num_images for report in reports] == [7, 7, 7]
-    # 7 and 14 lie within chunks: the last to finish finalizes what it shares with its neighbours.
-    assert [report.num_unsealed for report in reports] == [1, 1, 0]
-    assert contents(root) == contents(tmp_path / "whole")
+    first = render_dataset(job, tmp_path, NUM, inline, Shard(0, 3), run_others)
+    assert [report.num_rendered for report in (first, *others)] == [3, 4, 3]
+    assert contents(tmp_path) == whole
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_shards_of_separate_folders_are_merged_by_copying(layout: str, tmp_path: Path) -> None:
-    job = small_job(layout)
-    merged: dict[str, bytes] = {}
+def test_shards_of_separate_folders_are_merged_by_copying(
+    job: Job, whole: dict[str, bytes], tmp_path: Path, contents: Contents
+) -> None:
     for number in range(2):  # each finalizes a chunk of its own, and they share one
-        render_dataset(job, tmp_path / str(number), 24, inline, Shard(number, 2))
-        merged |= contents(tmp_path / str(number))
-    for name, content in merged.items():
-        path = tmp_path / "merged" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    assert render_dataset(job, tmp_path / "merged", 24, inline).num_rendered == 0
-    render_dataset(job, tmp_path / "whole", 24, inline)
-    assert contents(tmp_path / "merged") == contents(tmp_path / "whole")
+        render_dataset(job, tmp_path / str(number), NUM, inline, Shard(number, 2))
+        shutil.copytree(tmp_path / str(number), tmp_path / "merged", dirs_exist_ok=True)
+    assert render_dataset(job, tmp_path / "merged", NUM, inline).num_rendered == 0
+    assert contents(tmp_path / "merged") == whole
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_job: Make, contents: Contents
 ) -> None:
     job, write = small_job("ndds"), Path.write_bytes
     render_dataset(job, tmp_path / "whole", 10, inline)
@@ -162,7 +159,9 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     assert contents(root) == whole
 
 
-def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path: Path) -> None:
+def test_another_job_in_the_folder_is_refused_by_its_field(
+    tmp_path: Path, small_job: Make, contents: Contents
+) -> None:
     render_dataset(small_job("ndds"), tmp_path, 2, inline)
     before = contents(tmp_path)
     for change, field in (
@@ -178,54 +177,43 @@ def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path: Path) -> No
     assert contents(tmp_path) == before
 
 
-def test_changed_photos_and_meshes_are_another_job(tmp_path: Path) -> None:
-    import cv2
-
+def test_changed_photos_and_meshes_are_another_job(tmp_path: Path, small_job: Make) -> None:
     photos, mesh = tmp_path / "photos", tmp_path / "box.stl"
     photos.mkdir()
     picture = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
-    cv2.imwrite(str(photos / "a.png"), picture)
-    triangles = [[(0, 0, 0), (90, 0, 0), (0, 80, 0)], [(0, 0, 0), (0, 80, 0), (0, 0, 70)]]
 
     def write_mesh(scale: float) -> None:
-        lines = ["solid box"]
-        for triangle in triangles:
-            lines += ["facet normal 0 0 0", "outer loop"]
-            lines += ["vertex {} {} {}".format(*(scale * x for x in v)) for v in triangle]
-            lines += ["endloop", "endfacet"]
-        mesh.write_text("\n".join([*lines, "endsolid box"]))
+        trimesh.creation.box(np.array([90, 80, 70]) * scale).export(mesh)
 
-    def job(unit: str = "mm") -> Job:
-        options: dict[str, Any] = {"preset": "quickstart", "size": "32x24", "layout": "ndds"}
-        return make_job([str(mesh)], unit=unit, backgrounds=photos, **options)
+    def render(unit: str = "mm") -> None:
+        options = {"preset": "quickstart", "size": "32x24", "layout": "ndds", "unit": unit}
+        job = make_job([str(mesh)], backgrounds=photos, **options)
+        render_dataset(job, tmp_path / "out", 1, inline)
 
     write_mesh(1)
-    render_dataset(job(), tmp_path / "out", 1, inline)
-    for action, field in (
-        (lambda: write_mesh(1.1), r"parts\[0\]\.diameter is 0\.12.* there and 0\.13.* now"),
-        (
-            lambda: cv2.imwrite(str(photos / "b.png"), picture),
-            r'backgrounds\[1\] is "1" there and "2" now',
-        ),
-    ):
-        action()
-        with pytest.raises(UserError, match=field):
-            render_dataset(job(), tmp_path / "out", 1, inline)
+    cv2.imwrite(str(photos / "a.png"), picture)
+    render()
+    write_mesh(1.1)
+    with pytest.raises(UserError, match=r"parts\[0\]\.diameter is 0\.139.* there and 0\.153.* now"):
+        render()
     write_mesh(1)
     with pytest.raises(UserError, match='unit is "mm" there and "cm" now'):
-        render_dataset(job("cm"), tmp_path / "out", 1, inline)
+        render("cm")
+    cv2.imwrite(str(photos / "b.png"), picture)
+    with pytest.raises(UserError, match=r'backgrounds\[1\] is "1" there and "2" now'):
+        render()
 
 
 @pytest.mark.parametrize(
     "content", ["", "[1]", '{"seed": NaN}', '{"seed": 1, "seed": 2}', "[" * 100_000, "{}"]
 )
-def test_a_damaged_record_is_a_user_error(content: str, tmp_path: Path) -> None:
+def test_a_damaged_record_is_a_user_error(content: str, tmp_path: Path, small_job: Make) -> None:
     (tmp_path / RECORD_FILE).write_text(content)
     with pytest.raises(UserError, match=RECORD_FILE):
         render_dataset(small_job(), tmp_path, 2, inline)
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_folder_with_something_else_is_refused(tmp_path: Path, small_job: Make) -> None:
     (tmp_path / "thesis.pdf").touch()
     with pytest.raises(UserError, match=r"holds 'thesis\.pdf' and no"):
         render_dataset(small_job(), tmp_path, 2, inline)
@@ -233,7 +221,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path: Path) -> None:
         render_dataset(small_job(), tmp_path / "thesis.pdf" / "x", 2, inline)
 
 
-def test_only_abandoned_partial_files_are_removed(tmp_path: Path) -> None:
+def test_only_abandoned_partial_files_are_removed(tmp_path: Path, small_job: Make) -> None:
     job = small_job("ndds")
     render_dataset(job, tmp_path, 2, inline)
     mine = partial_path(tmp_path / "000009.png")
@@ -278,7 +266,7 @@ def test_a_shard_that_is_none(text: str) -> None:
 
 
 @pytest.mark.parametrize("num", [0, -5, 10**9 + 1])
-def test_a_count_that_cannot_be(num: int, tmp_path: Path) -> None:
+def test_a_count_that_cannot_be(num: int, tmp_path: Path, small_job: Make) -> None:
     with pytest.raises(UserError, match=f"-n {num}; allowed: 1 to 1,000,000,000"):
         render_dataset(small_job(), tmp_path / "out", num, inline)
     assert not (tmp_path / "out").exists()
@@ -310,7 +298,7 @@ def test_changes_that_cannot_be_made(changes: list[str], message: str) -> None:
         make_job(["servoholder"], changes=changes)
 
 
-def test_changes_reach_the_preset() -> None:
+def test_changes_reach_the_preset(small_job: Make) -> None:
     preset = small_job(changes=["lighting.num_lights=[2,3]", "min_visible_fraction=0.25"])
     assert preset.factory.preset.lighting.num_lights == (2, 3)
     assert preset.factory.preset.min_visible_fraction == 0.25
@@ -318,29 +306,20 @@ def test_changes_reach_the_preset() -> None:
     json.dumps(preset.record, allow_nan=False)
 
 
-def test_a_defect_comes_with_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_comes_with_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_job: Make
+) -> None:
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
-    with pytest.raises(RuntimeError, match=r"(?s)test_production\.py.*KeyError: 'defect'"):
+    with pytest.raises(RuntimeError, match=r"(?s)test_render_dataset\.py.*KeyError: 'defect'"):
         render_dataset(small_job("ndds"), tmp_path, 2, inline)
 
 
-def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path: Path) -> None:
+def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path: Path, small_job: Make) -> None:
     small = ["horizontal_fov_deg=5", "placement.lateral=0", "min_visible_fraction=0.95"]
     job = small_job(preset="paper", changes=small)
     with pytest.raises(UserError, match="part servoholder"):
         render_dataset(job, tmp_path / "out", 2, inline)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_a_machine_does_not_see(tmp_path: Path) -> None:
-    import pickle
-
-    from dopepp.data.jobs.work import Work
-
-    worker = Worker(pickle.dumps(Work(small_job().factory, "bop", tmp_path)))
-    outcome = worker.perform(Task(0, range(1)))
-    assert isinstance(outcome.error, UserError)
-    assert "as one of the workers sees it" in str(outcome.error)
 
 
 def test_the_bar_shows_count_rate_and_time_left() -> None:
@@ -357,7 +336,7 @@ def test_the_bar_shows_count_rate_and_time_left() -> None:
 def test_without_a_terminal_lines_go_to_the_log(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = iter([100.0, 100.0, 110.0, 140.0, 145.0])
+    clock = iter([100.0, 110.0, 140.0, 145.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     with caplog.at_level("INFO"), ProgressDisplay(Console(file=StringIO())) as progress:
         for done in (20, 20, 100, 110):
@@ -365,14 +344,3 @@ def test_without_a_terminal_lines_go_to_the_log(
     (message,) = caplog.messages
     assert "100 of 1,300" in message
     assert "10 min" in message
-
-
-def test_a_report_says_what_it_cost() -> None:
-    said = str(RenderReport(100, 50, 0, 10.0, 1.0, 0.5))
-    assert "50 of 100" in said
-    assert "5.0 images/s" in said
-    assert "30.0 CPU-ms" in said
-
-
-def test_writers_agree_on_the_names() -> None:
-    assert {BopWriter.name, NddsWriter.name} <= set(LAYOUTS)

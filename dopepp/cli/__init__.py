@@ -1,0 +1,59 @@
+"""The console command ``dopepp``; each subcommand imports what it needs when it is called.
+
+To add a command, write a function in a module of its name and one line in :data:`COMMANDS`.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+from dopepp.cli import check, compare, download, predict, release, render, symmetries
+from dopepp.cli.errors import USERS_MISTAKE
+
+COMMANDS: Final = (
+    predict.predict,
+    render.render,
+    check.check,
+    download.download,
+    compare.compare,
+    symmetries.symmetries,
+    release.release,
+)
+"""As ``--help`` lists them."""
+
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+"""Of the click that this version of Typer brings along or imports."""
+
+
+class _OneLine(TyperGroup):
+    """Tells a wrong option or a missing argument in one line, as any other mistake."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except _UsageError as error:
+            line = " ".join(error.format_message().split())  # type: ignore[attr-defined]
+            typer.echo(f"{line.rstrip('.')}; --help lists what there is", err=True)
+            raise typer.Exit(USERS_MISTAKE) from error
+
+
+app = typer.Typer(
+    cls=_OneLine,
+    no_args_is_help=True,
+    add_completion=False,
+    help="The console command ``dopepp``; each subcommand imports what it needs when it is called.",
+)
+
+
+@app.callback()
+def _configure() -> None:
+    """Poses of weakly textured parts: render, check, predict and compare."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+
+
+for _command in COMMANDS:
+    app.command()(_command)

@@ -1,0 +1,40 @@
+"""How a command ends early: with one line, and 2 for a user's mistake or another code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+import typer
+
+from dopepp.core.errors import UserError
+
+USERS_MISTAKE: Final = 2
+STOPPED: Final = 1
+
+
+@contextmanager
+def report_errors() -> Iterator[None]:
+    """End the command with one line for a user's mistake."""
+    try:
+        yield
+    except UserError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(USERS_MISTAKE) from error
+
+
+@contextmanager
+def resumable() -> Iterator[None]:
+    """End the command with one line when it is interrupted or cannot go on, too."""
+    from dopepp.core.interrupts import Interruption, StoppedError, interruptible
+
+    try:
+        with report_errors(), interruptible():
+            yield
+    except StoppedError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(STOPPED) from error
+    except Interruption as interruption:
+        typer.echo(str(interruption), err=True)
+        raise typer.Exit(interruption.exit_code) from interruption

@@ -1,0 +1,108 @@
+"""Work that others do: futures in the order they are done in, and Ray as a maker of futures."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any, Final, TypeVar
+
+from dopepp.core.errors import UserError, require
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_KNOCK_S: Final = 5.0
+
+_OBJECT_STORE_BYTES: Final = 200_000_000
+"""Of a local cluster; it holds the work, a few megabytes, and outcomes."""
+
+
+def completed(
+    submit: Callable[[Item], Future[Result]], items: Iterable[Item], room: Callable[[], int]
+) -> Iterator[tuple[Item, Future[Result]]]:
+    """Submit items and yield each with its future as soon as that is done.
+
+    Args:
+        submit: Hands an item to somebody.
+        items: Read only as far as there is room, and after what is done was yielded, because that
+            may decide what comes next.
+        room: Returns how many may be handed out at a time.
+    """
+    waiting, flying = iter(items), dict[Future[Result], Item]()
+    while True:
+        while len(flying) < room() and (item := next(waiting, None)) is not None:
+            flying[submit(item)] = item
+        if not flying:
+            return
+        for future in wait(flying, return_when=FIRST_COMPLETED).done:
+            yield flying.pop(future), future
+
+
+def connect(
+    address: str | None,
+    num_workers: int,
+    asked_by: str = "--engine ray",
+    option: str = "--ray-address",
+) -> Any:
+    """Import Ray and connect to a cluster, or start a local one.
+
+    A local one binds to this machine only and reports to nobody.
+
+    Args:
+        address: Of the cluster; None starts one on this machine that ends with this process.
+        num_workers: Cores of that local cluster.
+        asked_by: The choice that needs Ray, for messages.
+        option: The option that holds the address, for messages.
+
+    Raises:
+        UserError: Ray is not installed, or there is no cluster at the address.
+    """
+    require("ray", asked_by, "ray")
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray starts, so it comes first
+    import ray
+
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        options |= {
+            "address": "local",
+            "num_cpus": num_workers,
+            "include_dashboard": False,
+            "object_store_memory": _OBJECT_STORE_BYTES,
+            "_node_ip_address": "127.0.0.1",
+        }
+    else:
+        options["address"] = address
+    try:
+        if address is not None:  # knocks first: Ray itself tries for many minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=_KNOCK_S).close()
+        ray.init(**options)
+    except (OSError, ValueError, OverflowError, RuntimeError) as error:
+        raise UserError(
+            f"{option} {address}: {error}",
+            "host:port of a running Ray cluster that this machine belongs to",
+            "start one with `ray start --head`, or leave the address out",
+        ) from error
+    return ray
+
+
+def spread(
+    ray: Any, function: Callable[..., Result], **options: Any
+) -> Callable[..., Future[Result]]:
+    """Return a function that does the same as a task of the cluster.
+
+    Args:
+        ray: From :func:`connect`.
+        function: What is to be done.
+        **options: What a task occupies: ``num_cpus``, ``num_gpus``, and how often it is repeated.
+    """
+    # Without SPREAD, Ray fills one machine before it uses the next.
+    remote = ray.remote(scheduling_strategy="SPREAD", **options)(function)
+
+    def submit(*arguments: object) -> Future[Result]:
+        future: Future[Result] = remote.remote(*arguments).future()
+        return future
+
+    return submit

@@ -1,0 +1,81 @@
+"""Target maps: what the network is asked to give for a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dopepp.data.batch import PADDING, Batch
+from dopepp.maps.encode import MapGeometry, encode
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.heads import Stage
+from dopepp.models.losses import MapLoss
+from dopepp.training.symmetry import SymmetryHandling
+
+Targets = tuple[
+    Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
+]
+"""Belief maps and vector fields as the network should give them."""
+
+
+def draw_maps(
+    batch: Batch,
+    keypoints: Float[Tensor, "batch instances 9 2"],
+    num_objects: int,
+    geometry: MapGeometry,
+) -> Targets:
+    """Draw the maps of the instances that are visible enough for a metric to count them.
+
+    Args:
+        batch: Images and how much of each instance is visible.
+        keypoints: Of the instances, pixels; those of the batch, or of poses that look alike.
+        num_objects: Number of objects.
+        geometry: Stride, peak width and disc radius of the maps.
+    """
+    height, width = batch.images.shape[-2:]
+    map_size = height // geometry.stride, width // geometry.stride
+    seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
+    index = torch.where(seen, batch.object_index, PADDING)
+    return encode(keypoints, index, num_objects, map_size, geometry)
+
+
+def choose_keypoints(
+    batch: Batch,
+    stages: Sequence[Stage] | None,
+    symmetry: SymmetryHandling,
+    loss: MapLoss,
+    geometry: MapGeometry,
+) -> Float[Tensor, "batch instances 9 2"]:
+    """Return each instance's keypoints in the one of its look-alike poses that is to be learnt.
+
+    That is the pose nearest the reference orientation. Where another one is as good, it is the one
+    whose maps the network's answer has the lower loss to; one instance is decided after the other.
+
+    Args:
+        batch: Images and poses.
+        stages: The network's answer; None for the nearest pose always.
+        symmetry: Which poses look alike.
+        loss: Compares the answer with maps.
+        geometry: Stride, peak width and disc radius of the maps.
+    """
+    found = symmetry.equivalents(batch)
+    keypoints = found.keypoints[:, :, 0].clone()
+    if stages is None:
+        return keypoints
+    for slot, choice in found.allowed[:, :, 1:].any(dim=0).nonzero().tolist():
+        # Only the images on which this instance may take this choice are drawn, twice.
+        rows = found.allowed[:, slot, 1 + choice].nonzero()[:, 0]
+        some = batch.rows(rows)
+        answer = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
+        other = keypoints[rows]
+        other[:, slot] = found.keypoints[rows, slot, 1 + choice]
+        present_loss, other_loss = (
+            loss.per_image(answer, *draw_maps(some, points, symmetry.num_objects, geometry))
+            for points in (keypoints[rows], other)
+        )
+        better = other_loss < present_loss
+        keypoints[rows] = torch.where(better[:, None, None, None], other, keypoints[rows])
+    return keypoints

@@ -1,0 +1,223 @@
+"""Rates, areas, matches and intervals against loops over their definitions, scipy and by hand."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from dopepp.core.errors import UserError
+from dopepp.metrics.functional import (
+    BOP_MSPD_THRESHOLDS,
+    BOP_THRESHOLDS,
+    auc,
+    average_precision,
+    average_recall,
+    expected_calibration_error,
+    match,
+    pass_rate,
+    wilson_interval,
+)
+
+Array = NDArray[np.float64]
+REL = 1e-9
+
+
+def voc_loop(errors: list[float], maximum: float) -> float:
+    """YCB-Video's rule, written from its description: right-sided rectangles over sorted errors."""
+    total, previous, found = 0.0, 0.0, 0
+    for error in sorted(e for e in errors if e <= maximum):
+        found += 1
+        total += (error - previous) * found / len(errors)
+        previous = error
+    if found == 0:
+        return 0.0
+    return (total + (maximum - previous) * found / len(errors)) / maximum
+
+
+ERRORS = st.lists(
+    st.one_of(st.floats(0, 0.2), st.sampled_from([0.0, 0.05, 0.1, math.inf])), max_size=30
+)
+
+
+@given(ERRORS)
+@settings(deadline=None, max_examples=80)
+def test_auc_equals_loops(errors: list[float]) -> None:
+    values = torch.tensor(errors, dtype=torch.float64)
+    exact = sum(min(max(1 - e / 0.1, 0), 1) for e in errors) / max(len(errors), 1)
+    assert auc(values, 0.1) == pytest.approx(exact, rel=REL, abs=1e-15)
+    voc = auc(values, 0.1, "voc")
+    assert voc == pytest.approx(voc_loop(errors, 0.1), rel=REL, abs=1e-15)
+    hits = [e for e in errors if e <= 0.1]
+    if hits:  # the documented difference between the two
+        assert voc - exact == pytest.approx(max(hits) / (len(errors) * 0.1), rel=1e-6, abs=1e-12)
+
+
+def test_exact_auc_is_the_area_under_the_pass_rate() -> None:
+    errors = torch.from_numpy(np.random.default_rng(0).exponential(0.05, 40))
+    edges = np.concatenate([[0], np.sort(errors[errors < 0.1]), [0.1]])
+    # Between two errors the strict pass rate is constant, so the sum of rectangles is exact.
+    rates = [pass_rate(errors, (a + b) / 2) for a, b in itertools.pairwise(edges)]
+    assert auc(errors, 0.1) == pytest.approx(np.diff(edges) @ rates / 0.1, rel=REL)
+
+
+@pytest.mark.parametrize("method", ["exact", "voc"])
+@pytest.mark.parametrize("errors", [[], [math.inf, math.inf], [math.nan], [0.3]])
+def test_auc_without_a_hit_is_zero(method: str, errors: list[float]) -> None:
+    values = torch.tensor(errors, dtype=torch.float64)
+    assert auc(values, 0.1, method) == 0.0  # type: ignore[arg-type]
+
+
+def test_auc_refuses_other_methods_and_empty_ranges() -> None:
+    with pytest.raises(UserError, match="got auc method 'coco'; allowed: exact, voc"):
+        auc(torch.zeros(1), 0.1, "coco")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="got max_threshold=0"):
+        auc(torch.zeros(1), 0)
+
+
+def test_pass_rate_is_strict_and_misses_count() -> None:
+    errors = torch.tensor([0.0, 0.05, 0.1, math.inf, math.nan], dtype=torch.float64)
+    assert pass_rate(errors, 0.05) == 0.2
+    assert pass_rate(errors, 0.1) == 0.4
+    assert pass_rate(torch.empty(0), 0.1) == 0.0
+    assert pass_rate(errors[3:], 0.1) == 0.0
+
+
+def test_match_breaks_ties_by_order_and_includes_the_limit() -> None:
+    assert match(torch.ones(2), torch.full((2, 2), 0.1, dtype=torch.float64)).tolist() == [0, 1]
+    assert match(torch.ones(1), torch.tensor([[0.1000001]])).tolist() == [-1]
+    assert match(torch.ones(1), torch.tensor([[0.02, 0.02]])).tolist() == [0]
+
+
+def test_match_of_nothing_and_of_nan() -> None:
+    assert match(torch.empty(0), torch.empty(0, 3)).tolist() == []
+    assert match(torch.ones(2), torch.empty(2, 0)).tolist() == [-1, -1]
+    nan = torch.tensor([[math.nan, 0.02], [0.01, math.nan]])
+    assert match(torch.tensor([math.nan, 0.1]), nan).tolist() == [1, 0]
+    with pytest.raises(ValueError, match="2 scores need as many rows"):
+        match(torch.ones(2), torch.zeros(3, 1))
+
+
+@given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
+@settings(deadline=None, max_examples=60)
+def test_match_equals_a_plain_loop(p: int, g: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores, distances = rng.random(p), rng.uniform(0, 0.2, (p, g))
+    expected, taken = [-1] * p, set()
+    for i in sorted(range(p), key=lambda i: -scores[i]):
+        near = sorted((distances[i, j], j) for j in range(g) if j not in taken)
+        if near and near[0][0] <= 0.1:
+            expected[i] = near[0][1]
+            taken.add(near[0][1])
+    assert match(torch.from_numpy(scores), torch.from_numpy(distances)).tolist() == expected
+
+
+def loop_average_precision(scores: Array, correct: NDArray[np.bool_], instances: int) -> float:
+    order = np.argsort(-scores, kind="mergesort")
+    found, curve = 0, []
+    for rank, index in enumerate(order, start=1):
+        found += bool(correct[index])
+        curve.append((found / instances, found / rank))
+    return float(
+        np.mean(
+            [
+                max((p for r, p in curve if r >= level), default=0.0)
+                for level in np.linspace(0.0, 1.0, 101)
+            ]
+        )
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 100_000), count=st.integers(1, 40))
+def test_average_precision_is_its_definition(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores = rng.integers(0, 10, count) / 10.0
+    correct = rng.random(count) < 0.6
+    instances = int(correct.sum()) + int(rng.integers(0, 5)) or 1
+    expected = loop_average_precision(scores, correct, instances)
+    result = average_precision(torch.from_numpy(scores), torch.from_numpy(correct), instances)
+    assert result == pytest.approx(expected, abs=1e-12)
+
+
+def test_average_precision_at_the_ends() -> None:
+    none = torch.zeros(0)
+    assert average_precision(none, none.bool(), 3) == 0.0
+    assert average_precision(torch.ones(2), torch.zeros(2, dtype=torch.bool), 0) == 0.0
+    assert average_precision(torch.ones(2), torch.ones(2, dtype=torch.bool), 2) == 1.0
+    unknown = torch.tensor([torch.nan, 0.1])
+    assert average_precision(unknown, torch.tensor([False, True]), 1) == 1.0
+    with pytest.raises(ValueError, match="3 correct predictions of 2"):
+        average_precision(torch.ones(3), torch.ones(3, dtype=torch.bool), 2)
+    with pytest.raises(ValueError, match="differ"):
+        average_precision(torch.ones(3), torch.ones(2, dtype=torch.bool), 2)
+
+
+def test_average_recall_is_the_mean_of_strict_pass_rates() -> None:
+    errors = torch.tensor([0.05, 0.07, 0.3, torch.inf, torch.nan])
+    rates = [pass_rate(errors, threshold) for threshold in BOP_THRESHOLDS]
+    assert rates[0] == 0.0
+    assert rates[-1] == pytest.approx(0.6)
+    assert average_recall(errors, BOP_THRESHOLDS) == pytest.approx(sum(rates) / 10)
+    assert average_recall(torch.zeros(0), BOP_MSPD_THRESHOLDS) == 0.0
+    assert (len(BOP_THRESHOLDS), BOP_THRESHOLDS[2], BOP_MSPD_THRESHOLDS[-1]) == (10, 0.15, 50.0)
+    with pytest.raises(UserError, match="no thresholds"):
+        average_recall(errors, [])
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    counts=st.integers(1, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
+    confidence=st.floats(0.5, 0.999),
+)
+def test_wilsons_interval_is_scipys(counts: tuple[int, int], confidence: float) -> None:
+    passed, num = counts
+    low, high = wilson_interval(passed, num, confidence)
+    theirs = binomtest(passed, num).proportion_ci(confidence, method="wilson")
+    assert (low, high) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
+    assert 0 <= low <= passed / num <= high <= 1
+
+
+def test_without_trials_the_rate_is_unknown() -> None:
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("arguments", [(-1, 2), (3, 2), (1, 2, 0.0), (1, 2, 1.0)])
+def test_impossible_counts_are_refused(arguments: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=f"passed={arguments[0]}"):
+        wilson_interval(*arguments)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 60), bins=st.integers(1, 20))
+def test_calibration_error_is_its_definition(seed: int, count: int, bins: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores, correct = rng.integers(0, 41, count) / 40, rng.random(count) < 0.5
+    expected = 0.0
+    for k in range(bins):
+        inside = (scores * bins > k) & (scores * bins <= k + 1)
+        if k == 0:
+            inside |= scores == 0
+        if inside.any():
+            expected += inside.mean() * abs(scores[inside].mean() - correct[inside].mean())
+    result = expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct), bins)
+    assert result == pytest.approx(expected, abs=1e-12)
+
+
+def test_calibration_error_at_the_ends_and_of_mistakes() -> None:
+    none = torch.zeros(0)
+    assert expected_calibration_error(none, none.bool()) == 0.0
+    assert expected_calibration_error(torch.ones(3), torch.ones(3, dtype=torch.bool)) == 0.0
+    assert expected_calibration_error(torch.ones(3), torch.zeros(3, dtype=torch.bool)) == 1.0
+    for scores in (torch.tensor([1.5]), torch.tensor([torch.nan])):
+        with pytest.raises(ValueError, match=r"\[0, 1\]"):
+            expected_calibration_error(scores, torch.ones(1, dtype=torch.bool))
+    with pytest.raises(ValueError, match="bins"):
+        expected_calibration_error(torch.ones(2), torch.ones(1, dtype=torch.bool))
