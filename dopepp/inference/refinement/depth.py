@@ -105,7 +105,8 @@ class DepthRefiner:
     """
 
     def __init__(self, parts: Sequence[Part]) -> None:
-        self._gicp = _small_gicp()
+        require("small_gicp", "refine=depth", "depth")
+        self._gicp: ModuleType = import_module("small_gicp")
         self._surfaces = {
             part.name: surface_points(part.points)
             for part in parts
@@ -237,9 +238,3 @@ def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
     return make_transform(
         rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
     )
-
-
-def _small_gicp() -> ModuleType:
-    """Import small_gicp when it is asked for."""
-    require("small_gicp", "refine=depth", "depth")
-    return import_module("small_gicp")
