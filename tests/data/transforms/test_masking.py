@@ -95,6 +95,18 @@ def test_bounds_share_and_origin_of_the_patch(
         assert patch.reshape(-1, 3).std(axis=0).max() > 0
 
 
+def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box() -> None:
+    """Equation 4: 0.8 of the height and 0.8 of the width."""
+    mask = np.zeros(SIZE, bool)
+    mask[10:50, 20:70] = True
+    sizes = []
+    for seed in range(100):
+        result = RandomMask(1.0)(sample_of(mask), np.random.default_rng(seed), Stripes())
+        first, last, start, stop = box_of((result.image != (255, 0, 255)).any(axis=2) & mask)
+        sizes.append((last - first, stop - start))
+    assert np.max(sizes, axis=0).tolist() == [32, 40]
+
+
 def test_the_crop_is_a_piece_of_the_own_background() -> None:
     mask = ellipse(30, 40, 12, 12)
     sample, other = sample_of(mask), Stripes()
