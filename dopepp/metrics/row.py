@@ -73,10 +73,6 @@ class PoseRow:
         """Return a plain dict that JSON can hold; ``PoseRow(**record)`` reads it back."""
         return asdict(self)
 
-    def texts(self) -> dict[str, str]:
-        """Return what a table prints: heading to text, in the columns' order."""
-        return {column.heading: column.text(self) for column in COLUMNS}
-
 
 @dataclass(frozen=True)
 class Column:

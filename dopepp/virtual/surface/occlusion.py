@@ -81,7 +81,7 @@ def bake_open_sky(
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.ascontiguousarray(array).data)
     key = digest.digest()
     baked = _BAKED.get(key)
     if baked is None:
