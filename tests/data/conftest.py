@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,46 +16,31 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
 
 HALF = np.array([0.04, 0.03, 0.02])
-CLASSES = ("002_can", "003_box", "004_mug")
-
-
-def make_box(name: str) -> Part:
-    cuboid = cuboid_keypoints(-HALF, HALF)
-    return Part(name, cuboid, float(2 * np.linalg.norm(HALF)), cuboid[:8], mesh_hash=name)
 
 
 @pytest.fixture
 def box() -> Part:
-    return make_box("003_box")
+    cuboid = cuboid_keypoints(-HALF, HALF)
+    return Part("003_box", cuboid, float(2 * np.linalg.norm(HALF)), cuboid[:8], mesh_hash="box")
 
 
+@dataclass(eq=False)
 class FakeSource:
     """Small textured images with one instance, a pure function of (epoch, index)."""
 
-    def __init__(
-        self,
-        num_items: int = 12,
-        name: str = "fake",
-        label: str = "box",
-        size: tuple[int, int] = (64, 48),
-        bad: Callable[[int], Exception | None] = lambda index: None,
-    ) -> None:
-        self.name, self.num_items, self.label, self.size, self.bad = (
-            name,
-            num_items,
-            label,
-            size,
-            bad,
-        )
-        self.calls: list[tuple[int, int]] = []
+    num_items: int = 12
+    name: str = "fake"
+    label: str = "box"
+    size: tuple[int, int] = (64, 48)
+    bad: Callable[[int], Exception | None] = lambda index: None
+    calls: list[tuple[int, int]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return self.num_items
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         self.calls.append((epoch, index))
-        error = self.bad(index)
-        if error is not None:
+        if error := self.bad(index):
             raise error
         rng = np.random.default_rng([7, epoch, index])
         width, height = self.size
@@ -86,10 +72,9 @@ class YcbTree:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        (root / "data").mkdir(parents=True)
-        (root / "data_syn").mkdir()
-        (root / "image_sets").mkdir()
-        (root / "image_sets" / "classes.txt").write_text("\n".join(CLASSES) + "\n")
+        for folder in ("data", "data_syn", "image_sets"):
+            (root / folder).mkdir(parents=True)
+        self.write_list("classes", ["002_can", "003_box", "004_mug"])
         self.K = camera_matrix(100.0, 100.0, 47.5, 35.5)
 
     def write_list(self, name: str, lines: list[str]) -> None:
@@ -108,9 +93,9 @@ class YcbTree:
         label = np.zeros((72, 96), np.uint8)
         poses = np.zeros((3, 4, len(classes)))
         for i, class_index in enumerate(classes):
-            poses[:, :3, i] = np.eye(3)
-            poses[:, 3, i] = (0.04 * i, 0.0, 0.3)
-            T = np.vstack([poses[..., i], [0, 0, 0, 1]])
+            T = np.eye(4)
+            T[:3, 3] = (0.04 * i, 0.0, 0.3)
+            poses[..., i] = T[:3]
             corners = project_keypoints(cuboid_keypoints(-HALF, HALF), T, self.K)[:8]
             if labelled:
                 hull = cv2.convexHull(np.rint(corners).astype(np.int32))
@@ -120,10 +105,9 @@ class YcbTree:
             image[label == 0] = 0
         self.path(frame, "color.png").parent.mkdir(exist_ok=True)
         order = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        cv2.imwrite(str(self.path(frame, "color.png")), cv2.cvtColor(image, order))
-        cv2.imwrite(str(self.path(frame, "label.png")), label)
-        depth = np.full(label.shape, 3000, np.uint16)
-        cv2.imwrite(str(self.path(frame, "depth.png")), depth)
+        colour, depth = cv2.cvtColor(image, order), np.full(label.shape, 3000, np.uint16)
+        for what, pixels in (("color", colour), ("label", label), ("depth", depth)):
+            cv2.imwrite(str(self.path(frame, f"{what}.png")), pixels)
         fields: dict[str, Any] = {
             "cls_indexes": np.array(classes, np.float32)[:, None],
             "poses": poses,
@@ -139,3 +123,16 @@ class YcbTree:
 @pytest.fixture
 def ycb_tree(tmp_path: Path) -> YcbTree:
     return YcbTree(tmp_path / "ycb")
+
+
+@pytest.fixture(scope="session")
+def contents() -> Callable[[Path], dict[str, bytes]]:
+    """Read every file of a folder, and every folder as an empty one."""
+
+    def read(root: Path) -> dict[str, bytes]:
+        return {
+            str(path.relative_to(root)): path.read_bytes() if path.is_file() else b""
+            for path in root.rglob("*")
+        }
+
+    return read

@@ -5,11 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dopepp.data.check import check_dataset
-from dopepp.data.formats import Writer
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
@@ -20,17 +20,10 @@ from dopepp.parts.part import Part
 @pytest.mark.render
 @pytest.mark.parametrize("writer_class", [NddsWriter, BopWriter, WebdatasetWriter])
 def test_written_sets_are_clean(
-    tmp_path: Path, parts: list[Part], samples: list[Sample], writer_class: type[Writer]
+    tmp_path: Path, parts: list[Part], samples: list[Sample], writer_class: Any, write_set: Any
 ) -> None:
-    writer = writer_class(tmp_path / "set", parts)  # type: ignore[call-arg]
-    writer.prepare()
-    for index, sample in enumerate(samples):
-        writer.write(index, sample)
-    writer.finalize(0, range(len(samples)))
-    report = check_dataset(tmp_path / "set")
-    assert [str(defect) for defect in report.defects] == []
-    assert report.num_images == len(samples)
-    assert report.notes == []
+    report = check_dataset(write_set(writer_class, tmp_path / "set", parts, samples))
+    assert (report.defects, report.notes, report.num_images) == ([], [], len(samples))
 
 
 def test_data_sets_are_read_written_and_checked_without_torch(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,16 +17,3 @@ def small_job() -> Callable[..., Job]:
         return make_job(["servoholder"], **defaults | options)
 
     return make
-
-
-@pytest.fixture(scope="session")
-def contents() -> Callable[[Path], dict[str, bytes]]:
-    """Read every file of a folder, and every folder as an empty one."""
-
-    def read(root: Path) -> dict[str, bytes]:
-        return {
-            str(path.relative_to(root)): path.read_bytes() if path.is_file() else b""
-            for path in root.rglob("*")
-        }
-
-    return read

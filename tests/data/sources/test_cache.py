@@ -136,7 +136,6 @@ def test_a_file_lasts_and_is_told_apart(fake_source: Any, tmp_path: Path) -> Non
 def test_a_torn_slot_is_filled_again(fake_source: Any, tmp_path: Path) -> None:
     kept = CachedSource(fake_source(num_items=4), (64, 64), tmp_path)
     kept.sample(2)
-    assert kept.folder is not None
     path = kept.folder / "slots.bin"
     with path.open("r+b") as file:
         file.seek(path.stat().st_size * 2 // 4 + 100)

@@ -42,32 +42,19 @@ def items(source: HybridSource, epoch: int) -> list[tuple[str, str]]:
 
 @settings(deadline=None, max_examples=50)
 @given(
-    real=st.integers(1, 12),
-    virtual=st.integers(1, 40),
-    synthetic=st.none() | st.integers(1, 9),
-    fraction=st.floats(0, 1),
-    synthetic_fraction=st.floats(0, 1),
+    real=st.builds(Named, st.just("real"), st.integers(1, 12)),
+    virtual=st.builds(Named, st.just("virtual"), st.integers(1, 40)),
+    synthetic=st.none() | st.builds(Named, st.just("synthetic"), st.integers(1, 9)),
+    fractions=st.tuples(st.floats(0, 1), st.floats(0, 1)),
     length=st.integers(1, 40),
     seed=st.integers(0, 1000),
 )
 def test_shares_are_exact_and_items_used_equally(
-    real: int,
-    virtual: int,
-    synthetic: int | None,
-    fraction: float,
-    synthetic_fraction: float,
-    length: int,
-    seed: int,
-) -> None:
-    mix = HybridSource(
-        Named("real", real),
-        Named("virtual", virtual),
-        fraction,
-        length,
-        seed,
-        None if synthetic is None else Named("synthetic", synthetic),
-        synthetic_fraction,
-    )
+    real: Named, virtual: Named, synthetic: Named | None, fractions: tuple[float, float],
+    length: int, seed: int,
+) -> None:  # fmt: skip
+    fraction, synthetic_fraction = fractions
+    mix = HybridSource(real, virtual, fraction, length, seed, synthetic, synthetic_fraction)
     used: Counter[tuple[str, str]] = Counter()
     for epoch in range(3):
         epoch_items = items(mix, epoch)
@@ -79,8 +66,8 @@ def test_shares_are_exact_and_items_used_equally(
         used.update((name, key.partition("/")[2]) for name, key in epoch_items)
         # An (epoch, index) of a source never comes twice, so no background or render repeats.
         assert len(set(epoch_items)) == length
-    for name, size in (("real", real), ("virtual", virtual)):
-        uses = [used[name, str(i)] for i in range(size)]
+    for source in (real, virtual):
+        uses = [used[source.name, str(i)] for i in range(len(source))]
         assert max(uses) - min(uses) <= 1
 
 
@@ -119,12 +106,8 @@ def test_contains_and_describe_know_only_used_sources() -> None:
     assert mix.contains("virtual")
     (info,) = mix.describe()
     assert info.name == "virtual"
-    assert info.identity["hybrid"] == {
-        "seed": 0,
-        "samples_per_epoch": 10,
-        "role": "virtual",
-        "count": 10,
-    }
+    shares = {"seed": 0, "samples_per_epoch": 10, "role": "virtual", "count": 10}
+    assert info.identity["hybrid"] == shares
     roles = {mix.locate(i, 0)[0] for i in range(10)}
     assert roles == {VIRTUAL}
     assert (REAL, SYNTHETIC) == (0, 2)

@@ -10,16 +10,8 @@ from hypothesis import strategies as st
 
 from dopepp.data.transforms.augment import Photometric
 
-OFF: dict[str, float] = {
-    "brightness": 0,
-    "contrast": 0,
-    "saturation": 0,
-    "hue": 0,
-    "colour_gain": 0,
-    "blur_probability": 0,
-    "noise_probability": 0,
-    "jpeg_probability": 0,
-}
+STRENGTHS = ("brightness", "contrast", "saturation", "hue", "colour_gain")
+OFF = dict.fromkeys([*STRENGTHS, *(f"{name}_probability" for name in ("blur", "noise", "jpeg"))], 0)
 
 
 @pytest.fixture(scope="module")

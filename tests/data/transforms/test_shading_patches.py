@@ -55,17 +55,11 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 @settings(deadline=None, max_examples=60)
 @given(
-    row=st.floats(10, 60),
-    column=st.floats(10, 80),
-    height=st.floats(5, 25),
-    width=st.floats(5, 30),
-    share=st.floats(0, 1),
-    seed=st.integers(0, 10_000),
+    st.builds(ellipse, st.floats(10, 60), st.floats(10, 80), st.floats(5, 25), st.floats(5, 30)),
+    st.floats(0, 1),
+    st.integers(0, 10_000),
 )
-def test_the_share_is_reached_inside_the_box(
-    row: float, column: float, height: float, width: float, share: float, seed: int
-) -> None:
-    mask = ellipse(row, column, height, width)
+def test_the_share_is_reached_inside_the_box(mask: np.ndarray, share: float, seed: int) -> None:
     sample = addressed(mask)
     before = sample.image.copy()
     (shaded,) = shade(sample, [share], seed, 3)
@@ -84,7 +78,6 @@ def test_the_share_is_reached_inside_the_box(
     assert instance.masked_fraction == covered
     assert instance.visible_fraction == pytest.approx(0.7 * (1 - covered))
     # What a patch hides has no known depth.
-    assert shaded.sample.depth is not None
     assert not shaded.sample.depth[mask & ~left].any()
     assert shaded.sample.depth[left].all()
 
@@ -177,18 +170,14 @@ def test_a_solid_background_covers_nothing_and_says_so() -> None:
     assert shaded.reached == (0.0,)
 
 
-def test_a_background_with_little_room_gives_smaller_crops() -> None:
+def test_little_room_gives_smaller_crops_and_a_smooth_background_is_no_solid_one() -> None:
     mask = np.ones(SIZE, bool)
     mask[:, :6] = mask[:6] = False
-    (shaded,) = shade(addressed(mask), [0.2], 0, 0)
-    assert shaded.reached[0] == pytest.approx(0.2, abs=TOLERANCE)
-
-
-def test_a_smooth_background_is_no_solid_one() -> None:
-    sample = addressed(mask := ellipse(36, 40, 8, 12))
-    sample.image[~mask] = np.arange(SIZE[1])[None, :, None].repeat(SIZE[0], 0)[~mask]
-    (shaded,) = shade(sample, [0.6], 0, 0)
-    assert shaded.reached[0] == pytest.approx(0.6, abs=TOLERANCE)
+    smooth = addressed(seen := ellipse(36, 40, 8, 12))
+    smooth.image[~seen] = np.arange(SIZE[1])[None, :, None].repeat(SIZE[0], 0)[~seen]
+    for sample, share in ((addressed(mask), 0.2), (smooth, 0.6)):
+        (shaded,) = shade(sample, [share], 0, 0)
+        assert shaded.reached[0] == pytest.approx(share, abs=TOLERANCE)
 
 
 def test_the_only_crops_with_contrast_are_found() -> None:

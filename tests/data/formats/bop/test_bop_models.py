@@ -10,12 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import (
-    bop_parts,
-    parts_by_id,
-    read_models,
-    write_models,
-)
+from dopepp.data.formats.bop.models import bop_parts, parts_by_id, read_models, write_models
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import Mesh, make_part
@@ -45,7 +40,6 @@ def test_parts_come_back_with_symmetries_in_metres(tmp_path: Path) -> None:
     assert [record[f"min_{a}"] for a in "xyz"] == pytest.approx([-20, -20, -25])
     assert [record[f"size_{a}"] for a in "xyz"] == pytest.approx([40, 40, 50])
     read, plain = bop_parts(tmp_path)
-    assert read.symmetries_discrete is not None
     np.testing.assert_allclose(read.symmetries_discrete, flip[None], atol=1e-12)
     np.testing.assert_allclose(read.symmetries_continuous, [axis], atol=1e-12)
     assert plain.symmetries_discrete is None
@@ -60,7 +54,6 @@ def test_ply_is_read_by_trimesh_in_millimetres(tmp_path: Path) -> None:
     path = tmp_path / "models" / "obj_000001.ply"
     loaded: Any = trimesh.load(path, process=False)
     mesh = pivconnector().mesh
-    assert mesh is not None
     np.testing.assert_allclose(loaded.vertices, 1000 * mesh.vertices, atol=1e-4)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
     assert b"property float nx" in path.read_bytes()[:400]
@@ -81,8 +74,6 @@ def test_texture_round_trip(ycb_root: Path, tmp_path: Path) -> None:
     part = ycb_part(ycb_root, "009_gelatin_box")
     write_models(tmp_path, [part])
     (read,) = bop_parts(tmp_path)
-    assert read.mesh is not None
-    assert part.mesh is not None
     np.testing.assert_array_equal(read.mesh.texture, part.mesh.texture)
     np.testing.assert_allclose(read.mesh.uv, part.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(read.mesh.vertices, part.mesh.vertices, atol=1e-7)
@@ -101,10 +92,7 @@ def test_objects_without_a_name_are_called_after_their_file(tmp_path: Path) -> N
     folder.rename(tmp_path / "models_eval")
     parts = bop_parts(tmp_path)
     assert [part.name for part in parts] == ["obj_000001", "obj_000012"]
-    assert {number: part.name for number, part in parts_by_id(tmp_path, parts).items()} == {
-        1: "obj_000001",
-        12: "obj_000012",
-    }
+    assert parts_by_id(tmp_path, parts) == {1: parts[0], 12: parts[1]}
     assert list(parts_by_id(tmp_path / "none", parts[1:])) == [12]
     with pytest.raises(UserError, match=r"part 'servoholder'.*obj_000001, obj_000012"):
         parts_by_id(tmp_path, [servoholder()])

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,9 @@ Contents = Callable[[Path], dict[str, bytes]]
 
 
 def test_round_trip(
-    parts: list[Part], samples: list[Sample], tmp_path: Path, assert_read_back: Any
+    parts: list[Part], samples: list[Sample], tmp_path: Path, assert_read_back: Any, write_set: Any
 ) -> None:
-    writer = BopWriter(tmp_path, parts)
-    writer.prepare()
-    for index, sample in enumerate(samples):
-        writer.write(index, sample)
-    writer.finalize(0, range(NUM_IMAGES))
+    write_set(BopWriter, tmp_path, parts, samples)
     source = BopSource(tmp_path, bop_parts(tmp_path), "train_pbr")
     assert len(source) == NUM_IMAGES
     assert sum(len(sample.instances) for sample in samples) > 2 * NUM_IMAGES
@@ -69,17 +66,9 @@ def test_bytes_do_not_depend_on_the_order_of_writing(
 
 
 def test_goes_on_after_being_killed(
-    parts: list[Part],
-    samples: list[Sample],
-    tmp_path: Path,
-    contents: Contents,
-    monkeypatch: pytest.MonkeyPatch,
+    parts: list[Part], samples: list[Sample], tmp_path: Path, contents: Contents, write_set: Any
 ) -> None:
-    whole = BopWriter(tmp_path / "whole", parts)
-    whole.prepare()
-    for index, sample in enumerate(samples):
-        whole.write(index, sample)
-    whole.finalize(0, range(NUM_IMAGES))
+    write_set(BopWriter, tmp_path / "whole", parts, samples)
 
     def die(*_: object) -> None:
         raise KeyboardInterrupt
@@ -90,12 +79,12 @@ def test_goes_on_after_being_killed(
     first.write(2, samples[2])
     first.finalize(0, [2])
     first.write(0, samples[0])
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dopepp.data.formats.bop.writer.stage", die)
         with pytest.raises(KeyboardInterrupt):
             first.write(1, samples[1])  # all of its images, and no marker
     assert BopWriter(root, parts).written(0) == {0, 2}
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(BopWriter, "_write_camera", die)
         with pytest.raises(KeyboardInterrupt):
             BopWriter(root, parts).finalize(0, [0])
@@ -132,7 +121,6 @@ def test_two_processes_seal_one_scene(
     killed.start()
     while not BopWriter(tmp_path, parts).written(0):
         pass
-    assert killed.pid is not None
     os.kill(killed.pid, signal.SIGKILL)
     for process in [*processes, killed]:
         process.join()
@@ -142,24 +130,31 @@ def test_two_processes_seal_one_scene(
     assert list(records) == [str(index) for index in range(40)]
 
 
-def test_annotation_of_a_plate_in_literal_numbers(tmp_path: Path) -> None:
-    # A plate of 40 × 20 mm that faces the camera at 200 mm: 0.2 px/mm·200 → 20 px × 10 px.
-    part = make_part("plate", _box((0.040, 0.020, 0.002)))
+K = camera_matrix(100.0, 100.0, 15.5, 11.5)
+
+
+@pytest.fixture(scope="module")
+def plate() -> Part:
+    """A plate of 40 × 20 mm."""
+    box: Any = trimesh.creation.box((0.040, 0.020, 0.002))
+    return make_part("plate", Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
+
+
+def test_annotation_of_a_plate_in_literal_numbers(
+    plate: Part, tmp_path: Path, write_set: Any
+) -> None:
+    # It faces the camera at 200 mm: 0.2 px/mm·200 → 20 px × 10 px.
     T = np.eye(4)
     T[:3, 3] = 0.0, 0.0, 0.201
-    K = camera_matrix(100.0, 100.0, 15.5, 11.5)
     visible = np.zeros((24, 32), bool)
     visible[7:17, 10:20] = True  # the left half
     depth = np.where(visible, 0.2, 0.0).astype(np.float32)
     depth[7:17, 20:26] = 0.15  # something before the right half
     depth[0, 0] = 70.0  # beyond the scale
-    instance = Instance("plate", T, project_keypoints(part.cuboid, T, K), 0.5, visible)
+    instance = Instance("plate", T, project_keypoints(plate.cuboid, T, K), 0.5, visible)
     sample = Sample(np.zeros((24, 32, 3), np.uint8), K, [instance], depth)
-    labels = make_labels(sample, {"plate": 7}, {"plate": (part, make_surface(part.mesh))})
-    assert labels.camera == {
-        "cam_K": [100.0, 0.0, 15.5, 0.0, 100.0, 11.5, 0.0, 0.0, 1.0],
-        "depth_scale": 0.1,
-    }
+    labels = make_labels(sample, {"plate": 7}, {"plate": (plate, make_surface(plate.mesh))})
+    assert labels.camera == {"cam_K": [100, 0, 15.5, 0, 100, 11.5, 0, 0, 1], "depth_scale": 0.1}
     (truth,) = labels.truths
     assert truth["obj_id"] == 7
     assert truth["cam_R_m2c"] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
@@ -167,20 +162,13 @@ def test_annotation_of_a_plate_in_literal_numbers(tmp_path: Path) -> None:
     (info,) = labels.infos
     # Columns 15.5 ± 10 are pixels 6 – 25, rows 11.5 ± 5 pixels 7 – 16.
     assert info == {
-        "bbox_obj": [6, 7, 19, 9],
-        "bbox_visib": [10, 7, 9, 9],
-        "px_count_all": 200,
-        "px_count_valid": 160,
-        "px_count_visib": 100,
-        "visib_fract": 0.5,
-    }
+        "bbox_obj": [6, 7, 19, 9], "bbox_visib": [10, 7, 9, 9], "px_count_all": 200,
+        "px_count_valid": 160, "px_count_visib": 100, "visib_fract": 0.5,
+    }  # fmt: skip
     assert labels.depth[10, 12] == 2000
     assert labels.depth[10, 22] == 1500
     assert labels.depth[0, 0] == 0
-    writer = BopWriter(tmp_path, [part])
-    writer.prepare()
-    writer.write(0, sample)
-    writer.finalize(0, [0])
+    write_set(BopWriter, tmp_path, [plate], [sample])
     assert json.loads((tmp_path / "camera.json").read_text()) == {
         "cx": 15.5, "cy": 11.5, "depth_scale": 0.1, "fx": 100.0, "fy": 100.0,
         "height": 24, "width": 32,
@@ -194,21 +182,16 @@ def test_annotation_of_a_plate_in_literal_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(png, labels.depth)
 
 
-def test_truncated_hidden_and_far_objects() -> None:
-    part = make_part("plate", _box((0.040, 0.020, 0.002)))
-    surfaces = {"plate": (part, make_surface(part.mesh))}
-    K = camera_matrix(100.0, 100.0, 15.5, 11.5)
+def test_truncated_hidden_and_far_objects(plate: Part) -> None:
+    surfaces = {"plate": (plate, make_surface(plate.mesh))}
     T = np.eye(4)
     T[:3, 3] = -0.0305, 0.0, 0.201  # columns −9.75 … 10.25
     visible = np.zeros((24, 32), bool)
     visible[7:17, :11] = True
     hidden = np.zeros_like(visible)
     depth = np.where(visible, 20.0, 0.0).astype(np.float32)
-    keypoints = project_keypoints(part.cuboid, T, K)
-    instances = [
-        Instance("plate", T, keypoints, 0.5, visible),
-        Instance("plate", T, keypoints, 0.0, hidden),
-    ]
+    instance = Instance("plate", T, project_keypoints(plate.cuboid, T, K), 0.5, visible)
+    instances = [instance, replace(instance, visible_fraction=0.0, mask=hidden)]
     image = np.zeros((24, 32, 3), np.uint8)
     labels = make_labels(Sample(image, K, instances, depth), {"plate": 1}, surfaces)
     assert labels.infos[0]["bbox_obj"] == [-9, 7, 19, 9]
@@ -219,13 +202,14 @@ def test_truncated_hidden_and_far_objects() -> None:
     # 20 m do not fit into 16 bits of 0.1 mm.
     assert labels.camera["depth_scale"] == 1.0
     assert labels.depth[10, 5] == 20_000
-    with pytest.raises(ValueError, match="without depth"):
-        make_labels(Sample(image, K, instances), {"plate": 1}, surfaces)
-    bare = [Instance("plate", T, keypoints)]
-    with pytest.raises(ValueError, match="without a mask"):
-        make_labels(Sample(image, K, bare, depth), {"plate": 1}, surfaces)
-    with pytest.raises(ValueError, match="'plate'"):
-        make_labels(Sample(image, K, instances, depth), {"other": 1}, surfaces)
+    bare = [replace(instance, mask=None)]
+    for sample, numbers, message in (
+        (Sample(image, K, instances), {"plate": 1}, "without depth"),
+        (Sample(image, K, bare, depth), {"plate": 1}, "without a mask"),
+        (Sample(image, K, instances, depth), {"other": 1}, "'plate'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_labels(sample, numbers, surfaces)
 
 
 def test_refuses_a_folder_of_something_else(parts: list[Part], tmp_path: Path) -> None:
@@ -239,8 +223,3 @@ def test_refuses_a_folder_of_something_else(parts: list[Part], tmp_path: Path) -
     with pytest.raises(UserError, match="part bare without a mesh"):
         BopWriter(tmp_path / "c", [bare]).prepare()
     assert not (tmp_path / "c").exists()
-
-
-def _box(extents: tuple[float, float, float]) -> Mesh:
-    box: Any = trimesh.creation.box(extents)
-    return Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gzip
 import http.server
 import io
 import json
@@ -35,16 +36,9 @@ K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 
 
 @pytest.fixture
-def written(parts: list[Part], samples: list[Sample], tmp_path: Path) -> Path:
+def written(parts: list[Part], samples: list[Sample], tmp_path: Path, write_set: Any) -> Path:
     """Write four images in two shards."""
-    root = tmp_path / "rendered"
-    writer = WebdatasetWriter(root, parts)
-    writer.prepare()
-    for index, sample in enumerate(samples):
-        writer.write(index + 998, sample)
-    writer.finalize(0, [998, 999])
-    writer.finalize(1, [1000, 1001])
-    return root
+    return write_set(WebdatasetWriter, tmp_path / "rendered", parts, samples, 998)
 
 
 def test_round_trip(written: Path, samples: list[Sample], assert_read_back: Any) -> None:
@@ -52,8 +46,7 @@ def test_round_trip(written: Path, samples: list[Sample], assert_read_back: Any)
     assert len(source) == NUM_IMAGES
     source = pickle.loads(pickle.dumps(source))
     for index in (2, 0, 3, 1):  # at random
-        sample, read = samples[index], source.sample(index, epoch=5)
-        assert_read_back(read, sample)
+        assert_read_back(source.sample(index, epoch=5), samples[index])
     keys = [source.sample(index).key for index in range(4)]
     assert keys == ["000000_000998", "000000_000999", "000001_000000", "000001_000001"]
     assert source.contains("servoholder")
@@ -81,29 +74,21 @@ def test_the_library_and_tarfile_read_the_shards(written: Path, samples: list[Sa
             1 + (instance.label == "pivconnector") for instance in sample.instances
         ]
         masks = json.loads(item["mask_visib.json"])
-        first = masks["0"]
-        mask = sample.instances[0].mask
-        assert mask is not None
-        assert first["size"] == [120, 160]
-        assert sum(first["counts"][1::2]) == mask.sum()
+        assert masks["0"]["size"] == [120, 160]
+        assert sum(masks["0"]["counts"][1::2]) == np.sum(sample.instances[0].mask)
         assert set(masks) == set(json.loads(item["mask.json"]))
     table = json.loads((written / "train_pbr" / "key_to_shard.json").read_text())
     assert table == {item["__key__"]: int(item["__url__"][-10:-4]) for item in stream}
-    with tarfile.open(written / "train_pbr" / "shard-000001.tar") as archive:
-        for info, member in zip(
-            archive.getmembers(), members(written / "train_pbr" / "shard-000001.tar"), strict=True
-        ):
+    path = written / "train_pbr" / "shard-000001.tar"
+    with tarfile.open(path) as archive:
+        for info, member in zip(archive.getmembers(), members(path), strict=True):
             assert info.name == f"{member.key}.{member.extension}"
             assert (info.offset_data, info.size) == (member.offset, member.size)
             assert (info.mtime, info.uid, info.uname) == (0, 0, "dopepp")
 
 
 def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
-    written: Path,
-    parts: list[Part],
-    samples: list[Sample],
-    contents: Contents,
-    monkeypatch: pytest.MonkeyPatch,
+    written: Path, parts: list[Part], samples: list[Sample], contents: Contents
 ) -> None:
     def die(*_: object) -> None:
         raise KeyboardInterrupt
@@ -117,7 +102,7 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
         writer.finalize(index // 1000, [index])
     assert not (root / "train_pbr" / STAGING).exists()
     writer.write(1000, samples[2])
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(WebdatasetWriter, "_write_keys", die)
         with pytest.raises(KeyboardInterrupt):
             writer.finalize(1, [1000])
@@ -160,20 +145,14 @@ def test_damaged_runs(record: object, message: str) -> None:
         decode_runs(record, (2, 3), "x")
 
 
-class Shard:
-    """Writes a shard by hand with tarfile."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-
-    def write(self, files: list[tuple[Any, bytes]], **options: Any) -> Path:
-        with tarfile.open(self.path, "w", **options) as archive:
-            for name, content in files:
-                info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
-                info.size = len(content) if info.isreg() else 0
-                archive.addfile(info, io.BytesIO(content))
-        return self.path
+def write_shard(path: Path, files: list[tuple[Any, bytes]], **options: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(path, "w", **options) as archive:
+        for name, content in files:
+            info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
+            info.size = len(content) if info.isreg() else 0
+            archive.addfile(info, io.BytesIO(content))
+    return path
 
 
 def block() -> Part:
@@ -201,16 +180,13 @@ def test_a_shard_of_another_writer(tmp_path: Path) -> None:
     folder = tarfile.TarInfo("some")
     folder.type = tarfile.DIRTYPE
     long = image_files("some/" + "x" * 150)
-    shard = Shard(tmp_path / "shard-000000.tar")
-    for options in ({"format": tarfile.PAX_FORMAT}, {"format": tarfile.GNU_FORMAT}):
-        shard.write([(folder, b""), *files, ("__meta__", b"x"), *long], **options)
+    files = [(folder, b""), *files, ("__meta__", b"x"), *long]
+    for kind in (tarfile.PAX_FORMAT, tarfile.GNU_FORMAT):
+        write_shard(tmp_path / "shard-000000.tar", files, format=kind)
         source = WebdatasetSource(tmp_path, [block()])
         samples = [source.sample(index) for index in range(len(source))]
-        assert [s.key[:20] for s in samples] == [
-            "000001_000005",
-            "000000_000007",
-            "some/" + "x" * 15,
-        ]
+        keys = [sample.key[:20] for sample in samples]
+        assert keys == ["000001_000005", "000000_000007", "some/" + "x" * 15]
         assert [len(sample.instances) for sample in samples] == [1, 0, 1]
         (instance,) = samples[0].instances
         np.testing.assert_allclose(instance.T_cam_obj[:3, 3], [0.005, -0.01, 0.25])
@@ -222,7 +198,7 @@ def test_hostile_members_are_refused(tmp_path: Path) -> None:
     good = image_files("000000_000000")
 
     def refused(message: str, files: list[tuple[Any, bytes]]) -> None:
-        path = Shard(tmp_path / "s" / "shard-000000.tar").write(files)
+        path = write_shard(tmp_path / "s" / "shard-000000.tar", files)
         with pytest.raises(UserError, match=message) as caught:
             index_shard(path)
         assert "shard-000000.tar" in str(caught.value)
@@ -242,7 +218,7 @@ def test_hostile_members_are_refused(tmp_path: Path) -> None:
 
 def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) -> None:
     files = image_files("000000_000000") + image_files("000000_000001")
-    path = Shard(tmp_path / "shard-000000.tar").write(files)
+    path = write_shard(tmp_path / "shard-000000.tar", files)
     whole = path.read_bytes()
     with tarfile.open(path) as archive:
         infos = archive.getmembers()
@@ -259,19 +235,16 @@ def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) ->
             index_shard(path)
     bomb = tarfile.TarInfo("000000_000002.rgb.png")
     bomb.size = 1 << 40
-    path.write_bytes(whole[: ends[-1] + -ends[-1] % 512] + bomb.tobuf() + bytes(10_240))
-    with pytest.raises(UserError, match=r"000000_000002\.rgb\.png' of 1,099,512 MB"):
-        index_shard(path)
     long_name = tarfile.TarInfo("././@LongLink")
     long_name.type, long_name.size = tarfile.GNUTYPE_LONGNAME, 1 << 32
-    path.write_bytes(long_name.tobuf() + bytes(10_240))
-    with pytest.raises(UserError, match=r"a header of \d+ bytes"):
-        index_shard(path)
-    import gzip
-
-    path.write_bytes(gzip.compress(whole))
-    with pytest.raises(UserError, match="a compressed archive"):
-        index_shard(path)
+    for content, message in (
+        (whole[: ends[-1] + -ends[-1] % 512] + bomb.tobuf(), r"2\.rgb\.png' of 1,099,512 MB"),
+        (long_name.tobuf(), r"a header of \d+ bytes"),
+        (gzip.compress(whole), "a compressed archive"),
+    ):
+        path.write_bytes(content + bytes(10_240))
+        with pytest.raises(UserError, match=message):
+            index_shard(path)
     path.write_bytes(whole)
     index = index_shard(path)
     path.write_bytes(whole[:3000])
@@ -294,7 +267,7 @@ def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) ->
 def test_damaged_annotation_is_named(
     changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
-    Shard(tmp_path / "shard-000000.tar").write(image_files("000003_000004", **changes))
+    write_shard(tmp_path / "shard-000000.tar", image_files("000003_000004", **changes))
     source = WebdatasetSource(tmp_path, [block()])
     with pytest.raises(UserError, match=message) as caught:
         source.sample(0)
@@ -303,7 +276,7 @@ def test_damaged_annotation_is_named(
 
 def test_a_key_in_two_shards_and_wrong_paths(tmp_path: Path) -> None:
     for name in ("shard-000000.tar", "shard-000001.tar"):
-        Shard(tmp_path / "a" / name).write(image_files("000000_000000"))
+        write_shard(tmp_path / "a" / name, image_files("000000_000000"))
     with pytest.raises(UserError, match=r"shard-000001\.tar with 1 keys of .*shard-000000\.tar"):
         WebdatasetSource(tmp_path, [block()], "a")
     source = WebdatasetSource(tmp_path, [block()], "a/shard-000001.tar")
@@ -351,7 +324,7 @@ def test_shards_are_downloaded_once_and_within_bounds(
     address: str, tmp_path: Path, contents: Contents, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for n in (0, 1):
-        Shard(tmp_path / "served" / f"shard-{n:06d}.tar").write(image_files(f"00000{n}_000000"))
+        write_shard(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
     folder = tmp_path / "downloads"
     url = address + "/shard-{000000..000001}.tar"
     source = WebdatasetSource(tmp_path, [block()], url, download_dir=folder)
@@ -371,7 +344,7 @@ def test_shards_are_downloaded_once_and_within_bounds(
 
 
 def test_commands_run_only_when_allowed(tmp_path: Path) -> None:
-    path = Shard(tmp_path / "elsewhere" / "shard-000000.tar").write(image_files("000000_000000"))
+    path = write_shard(tmp_path / "elsewhere" / "shard-000000.tar", image_files("000000_000000"))
     command = f"pipe:cat {path}"
     with pytest.raises(UserError, match="a command to run"):
         WebdatasetSource(tmp_path, [block()], command, download_dir=tmp_path / "d")
