@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import resource
 from collections.abc import Callable, Iterator
@@ -11,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dopepp.core.errors import UserError
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.part import Mesh, make_part
@@ -118,3 +121,27 @@ def good(content: dict[str, Any], tmp_path: Path) -> Path:
     """A good checkpoint."""
     write_atomic(content, tmp_path / "good.ckpt")
     return tmp_path / "good.ckpt"
+
+
+@pytest.fixture
+def saved(content: dict[str, Any], tmp_path: Path) -> Callable[..., Path]:
+    """Write a good checkpoint that a function has changed."""
+
+    def save(edit: Callable[[dict[str, Any]], object]) -> Path:
+        spoilt = copy.deepcopy(content)
+        edit(spoilt)
+        torch.save(spoilt, tmp_path / "bad.ckpt")
+        return tmp_path / "bad.ckpt"
+
+    return save
+
+
+@pytest.fixture(scope="session")
+def rejected() -> Callable[[Path, str], None]:
+    """Expect that a checkpoint is not loaded, and one line for the user."""
+
+    def load(path: Path, match: str) -> None:
+        with one_line(match):
+            PoseEstimator.load(path)
+
+    return load

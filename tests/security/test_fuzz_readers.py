@@ -7,12 +7,10 @@ of its own, by the attack it would make.
 
 from __future__ import annotations
 
-import io
-import json
 import shutil
-import tarfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,19 +32,15 @@ from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
 from dopepp.data.archive import Limits, safe_extract
 from dopepp.data.check import check_dataset
-from dopepp.data.formats.bop.images import (
-    decode_depth,
-    decode_mask,
-    decode_rgb,
-    encode_png,
-    encode_runs,
-)
+from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.results import read_results
 from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.formats.ndds.source import NddsSource
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
@@ -78,8 +72,9 @@ NAMES: Final = (
     "colour.bmp", "colour.jpg", "colour.png", "colour.tga", "colour.tiff", "colour.webp",
     "deep.png", "m_s-test.csv",
     "meta.mat", "ndds/000000.json", "ndds/_camera_settings.json", "ndds/_object_settings.json",
-    "overrides.yaml", "palette.png", "print.jpg", "shards/camera.json",
-    "shards/models/models_info.json", "shards/train_pbr/shard-000000.tar", "text.ply", "text.stl",
+    "overrides.yaml", "palette.png", "print.jpg", "shards/models/models_info.json",
+    "shards/train_pbr/key_to_shard.json", "shards/train_pbr/shard-000000.tar", "text.ply",
+    "text.stl",
 )  # fmt: skip
 """What is spoilt: a file, or a file of a data set."""
 
@@ -189,14 +184,19 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
     box = trimesh.creation.box((10.0, 20.0, 30.0))
     picture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (24, 32, 3), np.uint8),
                                (5, 5), 2)  # fmt: skip
-    files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object] | None]] = {}
-
-    def add(
-        name: str, write: Callable[[Path], object], read: Callable[[Path], object] | None
-    ) -> None:
-        files[name] = (write, read)
-
-    for name, data in {
+    tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
+    rows = "scene_id,im_id,obj_id,score,R,t,time\n" + "1,4,2,0.75,1 0 0 0 0 -1 0 1 0,-10 20 812,1\n"
+    T = np.eye(4)
+    T[2, 3] = 0.4
+    meta = {
+        "cls_indexes": np.array([[2.0]]), "poses": T[:3, :, None],
+        "intrinsic_matrix": np.eye(3), "factor_depth": 10000,
+    }  # fmt: skip
+    text = {
+        "a.yaml": "a: {b: [1, 2.5, null]}\nc: 'x'\n",
+        "overrides.yaml": "- model=dopepp\n- 'data.parts=[a]'\n",
+    }
+    meshes = {
         "binary.stl": export_stl(box),
         "text.stl": export_stl_ascii(box).encode(),
         "box.obj": b"mtllib box.mtl\n" + export_obj(box).encode(),
@@ -205,39 +205,26 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
         "box.3mf": box.export(file_type="3mf"),
         "binary.ply": export_ply(box),
         "text.ply": export_ply(box, encoding="ascii"),
-    }.items():
-        add(name, lambda path, data=data: path.write_bytes(data), read_finite_mesh)
-    for name, image in {
-        "colour.png": Image.fromarray(picture),
-        "palette.png": Image.fromarray(picture).convert("P"),
-        "deep.png": Image.fromarray(picture[..., 0].astype(np.uint16) * 200),
-        "colour.jpg": Image.fromarray(picture),
-        "print.jpg": Image.fromarray(picture).convert("CMYK"),
-        "colour.tiff": Image.fromarray(picture),
-        "colour.webp": Image.fromarray(picture),
-        "colour.bmp": Image.fromarray(picture),
-        "colour.tga": Image.fromarray(picture),
-    }.items():
-        add(name, image.save, None)
-    add("a.ckpt", lambda path: torch.save(content, path), load_network)
-    tensors = {"a": torch.arange(6.0).view(2, 3), "b": torch.zeros(0, dtype=torch.int8)}
-    add("a.safetensors", lambda path: write_safetensors(path, tensors, {"spec": "{}"}),
-        read_safetensors)  # fmt: skip
-    add("a.yaml", lambda path: path.write_text("a: {b: [1, 2.5, null]}\nc: 'x'\n"), read_yaml)
-    add("overrides.yaml", lambda path: path.write_text("- model=dopepp\n- 'data.parts=[a]'\n"),
-        read_yaml)  # fmt: skip
-    rows = "scene_id,im_id,obj_id,score,R,t,time\n" + "1,4,2,0.75,1 0 0 0 0 -1 0 1 0,-10 20 812,1\n"
-    add("m_s-test.csv", lambda path: path.write_text(rows), lambda path: read_results(path, {2}))
-    fields = {
-        "cls_indexes": np.array([[2.0]]),
-        "poses": np.eye(4)[:3, :, None]
-        + np.array([0, 0, 0, 1.0])[None, :, None] * [[[0]], [[0]], [[0.4]]],
-        "intrinsic_matrix": np.eye(3),
-        "factor_depth": 10000,
     }
-    add("meta.mat", lambda path: scipy.io.savemat(path, fields, do_compression=True), read_meta)
-    for suffix in ("zip", "tar", "gztar"):
-        add(f"archive.{suffix}", lambda path, suffix=suffix: _pack(path, suffix), _extract)
+    colour = Image.fromarray(picture)
+    pictures = {
+        **{f"colour.{suffix}": colour for suffix in ("png", "jpg", "tiff", "webp", "bmp", "tga")},
+        "palette.png": colour.convert("P"),
+        "deep.png": Image.fromarray(picture[..., 0].astype(np.uint16) * 200),
+        "print.jpg": colour.convert("CMYK"),
+    }
+    files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object] | None]] = {
+        **{name: (partial(_put, data), read_finite_mesh) for name, data in meshes.items()},
+        **{name: (image.save, None) for name, image in pictures.items()},
+        **{name: (partial(_put, data.encode()), read_yaml) for name, data in text.items()},
+        **{f"archive.{kind}": (partial(_pack, kind), _extract) for kind in ("zip", "tar", "gztar")},
+        "a.ckpt": (lambda path: torch.save(content, path), load_network),
+        "a.safetensors": (
+            lambda path: write_safetensors(path, tensors, {"spec": "{}"}), read_safetensors
+        ),
+        "m_s-test.csv": (partial(_put, rows.encode()), lambda path: read_results(path, {2})),
+        "meta.mat": (lambda path: scipy.io.savemat(path, meta, do_compression=True), read_meta),
+    }  # fmt: skip
     made = {}
     for name, (write, read) in files.items():
         folder = root / name
@@ -249,7 +236,11 @@ def _files(root: Path, content: dict[str, Any]) -> dict[str, Target]:
     return made
 
 
-def _pack(path: Path, kind: str) -> None:
+def _put(content: bytes, path: Path) -> None:
+    path.write_bytes(content)
+
+
+def _pack(kind: str, path: Path) -> None:
     folder = path.parent / "packed"
     (folder / "a").mkdir(parents=True)
     (folder / "a" / "b.txt").write_text("hello\n" * 50)
@@ -265,59 +256,24 @@ def _extract(path: Path) -> None:
 
 
 def _datasets(root: Path) -> dict[str, Target]:
-    """Write two images in each layout, by hand: no renderer has to be compiled for it."""
+    """Write two images in each layout that is written."""
     box = trimesh.creation.box((40.0, 30.0, 20.0))
     part = make_part("obj_000001", Mesh(box.vertices / 1000, box.faces.astype(np.int32)))
-    picture, depth = encode_png(np.full((24, 32, 3), 90, np.uint8)), np.full((24, 32), 300)
-    camera = {"cam_K": [40.0, 0, 15.5, 0, 40.0, 11.5, 0, 0, 1], "depth_scale": 1.0}
-    truth = [{"cam_R_m2c": list(np.eye(3).ravel()), "cam_t_m2c": [0, 0, 300.0], "obj_id": 1}]
-    info = [{"visib_fract": 0.9, "bbox_visib": [10, 8, 9, 7], "px_count_all": 63}]
-    mask = np.zeros((24, 32), np.uint8)
-    mask[8:15, 10:19] = 255
-    for name in ("bop", "shards"):
-        (root / name / "models").mkdir(parents=True)
-        (root / name / "models" / "obj_000001.ply").write_bytes(export_ply(box))
-        size = {f"size_{axis}": side for axis, side in zip("xyz", (40.0, 30, 20), strict=True)}
-        low = {f"min_{axis}": -side / 2 for axis, side in zip("xyz", (40.0, 30, 20), strict=True)}
-        models = {"1": {"diameter": float(np.linalg.norm([40, 30, 20])), **low, **size}}
-        (root / name / "models" / "models_info.json").write_text(json.dumps(models))
-        (root / name / "camera.json").write_text(
-            json.dumps({"width": 32, "height": 24, "fx": 40.0, "fy": 40.0, "cx": 15.5, "cy": 11.5,
-                        "depth_scale": 1.0})
-        )  # fmt: skip
-    scene = root / "bop" / "train_pbr" / "000000"
-    for folder, data in (
-        ("rgb/000000.png", picture), ("depth/000000.png", encode_png(depth.astype(np.uint16))),
-        ("mask/000000_000000.png", encode_png(mask)),
-        ("mask_visib/000000_000000.png", encode_png(mask)),
-        ("scene_camera.json", json.dumps({"0": camera}).encode()),
-        ("scene_gt.json", json.dumps({"0": truth}).encode()),
-        ("scene_gt_info.json", json.dumps({"0": info}).encode()),
-    ):  # fmt: skip
-        (scene / folder).parent.mkdir(parents=True, exist_ok=True)
-        (scene / folder).write_bytes(data)
-    members = {
-        "rgb.png": picture, "depth.png": encode_png(depth.astype(np.uint16)),
-        "camera.json": json.dumps(camera).encode(), "gt.json": json.dumps(truth).encode(),
-        "gt_info.json": json.dumps(info).encode(),
-        "mask_visib.json": json.dumps({"0": encode_runs(mask > 0)}).encode(),
-    }  # fmt: skip
-    (root / "shards" / "train_pbr").mkdir()
-    with tarfile.open(root / "shards" / "train_pbr" / "shard-000000.tar", "w") as archive:
-        for name, data in members.items():
-            entry = tarfile.TarInfo(f"000000_000000.{name}")
-            entry.size = len(data)
-            archive.addfile(entry, io.BytesIO(data))
     T = np.eye(4)
     T[2, 3] = 0.3
     K = camera_matrix(40.0, 40.0, 15.5, 11.5)
-    instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 0.9, mask > 0)
-    writer = NddsWriter(root / "ndds", [part])
-    writer.prepare()
-    for index in range(2):
-        writer.write(index, Sample(np.full((24, 32, 3), 90, np.uint8), K, [instance], depth / 1000))
-    writer.finalize(0, range(2))
-
+    mask = np.zeros((24, 32), bool)
+    mask[10:14, 13:19] = True
+    instance = Instance(part.name, T, project_keypoints(part.cuboid, T, K), 0.9, mask)
+    depth = np.full((24, 32), 0.3, np.float32)
+    sample = Sample(np.full((24, 32, 3), 90, np.uint8), K, [instance], depth)
+    writers = {"bop": BopWriter, "shards": WebdatasetWriter, "ndds": NddsWriter}
+    for name, writer_class in writers.items():
+        writer = writer_class(root / name, [part])
+        writer.prepare()
+        for index in range(2):
+            writer.write(index, sample)
+        writer.finalize(0, range(2))
     readers: dict[str, Callable[[Path], object]] = {
         "bop": lambda folder: read_all(BopSource(folder, bop_parts(folder), "train_pbr")),
         "ndds": lambda folder: read_all(NddsSource(folder, [part])),

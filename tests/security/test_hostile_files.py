@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import shlex
 import stat
 import struct
@@ -253,12 +254,8 @@ def pax(records: dict[str, str]) -> bytes:
         length = len(body) + len(str(len(body) + 3))
         lines += f"{length}".encode() + body
     data = lines + bytes(-len(lines) % 512)
-    return (
-        entry("x", tarfile.XHDTYPE, len(lines)).tobuf()
-        + data
-        + entry("a.txt").tobuf()
-        + bytes(10_240)
-    )
+    head = entry("x", tarfile.XHDTYPE, len(lines)).tobuf()
+    return head + data + entry("a.txt").tobuf() + bytes(10_240)
 
 
 ARCHIVES: dict[str, bytes] = {
@@ -309,15 +306,13 @@ def test_shards_that_reach_out_or_explode(name: str, tmp_path: Path, bounded: An
     """A shard is never unpacked; what is in it may be refused or passed over."""
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(ARCHIVES[name])
+    line = ""
     with bounded():
         try:
-            index = index_shard(path)
+            assert not index_shard(path).keys
         except UserError as error:
             line = str(error)
-        else:
-            line = "taken" if index.keys else ""
     assert "\n" not in line
-    assert line != "taken"
 
 
 def test_an_encrypted_zip_and_one_of_links(tmp_path: Path, refused: Refused) -> None:
@@ -354,14 +349,6 @@ METAS: dict[str, bytes] = {
 }
 
 
-@pytest.mark.parametrize("name", METAS)
-def test_meta_mat_of_anybody(name: str, tmp_path: Path, refused: Refused) -> None:
-    path = tmp_path / "meta.mat"
-    path.write_bytes(METAS[name])
-    with refused(r"meta\.mat"):
-        read_meta(path)
-
-
 HEADER = "scene_id,im_id,obj_id,score,R,t,time\n"
 POSE = "1 0 0 0 1 0 0 0 1,0 0 900,1"
 TABLES: dict[str, bytes] = {
@@ -374,14 +361,6 @@ TABLES: dict[str, bytes] = {
     "zero bytes": HEADER.encode() + bytes(1000),
     "a score of nothing": f"{HEADER}1,1,2,nan,{POSE}".encode(),
 }
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_of_poses_of_anybody(name: str, tmp_path: Path, refused: Refused) -> None:
-    path = tmp_path / "method_set-test.csv"
-    path.write_bytes(TABLES[name])
-    with refused(r"method_set-test\.csv"):
-        read_results(path, {2})
 
 
 RECORDS: dict[str, bytes] = {
@@ -398,63 +377,62 @@ RECORDS: dict[str, bytes] = {
 }
 
 
-@pytest.mark.parametrize("name", RECORDS)
-def test_model_records_of_anybody(name: str, tmp_path: Path, refused: Refused) -> None:
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "models_info.json").write_bytes(RECORDS[name])
-    with refused(r"models_info\.json"):
-        read_models(tmp_path)
+READERS: dict[str, tuple[Callable[[Path], object], dict[str, bytes]]] = {
+    "meta.mat": (read_meta, METAS),
+    "method_set-test.csv": (lambda path: read_results(path, {2}), TABLES),
+    "models/models_info.json": (lambda path: read_models(path.parents[1]), RECORDS),
+}
+
+
+@pytest.mark.parametrize(
+    ("file", "name"), [(file, name) for file, (_, table) in READERS.items() for name in table]
+)
+def test_numbers_tables_and_records_of_anybody(
+    file: str, name: str, tmp_path: Path, refused: Refused
+) -> None:
+    read, table = READERS[file]
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(table[name])
+    with refused(re.escape(path.name)):
+        read(path)
 
 
 RENDER = "render servoholder --out out -n 1"
+BOMB = PICTURES["a PNG of terapixels"]
 ARGUMENTS: dict[str, tuple[str, dict[str, bytes]]] = {
-    "check: a folder of records that nest": (
-        "check set",
-        {
-            "set/_camera_settings.json": b"[" * 100_000,
-            "set/000000.json": b"[" * 100_000,
-            "set/000000.png": PICTURES["a PNG of terapixels"],
-        },
-    ),
-    "check: a BOP of bombs": (
-        "check set",
-        {
-            "set/models/models_info.json": b"{" * 100_000,
-            "set/train_pbr/000000/scene_gt.json": b"[" * 100_000,
-            "set/train_pbr/000000/scene_camera.json": b"{}",
-            "set/train_pbr/000000/rgb/000000.png": PICTURES["a PNG of terapixels"],
-        },
-    ),
-    "check: shards of bombs": (
-        "check set",
-        {
-            "set/train_pbr/shard-000000.tar": ARCHIVES["a name of gigabytes"],
-            "set/models/models_info.json": b'{"1": {"diameter": 1e999}}',
-        },
-    ),
+    "check: a folder of records that nest": ("check set", {
+        "set/_camera_settings.json": b"[" * 100_000,
+        "set/000000.json": b"[" * 100_000,
+        "set/000000.png": BOMB,
+    }),
+    "check: a BOP of bombs": ("check set", {
+        "set/models/models_info.json": b"{" * 100_000,
+        "set/train_pbr/000000/scene_gt.json": b"[" * 100_000,
+        "set/train_pbr/000000/scene_camera.json": b"{}",
+        "set/train_pbr/000000/rgb/000000.png": BOMB,
+    }),
+    "check: shards of bombs": ("check set", {
+        "set/train_pbr/shard-000000.tar": ARCHIVES["a name of gigabytes"],
+        "set/models/models_info.json": b'{"1": {"diameter": 1e999}}',
+    }),
     "render: a part that lies": (
-        "render a.ply --out out -n 1",
-        {"a.ply": MESHES["a.ply|a billion vertices"]},
+        "render a.ply --out out -n 1", {"a.ply": MESHES["a.ply|a billion vertices"]}
     ),
     "render: another job's record": (RENDER, {"out/_dopepp_render.json": b"[" * 100_000}),
     "render: a change that nests": (f"{RENDER} --set targets_per_image={'[' * 5000}", {}),
     "render: a change that runs": (
-        f"{RENDER} --set 'targets_per_image=!!python/object/apply:os.system [touch canary]'",
-        {},
+        f"{RENDER} --set 'targets_per_image=!!python/object/apply:os.system [touch canary]'", {}
     ),
     "symmetries: a part that reaches out": (
-        "symmetries a.obj",
-        {"a.obj": MESHES["n.obj|a library elsewhere"]},
+        "symmetries a.obj", {"a.obj": MESHES["n.obj|a library elsewhere"]}
     ),
-    "predict: a picture that explodes": (
-        "predict good.ckpt a.png --K 60 60 2 2",
-        {"a.png": PICTURES["a PNG of terapixels"]},
-    ),
+    "predict: a picture that explodes": ("predict good.ckpt a.png --K 60 60 2 2", {"a.png": BOMB}),
     "predict: a depth that explodes": (
         "predict good.ckpt b.png --K 60 60 8 8 --refine depth --depth a.png",
-        {"a.png": PICTURES["a PNG of terapixels"], "b.png": encoded("PNG", SMALL)},
+        {"a.png": BOMB, "b.png": encoded("PNG", SMALL)},
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)

@@ -46,6 +46,11 @@ def glb(binary: bytes = BINARY, **changes: Any) -> bytes:
     return packed(json.dumps(header | changes).encode(), binary)
 
 
+def linked(uri: str) -> bytes:
+    """A triangle whose corners lie elsewhere."""
+    return glb(buffers=[{"byteLength": 60, "uri": uri}])
+
+
 def packed(text: bytes, binary: bytes, length: int | None = None) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -110,6 +115,11 @@ def archive(**members: bytes) -> bytes:
     return file.getvalue()
 
 
+def one_model(resources: str, build: str = '<item objectid="1"/>', before: str = "") -> bytes:
+    """A 3MF file of a root model alone."""
+    return archive(model=model(resources, build, before))
+
+
 def body(number: int, content: str = MESH) -> str:
     return f'<object id="{number}" type="model">{content}</object>'
 
@@ -133,16 +143,15 @@ LAUGHS = "".join(f'<!ENTITY a{n} "{f"&a{n - 1};" * 10}">' for n in range(1, 12))
 NODES = [{"mesh": 0, "children": [n + 1]} for n in range(400)] + [{"mesh": 0}]
 TRIANGLE_OFF = b"OFF\n3 1 0\n0 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"
 
+VIEW = [{"buffer": 0, "byteLength": 1_200_000}]
+BARE = {"primitives": [{"attributes": {"POSITION": 0}}]}
+LARGE = {"bufferViews": VIEW, "accessors": array(count=99_999)}
+LARGE_BINARY = bytes(1_200_000)
+
 SCENES: dict[str, bytes] = {
-    "a.glb|a file elsewhere|needs the file 'file:": glb(
-        buffers=[{"byteLength": 60, "uri": "file:///etc/passwd"}]
-    ),
-    "b.glb|a file in another folder|needs the file '../": glb(
-        buffers=[{"byteLength": 60, "uri": "../../x.bin"}]
-    ),
-    "c.glb|a page of the web|needs the file 'http:": glb(
-        buffers=[{"byteLength": 60, "uri": "http://localhost/x"}]
-    ),
+    "a.glb|a file elsewhere|needs the file 'file:": linked("file:///etc/passwd"),
+    "b.glb|a file in another folder|needs the file '../": linked("../../x.bin"),
+    "c.glb|a page of the web|needs the file 'http:": linked("http://localhost/x"),
     "d.glb|a texture elsewhere|needs the file '/etc": glb(images=[{"uri": "/etc/passwd"}]),
     "e.glb|a billion zeros|sparse or left out": glb(
         accessors=[{"componentType": 5126, "count": 10**9, "type": "VEC3"}] * 2
@@ -163,13 +172,10 @@ SCENES: dict[str, bytes] = {
         accessors=array(count=999_936, type="MAT4") * 9,
     ),
     "k.glb|one array a thousand times|or over 30000000 values": glb(
-        bytes(1_200_000),
-        bufferViews=[{"buffer": 0, "byteLength": 1_200_000}],
-        accessors=array(count=99_999),
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}] * 1000,
+        LARGE_BINARY, **LARGE, meshes=[BARE] * 1000
     ),
     "l.glb|a million primitives|100000 primitives": glb(
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}] * 100_000}]
+        meshes=[{"primitives": BARE["primitives"] * 100_000}]
     ),
     "m.glb|a million nodes|100000 nodes": glb(nodes=[{"mesh": 0}] * 100_000),
     "n.glb|a node that holds itself|two places": glb(nodes=[{"mesh": 0, "children": [0]}]),
@@ -177,12 +183,8 @@ SCENES: dict[str, bytes] = {
         nodes=[{"mesh": 0, "children": [1]}, {"mesh": 0, "children": [0]}]
     ),
     "p.glb|a mesh shown a thousand times|5000000 triangles": glb(
-        bytes(1_200_000),
-        bufferViews=[{"buffer": 0, "byteLength": 1_200_000}],
-        accessors=array(count=99_999),
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        nodes=[{"mesh": 0}] * 1000,
-        scenes=[{"nodes": list(range(1000))}],
+        LARGE_BINARY, **LARGE, meshes=[BARE],
+        nodes=[{"mesh": 0}] * 1000, scenes=[{"nodes": list(range(1000))}],
     ),
     "q.glb|a header that nests|Recursion": packed(b"[" * 100_000, BINARY),
     "r.glb|a header of another length|not the 4294967295": packed(b"{}", BINARY, length=2**32 - 1),
@@ -200,37 +202,31 @@ SCENES: dict[str, bytes] = {
     "w.glb|a scene of nothing|0 vertices": glb(scenes=[{"nodes": []}]),
     "a.3mf|a bomb|200 MB of text": archive(model=model(body(1)), bomb=bytes(200_000_000)),
     "b.3mf|a bomb of a model|200 MB of text": archive(model=model(body(1)) + b" " * 200_000_000),
-    "c.3mf|a bomb of elements|40 MB of text": archive(model=model("<a/>" * 10_000_000)),
+    "c.3mf|a bomb of elements|40 MB of text": one_model("<a/>" * 10_000_000),
     "d.3mf|a bomb that lies|BadZipFile": lying_archive(),
-    "e.3mf|laughs|document type": archive(
-        model=model(
-            f'<object id="1" name="&a11;">{MESH}</object>',
-            before=f'<!DOCTYPE model [<!ENTITY a0 "ha">{LAUGHS}]>',
-        )
+    "e.3mf|laughs|document type": one_model(
+        f'<object id="1" name="&a11;">{MESH}</object>',
+        before=f'<!DOCTYPE model [<!ENTITY a0 "ha">{LAUGHS}]>',
     ),
-    "f.3mf|a file elsewhere|document type": archive(
-        model=model(
-            body(1) + "&x;", before='<!DOCTYPE m [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
-        )
+    "f.3mf|a file elsewhere|document type": one_model(
+        body(1) + "&x;", before='<!DOCTYPE m [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
     ),
     "g.3mf|a hidden file elsewhere|document type": archive(
         model=model(body(1), before='<!DOCTYPE m SYSTEM "http://localhost/m.dtd">')
-        .decode()
-        .replace('"1.0"?', '"1.0" encoding="UTF-16"?')
-        .encode("utf-16")
+        .decode().replace('"1.0"?', '"1.0" encoding="UTF-16"?').encode("utf-16")
     ),
-    "h.3mf|an object that holds itself|used above its end": archive(model=model(assembly(1, 1))),
-    "i.3mf|two objects that hold each other|used above its end": archive(
-        model=model(assembly(1, 2, 2) + assembly(2, 1, 1))
+    "h.3mf|an object that holds itself|used above its end": one_model(assembly(1, 1)),
+    "i.3mf|two objects that hold each other|used above its end": one_model(
+        assembly(1, 2, 2) + assembly(2, 1, 1)
     ),
-    "j.3mf|one that is doubled forty times|over 1000 objects": archive(
-        model=model(body(1) + DOUBLED, '<item objectid="39"/>')
+    "j.3mf|one that is doubled forty times|over 1000 objects": one_model(
+        body(1) + DOUBLED, '<item objectid="39"/>'
     ),
-    "k.3mf|a chain without an end|over 1000 objects": archive(
-        model=model(body(1) + CHAIN, '<item objectid="49999"/>' * 500)
+    "k.3mf|a chain without an end|over 1000 objects": one_model(
+        body(1) + CHAIN, '<item objectid="49999"/>' * 500
     ),
-    "l.3mf|a thousand objects shown|over 1000 objects": archive(
-        model=model(body(1), '<item objectid="1"/>' * 100_000)
+    "l.3mf|a thousand objects shown|over 1000 objects": one_model(
+        body(1), '<item objectid="1"/>' * 100_000
     ),
     "m.3mf|objects in another file|objects in other files": archive(
         model=model(
@@ -239,10 +235,10 @@ SCENES: dict[str, bytes] = {
         ),
         **{"3D/x.model": model(body(1))},
     ),
-    "n.3mf|a number of a million digits|finite": archive(
-        model=model(body(1, MESH.replace('x="9"', f'x="{"9" * 1_000_000}"')))
+    "n.3mf|a number of a million digits|finite": one_model(
+        body(1, MESH.replace('x="9"', f'x="{"9" * 1_000_000}"'))
     ),
-    "o.3mf|elements that nest|depth": archive(model=model("<a>" * 100_000 + "</a>" * 100_000)),
+    "o.3mf|elements that nest|depth": one_model("<a>" * 100_000 + "</a>" * 100_000),
     "p.3mf|no model|where one must be": archive(readme=b"hello"),
     "q.3mf|an archive of names|where one must be": archive(
         **{f"../../{n}": b"" for n in range(20_000)}
@@ -259,7 +255,7 @@ SCENES: dict[str, bytes] = {
     "f.off|a number of a million digits|finite": TRIANGLE_OFF.replace(b"9", b"9" * 1_000_000, 1),
     "g.off|binary|utf-8": b"OFF BINARY\n" + struct.pack(">III", 2**31, 2**31, 0),
     "h.off|comments|unpack": b"OFF\n" + b"#\n" * 500_000,
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -276,8 +272,8 @@ def test_scenes_that_explode_lie_or_reach_out(name: str, tmp_path: Path, refused
     [
         ("a.glb", glb()),
         ("b.glb", glb(nodes=NODES)),
-        ("a.3mf", archive(model=model(body(1)))),
-        ("b.3mf", archive(model=model(body(1) + assembly(2, *[1] * 30), '<item objectid="2"/>'))),
+        ("a.3mf", one_model(body(1))),
+        ("b.3mf", one_model(body(1) + assembly(2, *[1] * 30), '<item objectid="2"/>')),
         ("a.off", TRIANGLE_OFF),
     ],
 )
