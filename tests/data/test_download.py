@@ -67,9 +67,6 @@ class Handler(BaseHTTPRequestHandler):
             self.end_headers()
             self.wfile.write(body[: len(body) // 2] if kind == "cut" else body)
 
-    def log_message(self, *args: object) -> None:
-        pass
-
 
 class Server(ThreadingHTTPServer):
     content = CONTENT

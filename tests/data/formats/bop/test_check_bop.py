@@ -47,28 +47,19 @@ def records(image: int) -> dict[str, Any]:
     ]
     wholes = [hull_mask(R, t) for R, t in poses]
     visible = [np.where(wholes[1] > 0, 0, wholes[0]).astype(np.uint8), wholes[1]]
-    infos = [
-        {
-            "bbox_obj": bounds(whole),
-            "bbox_visib": bounds(seen),
-            "px_count_all": int((whole > 0).sum()),
-            "px_count_valid": int((whole > 0).sum()),
-            "px_count_visib": int((seen > 0).sum()),
-            "visib_fract": float((seen > 0).sum() / (whole > 0).sum()),
-        }
-        for whole, seen in zip(wholes, visible, strict=True)
-    ]
-    truths = [
-        {"cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": t.tolist(), "obj_id": n + 1}
-        for n, (R, t) in enumerate(poses)
-    ]
+    infos, truths = [], []
+    for number, ((R, t), whole, seen) in enumerate(zip(poses, wholes, visible, strict=True)):
+        all_pixels, seen_pixels = int((whole > 0).sum()), int((seen > 0).sum())
+        counts = {"all": all_pixels, "valid": all_pixels, "visib": seen_pixels}
+        info = {"bbox_obj": bounds(whole), "bbox_visib": bounds(seen)}
+        info |= {f"px_count_{name}": count for name, count in counts.items()}
+        infos.append(info | {"visib_fract": seen_pixels / all_pixels})
+        pose = {"cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": t.tolist()}
+        truths.append(pose | {"obj_id": number + 1})
+    camera = {"cam_K": np.ravel(K).tolist(), "depth_scale": 0.1}
     return {
-        "camera": {"cam_K": np.ravel(K).tolist(), "depth_scale": 0.1},
-        "gt": truths,
-        "gt_info": infos,
-        "mask": wholes,
-        "mask_visib": visible,
-    }
+        "camera": camera, "gt": truths, "gt_info": infos, "mask": wholes, "mask_visib": visible
+    }  # fmt: skip
 
 
 def models() -> dict[str, Any]:
