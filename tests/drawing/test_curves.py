@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -73,15 +74,9 @@ def test_png_and_csv_hold_the_curves(tmp_path: Path) -> None:
     ]
 
 
-def test_figures_without_curves_are_drawn() -> None:
-    assert figure_image(accuracy_figure({})).ndim == 3
-    assert figure_image(accuracy_figure({"none": np.array([])})).ndim == 3
-
-
-def test_no_global_state_of_pyplot_is_touched() -> None:
-    import matplotlib.pyplot as plt
-
-    figure_image(accuracy_figure({"a": np.array([0.01])}))
+def test_figures_without_curves_are_drawn_and_pyplot_keeps_none() -> None:
+    for curves in ({}, {"none": np.array([])}, {"a": np.array([0.01])}):
+        assert figure_image(accuracy_figure(curves)).ndim == 3
     assert plt.get_fignums() == []
 
 

@@ -46,17 +46,16 @@ def test_losses_that_are_not_positive_are_not_drawn_on_a_logarithm() -> None:
     assert lines_figure([], "step", "loss", log_y=True).axes[0].get_legend() is None
 
 
-def test_a_long_line_is_drawn_pale_and_smooth() -> None:
+def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed() -> None:
     noisy = np.random.default_rng(0).normal(1, 0.5, (1, 500))
-    pale, smooth = lines_figure([line(noisy)], "step", "loss").axes[0].lines
+    pale, smooth, other = (
+        lines_figure([line(noisy), replace(line(noisy[:, :3]), dashed=True)], "step", "loss")
+        .axes[0]
+        .lines
+    )
     assert np.std(np.asarray(smooth.get_ydata())) < 0.5 * np.std(np.asarray(pale.get_ydata()))
-    assert [one.get_label() for one in (pale, smooth)][1] == "dope"
-
-
-def test_what_is_compared_with_is_dashed() -> None:
-    one = line(np.ones((1, 3)))
-    figure = lines_figure([replace(one, dashed=True), one], "step", "loss")
-    assert [drawn.get_linestyle() for drawn in figure.axes[0].lines] == ["--", "-"]
+    assert smooth.get_label() == "dope"
+    assert [one.get_linestyle() for one in (smooth, other)] == ["-", "--"]
 
 
 @settings(max_examples=30, deadline=None)
@@ -101,10 +100,7 @@ def test_masks_are_painted_in_their_colours_on_the_darkened_image() -> None:
         expected = 0.35 * 100 + 0.65 * np.array(colour)
         assert np.abs(panel[mask] - expected).max() <= 1
     assert (mask_panel(GREY, []) == 35).all()
-
-
-def test_more_instances_than_colours_begin_again() -> None:
-    masks = [np.ones((30, 40), bool)] * (len(COLOURS) + 1)
+    masks = [np.ones((30, 40), bool)] * (len(COLOURS) + 1)  # after the last colour the first
     assert (mask_panel(GREY, masks) == mask_panel(GREY, masks[:1])).all()
 
 

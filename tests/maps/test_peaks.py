@@ -215,16 +215,6 @@ def test_random_maps_never_give_a_position_that_is_none() -> None:
     assert np.isfinite(peaks.covariance_px[peaks.found]).all()
 
 
-def test_a_batch_is_its_images() -> None:
-    rng = torch.Generator().manual_seed(4)
-    belief = torch.rand(5, 9, 16, 20, generator=rng) ** 4
-    together = find_peaks(belief, GEOMETRY, max_peaks=7)
-    for b in range(5):
-        alone = find_peaks(belief[b : b + 1], GEOMETRY, max_peaks=7)
-        for name, values in vars(alone).items():
-            assert_array_equal(values, getattr(together, name)[b : b + 1])
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_blurred_peak_tells_its_covariance(noise: float) -> None:
     """Target variance off, the rest is Σ with its xy term; noise of the map alone adds little."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -122,6 +122,8 @@ def test_a_point_behind_the_camera_makes_the_reprojection_infinite() -> None:
     assert errors[1] == math.inf
 
 
+@example(math.radians(1e-6), np.array([0.0, 1, 0]), 0)
+@example(math.pi, np.array([0.0, 1, 0]), 0)
 @given(st.floats(0, math.pi), arrays(np.float64, 3, elements=st.floats(-1, 1)), st.integers(0, 99))
 @settings(deadline=None, max_examples=60)
 def test_rotation_error_equals_scipy(angle: float, axis: Array, seed: int) -> None:
@@ -134,13 +136,6 @@ def test_rotation_error_equals_scipy(angle: float, axis: Array, seed: int) -> No
     # 1e-13 degrees is the rounding of the matrices themselves.
     magnitude = np.degrees((turned * base.inv()).magnitude())
     assert error == pytest.approx(magnitude, rel=REL, abs=1e-13)
-
-
-@pytest.mark.parametrize("degrees", [1e-6, 1e-3, 90.0, 179.999999, 180.0])
-def test_rotation_error_keeps_its_digits_at_both_ends(degrees: float) -> None:
-    R = torch.from_numpy(Rotation.from_euler("y", degrees, degrees=True).as_matrix())[None]
-    error = rotation_error_deg(R, torch.eye(3).double()[None]).item()
-    assert error == pytest.approx(degrees, rel=REL)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -187,9 +182,6 @@ def test_wrong_shapes_are_refused(
     for error in (add, add_s):
         with pytest.raises(ValueError, match=re.escape(message)):
             error(*pose, points)
-
-
-def test_a_wrong_camera_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"K must be \(3, 3\) or \(N, 3, 3\)"):
         reprojection_error(*poses(3, 0), cloud(3), torch.eye(3).expand(2, 3, 3))
 

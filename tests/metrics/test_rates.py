@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -58,14 +57,6 @@ def test_auc_equals_loops(errors: list[float]) -> None:
     hits = [e for e in errors if e <= 0.1]
     if hits:  # the documented difference between the two
         assert voc - exact == pytest.approx(max(hits) / (len(errors) * 0.1), rel=1e-6, abs=1e-12)
-
-
-def test_exact_auc_is_the_area_under_the_pass_rate() -> None:
-    errors = torch.from_numpy(np.random.default_rng(0).exponential(0.05, 40))
-    edges = np.concatenate([[0], np.sort(errors[errors < 0.1]), [0.1]])
-    # Between two errors the strict pass rate is constant, so the sum of rectangles is exact.
-    rates = [pass_rate(errors, (a + b) / 2) for a, b in itertools.pairwise(edges)]
-    assert auc(errors, 0.1) == pytest.approx(np.diff(edges) @ rates / 0.1, rel=REL)
 
 
 @pytest.mark.parametrize("method", ["exact", "voc"])
@@ -174,19 +165,18 @@ def test_average_recall_is_the_mean_of_strict_pass_rates() -> None:
 
 @settings(deadline=None, max_examples=100)
 @given(
-    counts=st.integers(1, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
+    counts=st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
     confidence=st.floats(0.5, 0.999),
 )
 def test_wilsons_interval_is_scipys(counts: tuple[int, int], confidence: float) -> None:
     passed, num = counts
     low, high = wilson_interval(passed, num, confidence)
+    if num == 0:  # without trials the rate is unknown
+        assert (low, high) == (0.0, 1.0)
+        return
     theirs = binomtest(passed, num).proportion_ci(confidence, method="wilson")
     assert (low, high) == pytest.approx((theirs.low, theirs.high), abs=1e-9)
     assert 0 <= low <= passed / num <= high <= 1
-
-
-def test_without_trials_the_rate_is_unknown() -> None:
-    assert wilson_interval(0, 0) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("arguments", [(-1, 2), (3, 2), (1, 2, 0.0), (1, 2, 1.0)])

@@ -7,20 +7,6 @@ from torch import nn
 from dopepp.core.errors import UserError
 from dopepp.models.backbones import DSC, VGG19, VGG19Original
 
-# torchvision's vgg19: index of each convolution under `features` and its channels.
-TORCHVISION = {
-    0: (3, 64),
-    2: (64, 64),
-    5: (64, 128),
-    7: (128, 128),
-    10: (128, 256),
-    12: (256, 256),
-    14: (256, 256),
-    16: (256, 256),
-    19: (256, 512),
-    21: (512, 512),
-}
-
 
 def num_weights(module: nn.Module) -> int:
     return sum(layer.weight.numel() for layer in module.modules() if isinstance(layer, nn.Conv2d))
@@ -64,51 +50,40 @@ def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm
 
 
 @pytest.fixture(scope="module")
-def torchvision_weights() -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    weights = {}
-    for index, (inputs, outputs) in TORCHVISION.items():
-        weights[f"features.{index}.weight"] = torch.randn(
-            outputs, inputs, 3, 3, generator=generator
-        )
-        weights[f"features.{index}.bias"] = torch.randn(outputs, generator=generator)
+def torchvision():
+    """Layers 0 to 22 of torchvision's vgg19, rebuilt, and a file's content with its keys."""
+    torch.manual_seed(0)
+    layers, channels = [], 3
+    for wide in (64, 64, None, 128, 128, None, 256, 256, 256, 256, None, 512, 512):
+        if wide is None:
+            layers.append(nn.MaxPool2d(2))
+        else:
+            layers += [nn.Conv2d(channels, wide, 3, padding=1), nn.ReLU()]
+            channels = wide
+    reference = nn.Sequential(*layers[:23])
+    weights = {f"features.{key}": value for key, value in reference.state_dict().items()}
     # What the file holds beyond these layers is left alone.
-    weights["classifier.6.bias"] = torch.zeros(1000)
-    return weights
+    return reference, weights | {"classifier.6.bias": torch.zeros(1000)}
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_loads_torchvision_weights(tmp_path, torchvision_weights, zipped):
-    path = tmp_path / "vgg19.pth"
-    torch.save(torchvision_weights, path, _use_new_zipfile_serialization=zipped)
-    backbone = VGG19(weights_path=str(path))
-    # torchvision's own layout, rebuilt: layers 0–22 with the file's keys.
-    reference = nn.Sequential()
-    for index in range(23):
-        if index in TORCHVISION:
-            reference.append(nn.Conv2d(*TORCHVISION[index], 3, padding=1))
-        else:
-            reference.append(nn.MaxPool2d(2) if index in (4, 9, 18) else nn.ReLU())
-    reference.load_state_dict(
-        {
-            key.removeprefix("features."): value
-            for key, value in torchvision_weights.items()
-            if key.startswith("features.")
-        }
-    )
+def test_loads_torchvision_weights(tmp_path, torchvision, zipped):
+    reference, weights = torchvision
+    torch.save(weights, tmp_path / "vgg19.pth", _use_new_zipfile_serialization=zipped)
+    backbone = VGG19(weights_path=str(tmp_path / "vgg19.pth"))
     images = torch.randn(1, 3, 16, 16)
     with torch.no_grad():
-        ours = backbone.layers[:-2](images)
-        torch.testing.assert_close(ours, reference(images))
+        torch.testing.assert_close(backbone.layers[:-2](images), reference(images))
 
 
-def test_wrong_key_or_shape_is_refused(tmp_path, torchvision_weights):
+def test_wrong_key_or_shape_is_refused(tmp_path, torchvision):
+    weights = torchvision[1]
     path = tmp_path / "vgg19.pth"
-    renamed = {f"module.{key}": value for key, value in torchvision_weights.items()}
+    renamed = {f"module.{key}": value for key, value in weights.items()}
     torch.save(renamed, path)
     with pytest.raises(UserError, match=r"got nothing under features\.0\.weight in .*vgg19\.pth"):
         VGG19(weights_path=str(path))
-    torch.save({**torchvision_weights, "features.5.weight": torch.zeros(128, 64, 1, 1)}, path)
+    torch.save({**weights, "features.5.weight": torch.zeros(128, 64, 1, 1)}, path)
     with pytest.raises(UserError, match=r"\(128, 64, 1, 1\) under features\.5\.weight"):
         VGG19(weights_path=str(path))
     torch.save([1, 2], path)

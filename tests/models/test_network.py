@@ -9,7 +9,7 @@ from torch import nn
 
 from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale
-from dopepp.models.layers import conv_block, find_activation, scaled_channels
+from dopepp.models.layers import find_activation
 from dopepp.models.spec import build_network
 
 
@@ -209,14 +209,6 @@ def test_head_arguments_are_bounded(head, arguments, message):
         head(8, 1, **arguments)
 
 
-@pytest.mark.parametrize(
-    ("channels", "width", "expected"),
-    [(128, 1, 128), (128, 0.5, 64), (64, 0.3, 16), (64, 1 / 64, 8), (512, 4, 2048)],
-)
-def test_scaled_channels(channels, width, expected):
-    assert scaled_channels(channels, width) == expected
-
-
 def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
     torch.manual_seed(0)
     network = build_network(make_spec(attention="Identity"))
@@ -225,10 +217,3 @@ def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
     with torch.no_grad():
         network(torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8))
     assert 0.05 < features[0].std() < 20
-
-
-def test_batch_norm_takes_the_place_of_the_bias():
-    with_norm, without = conv_block(4, 8, 3, batch_norm=True), conv_block(4, 8, 3)
-    assert [type(layer) for layer in with_norm] == [nn.Conv2d, nn.BatchNorm2d, nn.ReLU]
-    assert with_norm[0].bias is None
-    assert without[0].bias is not None

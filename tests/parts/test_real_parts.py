@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
 from dopepp.core.errors import UserError
 from dopepp.parts import load_part, ycb_part
-from dopepp.parts.mesh.decimate import decimate
 
 TEXTURED = (
     "003_cracker_box",
@@ -55,37 +53,6 @@ def test_a_textured_model_agrees_with_trimesh(ycb_root: Path, name: str) -> None
     area = reference.area_faces > 1e-12 * np.square(reference.extents).sum()
     theirs = np.concatenate([reference.vertices, reference.visual.uv], axis=1)[reference.faces]
     np.testing.assert_allclose(_sorted(ours), _sorted(theirs[area]), atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["stl", "006_mustard_bottle"])
-def test_a_decimated_part_keeps_its_shape(shared_data: Path, name: str) -> None:
-    if name == "stl":
-        parts = [load_part(path, "mm") for path in sorted(shared_data.rglob("*.[sS][tT][lL]"))[:3]]
-    else:
-        parts = [ycb_part(shared_data / "ycb_video_mini", name)]
-    for mesh in (part.mesh for part in parts):
-        assert mesh is not None
-        whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        # The edges of the files' long triangles are halved more often than those of the models.
-        longest = float(np.sqrt(whole.area / (8_000 if name == "stl" else 30_000)))
-        fine = trimesh.Trimesh(
-            *trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest), process=False
-        )
-        fine.merge_vertices(merge_tex=True, merge_norm=True)
-        fewer, kept, _, moved = decimate(
-            np.asarray(fine.vertices), np.asarray(fine.faces), None, 50_000
-        )
-        solid = trimesh.Trimesh(fewer, kept, process=False)
-        size = float(np.linalg.norm(whole.extents))
-        np.testing.assert_allclose(solid.extents, whole.extents, atol=1e-3 * size)
-        assert len(fine.faces) > 100_000
-        assert solid.area == pytest.approx(whole.area, rel=0.02)
-        assert moved < 0.02 * size
-        samples = trimesh.sample.sample_surface(solid, 3000, seed=1)[0]
-        dense = trimesh.sample.sample_surface(whole, 200_000, seed=2)[0]
-        assert np.quantile(cKDTree(dense).query(samples)[0], 0.99) < 0.01 * size
-        if whole.is_watertight:
-            assert solid.volume == pytest.approx(whole.volume, rel=0.02)
 
 
 def _sorted(triangles: np.ndarray) -> np.ndarray:

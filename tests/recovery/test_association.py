@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from dopepp.geometry.cuboid import CORNER_SIGNS
 from dopepp.recovery.association import ObjectPeaks, associate, direction_evidence
-from dopepp.recovery.consensus import predict
 
 WIDE = math.radians(45)
 
@@ -91,17 +90,6 @@ def test_corners_in_one_direction_are_told_apart_by_the_others() -> None:
             right += (one.position[:8] == corners[:, n]).all(1).sum()
             total += 8
     assert right >= 0.97 * total
-
-
-def test_three_corners_foretell_the_others() -> None:
-    corners, centroids = crowd(np.random.default_rng(1), 1)
-    evidence = np.full((1, 8, 1), -np.inf)
-    evidence[0, [0, 1, 2]] = 0.0
-    expected, deviation = predict(corners, evidence, centroids, 4.0, 160_000.0)
-    assert_allclose(expected[0], corners[:, 0], atol=1e-9)
-    assert deviation[0] > 4
-    evidence[0, 2] = -np.inf
-    assert np.isnan(predict(corners, evidence, centroids, 4.0, 160_000.0)[0]).all()
 
 
 def test_a_pose_found_before_decides() -> None:

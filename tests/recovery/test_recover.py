@@ -28,21 +28,25 @@ def same(one: Detection, other: Detection) -> None:
     assert_allclose(one.peaks, other.peaks, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["box", "plate"])
+@pytest.mark.parametrize("name", ["box", "plate", "origin elsewhere"])
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_all_instances_come_back(
-    name: str, count: int, request: pytest.FixtureRequest, make_scene: Make, pose: Make
+    name: str, count: int, box: np.ndarray, plate: np.ndarray, make_scene: Make, pose: Make
 ) -> None:
-    cuboid, rng = request.getfixturevalue(name), np.random.default_rng(count)
+    elsewhere = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
+    cuboid = {"box": box, "plate": plate, "origin elsewhere": elsewhere}[name]
+    rng = np.random.default_rng(count)
     for _ in range(8):
         scene = make_scene(cuboid)
         for x, y in PLACES[:count]:
-            scene.place(0, pose(rng, x, y, 0.55))
+            T = pose(rng, x, y, 0.55)
+            T[:3, 3] -= T[:3, :3] @ cuboid[8]
+            scene.place(0, T)
         found = recover(*scene.maps(), scene.cuboids, scene.K)
         assert len(found) == count
         assert max(scene.error(0, one.T_cam_obj) for one in found) < 0.1
-        places = {tuple(np.round(one.T_cam_obj[:2, 3] / 0.09).astype(int)) for one in found}
-        assert len(places) == count
+        centres = [transform(one.T_cam_obj, cuboid[8])[:2] for one in found]
+        assert len({tuple(np.round(centre / 0.09).astype(int)) for centre in centres}) == count
 
 
 def test_instances_side_by_side_keep_their_own_corners(
@@ -121,17 +125,6 @@ def test_best_score_comes_first_and_stays_within_one(
     assert len(recover(belief, field, scene.cuboids, scene.K, centroid_threshold=0.7)) == 1
 
 
-def test_a_part_with_its_origin_elsewhere(make_scene: Make, pose: Make) -> None:
-    cuboid = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
-    rng = np.random.default_rng(6)
-    for _ in range(10):
-        T = pose(rng)
-        T[:3, 3] -= T[:3, :3] @ cuboid[8]
-        scene = make_scene(cuboid).place(0, T)
-        (one,) = recover(*scene.maps(), scene.cuboids, scene.K)
-        assert scene.error(0, one.T_cam_obj) < 0.1
-
-
 def test_what_is_absent_is_not_found(
     make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
 ) -> None:
@@ -194,17 +187,6 @@ def test_maps_in_half_precision_and_channels_last(
     )
     ((one,),) = recover_batch(belief, field, scene.cuboids, scene.K[None])
     assert scene.error(0, one.T_cam_obj) < 0.1
-
-
-@pytest.mark.parametrize("sigma", [0.7, 1.5, 2.0])
-def test_any_width_of_the_peaks(
-    sigma: float, make_scene: Make, box: np.ndarray, pose: Make
-) -> None:
-    rng = np.random.default_rng(9)
-    for _ in range(5):
-        scene = make_scene(box).place(0, pose(rng))
-        (one,) = recover(*scene.maps(sigma), scene.cuboids, scene.K, sigma=sigma)
-        assert scene.error(0, one.T_cam_obj) < 0.05
 
 
 @pytest.mark.parametrize(

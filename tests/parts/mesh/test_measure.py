@@ -32,6 +32,10 @@ def test_largest_distance_is_the_largest_of_all_pairs(
     assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-9)
 
 
+BALL = np.random.default_rng(1).normal(size=(2000, 3))
+BALL /= np.linalg.norm(BALL, axis=1, keepdims=True)
+
+
 @pytest.mark.parametrize(
     "points",
     [
@@ -40,18 +44,13 @@ def test_largest_distance_is_the_largest_of_all_pairs(
         np.repeat(np.eye(3), 4, axis=0),
         np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T.astype(float),
         np.random.default_rng(0).normal(size=(3000, 3)),
+        BALL,
     ],
-    ids=["one", "coincident", "duplicates", "cube", "many"],
+    ids=["one", "coincident", "duplicates", "cube", "many", "all on the hull"],
 )
 def test_largest_distance_of_special_sets(points: np.ndarray) -> None:
     expected = pdist(points).max() if len(points) > 1 else 0.0
     assert largest_distance(points) == pytest.approx(expected, rel=1e-12, abs=1e-15)
-
-
-def test_largest_distance_needs_more_than_one_block_of_a_hull() -> None:
-    points = np.random.default_rng(1).normal(size=(2000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)  # all on the hull
-    assert largest_distance(points) == pdist(points).max()
 
 
 @pytest.mark.parametrize("shape", ["ball", "noisy ball", "egg", "corner", "lens"])
@@ -129,11 +128,9 @@ def test_a_face_without_area_gets_no_sample() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]])
     faces = np.array([[3, 3, 3], [0, 1, 2], [0, 3, 3]])
     assert sample_surface(vertices, faces).max() <= 1
-
-
-def test_no_area_means_no_samples() -> None:
-    with pytest.raises(ValueError, match="area"):
-        sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    for sampler in (sample_surface, SurfaceTree):
+        with pytest.raises(ValueError, match="area"):
+            sampler(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 
 
 def test_weld_merges_equal_positions_and_the_two_zeros() -> None:
@@ -175,8 +172,3 @@ def test_points_are_spread_by_area_and_lie_on_their_triangles() -> None:
     closest, normals = surface.nearest(points + 1e-4 * surface.normals[owners])
     assert np.quantile(np.abs(closest - points).max(axis=1), 0.95) < 2e-4
     assert ((normals * surface.normals[owners]).sum(axis=1) > 0.99).mean() > 0.99
-
-
-def test_triangles_without_area_are_refused() -> None:
-    with pytest.raises(ValueError, match="total area of 0"):
-        SurfaceTree(np.zeros((3, 3)), np.array([[0, 1, 2]]))
