@@ -125,7 +125,7 @@ def test_wild_corners_are_rejected(name: str, count: int) -> None:
     for _ in range(trials):
         truth = look_at(cuboid, rng)
         pixels = project_keypoints(cuboid, truth, K) + rng.normal(size=(9, 2)) * 0.2
-        wild = rng.permutation(8)[:count]
+        wild = rng.integers(8, size=count)
         pixels[wild] += 60 * np.stack([np.cos(wild), np.sin(wild)], axis=1)
         result = solve_pnp(cuboid, pixels, K, 0.2)
         check(result, cuboid)
