@@ -183,11 +183,8 @@ def test_prior_measures_turns_and_shifts(values: list[float]) -> None:
     moved = make_transform(rotation_vector_to_matrix(turn) @ TRUE[:3, :3], TRUE[:3, 3] + shift)
     assert_allclose(prior.offset(moved), [*-turn, *-shift], atol=1e-9)
     assert np.linalg.eigvalsh(prior.information).min() > 0
-
-
-def test_a_covariance_that_is_none_is_replaced() -> None:
-    broken = make_prior(TRUE, 0.1, np.full((6, 6), np.nan))
-    assert_allclose(broken.information, make_prior(TRUE, 0.1).information)
+    broken = make_prior(TRUE, 0.1, np.full((6, 6), np.nan))  # a covariance that is none
+    assert_allclose(broken.information, prior.information)
 
 
 @pytest.mark.parametrize(
@@ -202,11 +199,8 @@ def test_a_covariance_that_is_none_is_replaced() -> None:
 def test_depth_that_cannot_be_right(depth: np.ndarray, message: str) -> None:
     with pytest.raises(UserError, match=message):
         checked_depth(depth, (4, 3))
-
-
-def test_unknown_depth_is_zero() -> None:
-    depth = np.array([[np.nan, np.inf], [0.0, 1.5]])
-    assert_allclose(checked_depth(depth, (2, 2)), [[0, 0], [0, 1.5]])
+    unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
+    assert_allclose(checked_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
 
 
 def test_depth_is_undistorted_without_mixing() -> None:

@@ -179,12 +179,6 @@ def test_distorted_images_are_undistorted_first(
     assert_array_equal(seen[1], seen[2])
 
 
-@pytest.mark.parametrize("bad", [[0.1], [0.1] * 6, [0.1, np.nan, 0, 0], [[0.1, 0.2, 0.3]]])
-def test_bad_distortion(estimator: PoseEstimator, bad: list[float]) -> None:
-    with pytest.raises(UserError, match="4, 5, 8, 12 or 14 finite numbers"):
-        estimator.predict(image(640, 480), K_VGA, np.array(bad))
-
-
 def test_views_and_lists_are_taken(estimator: PoseEstimator) -> None:
     bgr = image(640, 480)
     flipped = estimator.predict(bgr[..., ::-1], K_VGA)
@@ -195,31 +189,33 @@ def test_views_and_lists_are_taken(estimator: PoseEstimator) -> None:
         assert_allclose(one.T_cam_obj, two.T_cam_obj)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        np.zeros((480, 640, 3), np.float32),
-        np.zeros((480, 640, 3), np.uint16),
-        np.zeros((480, 640), np.uint8),
-        np.zeros((480, 640, 1), np.uint8),
-        np.zeros((480, 640, 4), np.uint8),
-        np.zeros((3, 480, 640), np.uint8),
-        np.zeros((0, 640, 3), np.uint8),
-        None,
-    ],
-)
-def test_bad_image(estimator: PoseEstimator, bad: Any) -> None:
-    with pytest.raises(UserError, match=r"\(height, width, 3\) uint8 in RGB order") as caught:
-        estimator.predict(bad, K_VGA)
+IMAGE, CAMERA = r"\(height, width, 3\) uint8 in RGB order", "pinhole matrix|field of view"
+BAD = [
+    *(({"image": np.zeros((480, 640, 3), kind)}, IMAGE) for kind in (np.float32, np.uint16)),
+    *(
+        ({"image": np.zeros(shape, np.uint8)}, IMAGE)
+        for shape in ((480, 640), (480, 640, 1), (480, 640, 4), (3, 480, 640), (0, 640, 3))
+    ),
+    ({"image": None}, IMAGE),
+    *(({"K": K}, CAMERA) for K in (np.eye(4), np.full((3, 3), np.nan), K_VGA * 2, None)),
+    ({"K": camera_matrix(1e5, 1e5, 320, 240)}, CAMERA),
+    *(
+        ({"distortion": np.array(bad)}, "4, 5, 8, 12 or 14 finite numbers")
+        for bad in ([0.1], [0.1] * 6, [0.1, np.nan, 0, 0], [[0.1, 0.2, 0.3]])
+    ),
+    ({"depth": np.ones((480, 640), np.uint16)}, "depth of type uint16"),
+]
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD)
+def test_bad_input(
+    estimator: PoseEstimator, checkpoint_path: Path, bad: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "bad", [np.eye(4), np.full((3, 3), np.nan), K_VGA * 2, camera_matrix(1e5, 1e5, 320, 240), None]
-)
-def test_bad_camera(estimator: PoseEstimator, bad: Any) -> None:
-    with pytest.raises(UserError, match=r"pinhole matrix|field of view"):
-        estimator.predict(image(640, 480), bad)
+    with pytest.raises(UserError, match=r"refine='icp'.*depth, or None"):
+        PoseEstimator.load(checkpoint_path, refine="icp")
 
 
 def test_a_recovery_option_of_another_program() -> None:
@@ -290,14 +286,3 @@ def test_refines_with_depth_where_it_is_given(tmp_path: Path) -> None:
         alone = estimator.predict(picture, K_VGA)[0]
         assert abs(np.linalg.norm(alone.T_cam_obj[:3, 3] - off[:3, 3])) < 0.004
     assert errors[1] < 0.002 < 0.009 < errors[0]
-
-
-def test_says_what_is_wrong_with_refinement_and_depth(
-    estimator: PoseEstimator, checkpoint_path: Path
-) -> None:
-    with pytest.raises(UserError, match=r"refine='icp'.*depth, or None"):
-        PoseEstimator.load(checkpoint_path, refine="icp")
-    with pytest.raises(UserError, match="depth of type uint16"):
-        estimator.predict(
-            image(64, 48), camera_matrix(60, 60, 31, 23), depth=np.ones((48, 64), np.uint16)
-        )

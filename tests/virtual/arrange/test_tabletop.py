@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import invert_transform, transform
+from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import Part, make_part
 from dopepp.virtual import (
@@ -255,9 +255,3 @@ def test_a_slope_is_met_where_it_is_highest(surface_of: MakeSurface) -> None:
     for x in (-20, 0, 30):
         expected = (0.001 * x + 0.005 + 0.05) / 2
         assert table.height(block, (x, 0)) == pytest.approx(expected, abs=8e-4)
-
-
-def test_the_tables_frame_is_rigid() -> None:
-    view = Table(roll_deg=180.0).draw_view(np.random.default_rng(0))
-    np.testing.assert_allclose(view @ invert_transform(view), np.eye(4), atol=1e-12)
-    assert np.linalg.det(view[:3, :3]) == pytest.approx(1.0)
