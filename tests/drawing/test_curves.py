@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-from pathlib import Path
 
 import cv2
 import matplotlib.pyplot as plt
@@ -31,7 +30,7 @@ ERRORS = st.lists(
 
 @given(ERRORS)
 @settings(deadline=None, max_examples=60)
-def test_a_curve_counts_what_is_strictly_below(errors: list[float]) -> None:
+def test_a_curve_counts_what_is_strictly_below(errors):
     thresholds, accuracy = accuracy_curve(np.array(errors))
     for threshold, share in zip(thresholds, accuracy, strict=True):
         below = sum(error < threshold for error in errors)
@@ -40,7 +39,7 @@ def test_a_curve_counts_what_is_strictly_below(errors: list[float]) -> None:
 
 @given(ERRORS)
 @settings(deadline=None, max_examples=20)
-def test_the_legend_shows_the_exact_auc_of_metrics(errors: list[float]) -> None:
+def test_the_legend_shows_the_exact_auc_of_metrics(errors):
     figure = accuracy_figure({"a": np.array(errors)})
     label = figure.axes[0].get_legend_handles_labels()[1][0]
     shown = float(label.removeprefix("a (AUC ").removesuffix(" %)"))
@@ -48,7 +47,7 @@ def test_the_legend_shows_the_exact_auc_of_metrics(errors: list[float]) -> None:
     assert shown == pytest.approx(exact, abs=0.05 + 1e-9)
 
 
-def test_png_and_csv_hold_the_curves(tmp_path: Path) -> None:
+def test_png_and_csv_hold_the_curves(tmp_path):
     curves = {"DOPE, old": np.array([0.02, math.inf]), "DOPE++": np.array([0.0, 0.0101])}
     save_accuracy_curves(tmp_path / "run.1" / "auc_curves", curves, title="servoholder")
     with (tmp_path / "run.1" / "auc_curves.csv").open(newline="") as file:
@@ -74,7 +73,7 @@ def test_png_and_csv_hold_the_curves(tmp_path: Path) -> None:
     ]
 
 
-def test_figures_without_curves_are_drawn_and_pyplot_keeps_none() -> None:
+def test_figures_without_curves_are_drawn_and_pyplot_keeps_none():
     for curves in ({}, {"none": np.array([])}, {"a": np.array([0.01])}):
         assert figure_image(accuracy_figure(curves)).ndim == 3
     assert plt.get_fignums() == []
@@ -85,7 +84,7 @@ def curve(*rates: float) -> RateCurve:
     return RateCurve(np.arange(len(rates), dtype=float), rate, rate * 0.9, rate * 0.9 + 0.1)
 
 
-def test_every_panel_has_a_line_and_an_interval_for_every_method() -> None:
+def test_every_panel_has_a_line_and_an_interval_for_every_method():
     panels = {
         "a": {"dope": curve(0.9, 0.5), "dopepp": curve(1.0, 0.8)},
         "b": {"dope": curve(0.1)},
@@ -104,7 +103,7 @@ def test_every_panel_has_a_line_and_an_interval_for_every_method() -> None:
     assert figure_image(figure).std() > 0
 
 
-def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured() -> None:
+def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured():
     rate = np.array([0.1, 0.9, 0.4])
     lines = {"dopepp": RateCurve(np.array([0.5, 1.0, 2.0]), rate, rate, rate)}
     (axes,) = rates_figure({"a": lines}, "scale", 1, ratio=True).axes
@@ -114,6 +113,6 @@ def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured() -> None:
 
 
 @pytest.mark.parametrize(("panels", "columns"), [({}, 2), ({"a": {}}, 0)])
-def test_nothing_to_draw_is_refused(panels: dict[str, dict[str, RateCurve]], columns: int) -> None:
+def test_nothing_to_draw_is_refused(panels, columns):
     with pytest.raises(ValueError, match=f"got {len(panels)} and {columns}"):
         rates_figure(panels, "x", columns)

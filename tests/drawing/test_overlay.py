@@ -32,7 +32,7 @@ def keypoints(seed: int = 0, z: float = 0.4) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("colour", [YELLOW, GREEN, BLUE])
-def test_all_edges_and_the_centroid_are_drawn_in_the_colour(colour: tuple[int, int, int]) -> None:
+def test_all_edges_and_the_centroid_are_drawn_in_the_colour(colour):
     points, given = keypoints(), black()
     image = draw_wireframe(given, points, colour)
     overlay(given, [Wireframe(points, colour, "a")])
@@ -48,14 +48,14 @@ def test_all_edges_and_the_centroid_are_drawn_in_the_colour(colour: tuple[int, i
     assert image[v, u].tolist() == list(colour)
 
 
-def test_nothing_is_drawn_away_from_the_lines() -> None:
+def test_nothing_is_drawn_away_from_the_lines():
     points = keypoints()
     drawn = np.argwhere(draw_wireframe(black(), points).any(axis=2))[:, ::-1]
     lower, upper = points.min(axis=0) - 3, points.max(axis=0) + 3
     assert ((drawn > lower) & (drawn < upper)).all()
 
 
-def test_a_line_lies_on_its_sub_pixel_position() -> None:
+def test_a_line_lies_on_its_sub_pixel_position():
     points = np.full((9, 2), math.nan)
     points[[4, 5]] = [[20, 50.5], [140, 50.5]]  # a back edge, half way between two rows
     image = draw_wireframe(black(), points, (200, 200, 200)).astype(float)
@@ -63,7 +63,7 @@ def test_a_line_lies_on_its_sub_pixel_position() -> None:
     assert weights @ np.arange(120) / weights.sum() == pytest.approx(50.5, abs=0.1)
 
 
-def test_all_24_orientations_of_a_cube_look_different() -> None:
+def test_all_24_orientations_of_a_cube_look_different():
     axes = [np.array(p) for p in itertools.permutations(np.eye(3))]
     signs = [np.diag(s) for s in itertools.product([1.0, -1.0], repeat=3)]
     rotations = [s @ a for a in axes for s in signs if np.linalg.det(s @ a) > 0]
@@ -79,7 +79,7 @@ def test_all_24_orientations_of_a_cube_look_different() -> None:
         assert (np.abs(a - b).max(axis=2) > 60).sum() > 20
 
 
-def test_edges_with_a_missing_keypoint_are_left_out() -> None:
+def test_edges_with_a_missing_keypoint_are_left_out():
     points = keypoints()
     points[0] = math.nan
     image = draw_wireframe(black(), points)
@@ -89,7 +89,7 @@ def test_edges_with_a_missing_keypoint_are_left_out() -> None:
     assert not draw_wireframe(black(), np.full((9, 2), math.inf)).any()
 
 
-def test_a_line_between_points_far_outside_crosses_the_image() -> None:
+def test_a_line_between_points_far_outside_crosses_the_image():
     points = np.full((9, 2), math.nan)
     points[[4, 5]] = [[-3e9 + 80, 60], [3e9 + 80, 60]]
     image = draw_wireframe(black(), points)
@@ -104,14 +104,12 @@ def test_a_line_between_points_far_outside_crosses_the_image() -> None:
     st.integers(1, 40),
 )
 @settings(deadline=None, max_examples=60)
-def test_any_keypoints_on_any_image_are_drawn_without_an_error(
-    points: NDArray[np.float64], width: int, height: int
-) -> None:
+def test_any_keypoints_on_any_image_are_drawn_without_an_error(points, width, height):
     frames = [Wireframe(points, BLUE, "a long name")]  # whose legend is cut, not refused
     assert overlay(black(width, height), frames, width).shape == (height, width, 3)
 
 
-def test_narrow_images_are_enlarged_and_the_keypoints_follow() -> None:
+def test_narrow_images_are_enlarged_and_the_keypoints_follow():
     points = keypoints()
     image = overlay(black(), [Wireframe(points, GREEN)], min_width_px=600)
     assert image.shape == (480, 640, 3)
@@ -121,7 +119,7 @@ def test_narrow_images_are_enlarged_and_the_keypoints_follow() -> None:
     assert overlay(wide, []).shape == wide.shape
 
 
-def test_enlarging_keeps_pixel_centres() -> None:
+def test_enlarging_keeps_pixel_centres():
     image = black(9, 7)
     image[3, 5] = 255
     large = enlarge(image, 5).astype(float)[..., 0]
@@ -133,7 +131,7 @@ def test_enlarging_keeps_pixel_centres() -> None:
         enlarge(image, 0)
 
 
-def test_the_legend_names_each_label_once_in_its_colour() -> None:
+def test_the_legend_names_each_label_once_in_its_colour():
     nowhere = np.full((9, 2), math.nan)
     frames = [Wireframe(nowhere, GREEN, "truth"), Wireframe(nowhere, GREEN, "truth")]
     one = overlay(black(640, 480), frames)

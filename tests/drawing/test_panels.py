@@ -28,7 +28,7 @@ def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> PlotLine
     return PlotLine(name, np.arange(values.shape[1], dtype=float), values, colour)
 
 
-def test_several_runs_are_a_mean_in_a_band() -> None:
+def test_several_runs_are_a_mean_in_a_band():
     figure = lines_figure([line(np.array([[1.0, 2.0], [3.0, 6.0]]))], "step", "loss", log_y=True)
     (axes,) = figure.axes
     (mean,) = axes.lines
@@ -40,13 +40,13 @@ def test_several_runs_are_a_mean_in_a_band() -> None:
     assert figure_image(figure).std() > 5
 
 
-def test_losses_that_are_not_positive_are_not_drawn_on_a_logarithm() -> None:
+def test_losses_that_are_not_positive_are_not_drawn_on_a_logarithm():
     figure = lines_figure([line(np.array([[1.0, 0.0]]))], "step", "loss", log_y=True)
     assert figure.axes[0].get_yscale() == "linear"
     assert lines_figure([], "step", "loss", log_y=True).axes[0].get_legend() is None
 
 
-def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed() -> None:
+def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
     noisy = np.random.default_rng(0).normal(1, 0.5, (1, 500))
     pale, smooth, other = (
         lines_figure([line(noisy), replace(line(noisy[:, :3]), dashed=True)], "step", "loss")
@@ -60,7 +60,7 @@ def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed() ->
 
 @settings(max_examples=30, deadline=None)
 @given(num=st.integers(1, 400), slope=st.floats(-3, 3))
-def test_smoothing_keeps_length_level_and_straight_lines(num: int, slope: float) -> None:
+def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
     values = 5 + slope * np.arange(num, dtype=float)
     result = smoothed(values)
     assert result.shape == values.shape
@@ -71,7 +71,7 @@ def test_smoothing_keeps_length_level_and_straight_lines(num: int, slope: float)
     np.testing.assert_allclose(smoothed(np.full(num, 2.5)), 2.5)
 
 
-def test_pictures_stand_in_rows() -> None:
+def test_pictures_stand_in_rows():
     pictures = [np.full((2 + i, 3 + i, 3), 10 * i, np.uint8) for i in range(3)]
     sheet = grid(pictures, 2)
     assert sheet.shape == (3 + 4, 3 + 4, 3)
@@ -83,14 +83,14 @@ def test_pictures_stand_in_rows() -> None:
             grid(*wrong)
 
 
-def test_a_message_is_cut_where_the_picture_ends() -> None:
+def test_a_message_is_cut_where_the_picture_ends():
     picture = message_picture(120, 60, "no file anywhere " * 50)
     assert picture.shape == (60, 120, 3)
     assert picture.std() > 1
     assert (message_picture(40, 30, "")[0] == picture[0, :40]).all()
 
 
-def test_masks_are_painted_in_their_colours_on_the_darkened_image() -> None:
+def test_masks_are_painted_in_their_colours_on_the_darkened_image():
     first, second = np.zeros((2, 30, 40), bool)
     first[5:10, 5:15] = True
     second[20:25, 20:30] = True
@@ -104,7 +104,7 @@ def test_masks_are_painted_in_their_colours_on_the_darkened_image() -> None:
     assert (mask_panel(GREY, masks) == mask_panel(GREY, masks[:1])).all()
 
 
-def test_depth_goes_from_red_over_the_objects_range_to_blue() -> None:
+def test_depth_goes_from_red_over_the_objects_range_to_blue():
     depth = np.full((30, 40), 9.0, np.float32)  # a plane far behind
     depth[:, :20] = np.linspace(0.2, 0.4, 20)
     depth[0] = 0
@@ -119,7 +119,7 @@ def test_depth_goes_from_red_over_the_objects_range_to_blue() -> None:
     assert (panel[5, 20:] == panel[5, 20]).all()
 
 
-def test_depth_without_objects_and_without_anything() -> None:
+def test_depth_without_objects_and_without_anything():
     nothing = np.zeros((30, 40), bool)
     assert depth_panel(np.full((30, 40), 1.0), nothing)[1] == "depth: red 0.999 m to blue 1.001 m"
     panel, words = depth_panel(np.zeros((30, 40)), nothing)
@@ -127,7 +127,7 @@ def test_depth_without_objects_and_without_anything() -> None:
     assert not panel.any()
 
 
-def test_axes_end_where_they_should() -> None:
+def test_axes_end_where_they_should():
     image = np.zeros((60, 80, 3), np.uint8)
     draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]), thickness=1)
     for (column, row), colour in zip([(60, 30), (20, 8), (20, 50)], AXIS_COLOURS, strict=True):
@@ -137,7 +137,7 @@ def test_axes_end_where_they_should() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e12])
-def test_an_axis_that_is_not_seen_is_left_out(bad: float) -> None:
+def test_an_axis_that_is_not_seen_is_left_out(bad):
     image = np.zeros((60, 80, 3), np.uint8)
     draw_axes(image, np.array([[20.0, 30], [bad, bad], [20, 5], [20, 55]]))
     assert image[10, 20].any()

@@ -28,7 +28,7 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     return make_transform(random_rotation(rng), rng.uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 1.0]))
 
 
-def test_projection_is_opencvs() -> None:
+def test_projection_is_opencvs():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.1, 0.1, (40, 3))
     vector, translation = rng.normal(size=3), np.array([0.03, -0.02, 0.5])
@@ -38,14 +38,14 @@ def test_projection_is_opencvs() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_is_not_in_front_of_the_camera_has_no_pixel() -> None:
+def test_what_is_not_in_front_of_the_camera_has_no_pixel():
     points = np.array([[0, 0, 1], [0.1, 0.2, 0], [0.1, 0.2, -1], [np.nan, 0, 1], [1, 1, 1e-320]])
     pixels = project(points, K)
     assert_allclose(pixels[0], K[:2, 2])
     assert np.isnan(pixels[1:4]).all()
 
 
-def test_transforms_invert() -> None:
+def test_transforms_invert():
     rng = np.random.default_rng(2)
     T, points = random_pose(rng), rng.normal(size=(2, 5, 3))
     assert_allclose(invert_transform(T), np.linalg.inv(T), atol=1e-12)
@@ -53,7 +53,7 @@ def test_transforms_invert() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.5, 0.8, 1.5, 2.0])
-def test_resize_rule_is_opencvs(scale: float) -> None:
+def test_resize_rule_is_opencvs(scale):
     """A blob's centre of mass moves with cv2.resize as u → s(u + ½) − ½ says."""
     x, y = np.array([37.3, 61.9])
     grid_y, grid_x = np.mgrid[:120, :120]
@@ -66,7 +66,7 @@ def test_resize_rule_is_opencvs(scale: float) -> None:
     assert_allclose(resize_points(np.array([x, y]), scale, scale), centre, atol=0.02)
 
 
-def test_resized_camera_sees_the_resized_points() -> None:
+def test_resized_camera_sees_the_resized_points():
     rng = np.random.default_rng(3)
     points = rng.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 1], (20, 3))
     expected = resize_points(project(points, K), 0.65, 1.7)
@@ -79,7 +79,7 @@ SIZES = st.tuples(st.integers(1, 3000), st.integers(1, 3000))
 
 @settings(deadline=None, max_examples=200)
 @given(SIZES, SIZES)
-def test_letterbox_fits_and_comes_back(size: tuple[int, int], input_size: tuple[int, int]) -> None:
+def test_letterbox_fits_and_comes_back(size, input_size):
     box = Letterbox.fit(size, input_size)
     assert 1 <= box.width <= input_size[0]
     assert 1 <= box.height <= input_size[1]
@@ -96,7 +96,7 @@ def test_letterbox_fits_and_comes_back(size: tuple[int, int], input_size: tuple[
 
 
 @pytest.mark.parametrize("input_size", [(128, 128), (416, 416), (64, 300)])
-def test_letterbox_image_goes_where_its_points_go(input_size: tuple[int, int]) -> None:
+def test_letterbox_image_goes_where_its_points_go(input_size):
     grid_y, grid_x = np.mgrid[:150, :200]
     blob = 255 * np.exp(-((grid_x - 120.4) ** 2 + (grid_y - 60.8) ** 2) / (2 * 8.0**2))
     image = np.repeat(np.round(blob).astype(np.uint8)[..., None], 3, axis=2)
@@ -110,14 +110,14 @@ def test_letterbox_image_goes_where_its_points_go(input_size: tuple[int, int]) -
     assert_allclose(centre, box.points(np.array([120.4, 60.8])), atol=0.1)
 
 
-def test_letterbox_averages_when_it_shrinks() -> None:
+def test_letterbox_averages_when_it_shrinks():
     checkers = np.indices((64, 64)).sum(0) % 2 * np.uint8(255)
     image = np.repeat(checkers[..., None].astype(np.uint8), 3, axis=2)
     assert np.abs(Letterbox.fit((64, 64), (16, 16)).image(image).astype(int) - 128).max() <= 1
     assert Letterbox.fit((64, 64), (64, 96)).image(image) is image
 
 
-def test_the_rounding_of_a_calibration_file_is_removed() -> None:
+def test_the_rounding_of_a_calibration_file_is_removed():
     rounding = 1e-8 * np.array([[0, 1, 0], [1, 0, 0], [1, -1, 1.0]])
     checked = check_camera(K + rounding, (640, 480), "test")
     assert_array_equal(checked, K)
@@ -143,7 +143,7 @@ def test_the_rounding_of_a_calibration_file_is_removed() -> None:
         (camera_matrix(60000, 60000, 320, 240), "field of view"),
     ],
 )
-def test_bad_camera(bad: np.ndarray, message: str) -> None:
+def test_bad_camera(bad, message):
     with pytest.raises(UserError, match=message) as caught:
         check_camera(bad, (640, 480), "frame 7")
     assert "frame 7" in str(caught.value)

@@ -22,7 +22,7 @@ NDDS_ORDER = np.array(
 
 
 @pytest.mark.parametrize("thickness", [0.007, 0.0])
-def test_a_box_off_the_origin_has_its_keypoints_in_ndds_order(thickness: float) -> None:
+def test_a_box_off_the_origin_has_its_keypoints_in_ndds_order(thickness):
     lower, upper = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.0, 0.3 + thickness])
     keypoints = cuboid_keypoints(lower, upper)
     assert_allclose(keypoints[8], (lower + upper) / 2)
@@ -31,7 +31,7 @@ def test_a_box_off_the_origin_has_its_keypoints_in_ndds_order(thickness: float) 
     assert_array_equal(np.sign(keypoints - keypoints[8]), NDDS_ORDER * np.sign(upper - lower))
 
 
-def test_edges_are_the_twelve_of_a_box() -> None:
+def test_edges_are_the_twelve_of_a_box():
     sides = np.array([0.2, 0.3, 0.5])
     keypoints = cuboid_keypoints(np.zeros(3), sides)
     edges = np.array([keypoints[b] - keypoints[a] for a, b in EDGES])
@@ -44,6 +44,6 @@ def test_edges_are_the_twelve_of_a_box() -> None:
     ("lower", "upper"),
     [([0, 0, 1], [1, 1, 0]), ([0, 0, np.nan], [1, 1, 1]), ([0] * 3, [np.inf] * 3)],
 )
-def test_bad_bounds(lower: list[float], upper: list[float]) -> None:
+def test_bad_bounds(lower, upper):
     with pytest.raises(ValueError, match="finite with lower <= upper"):
         cuboid_keypoints(np.array(lower), np.array(upper))

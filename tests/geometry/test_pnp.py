@@ -82,7 +82,7 @@ def check(result: PnPResult, object_points: np.ndarray) -> None:
 @pytest.mark.parametrize("name", CUBOIDS)
 @settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_clean_points_give_the_exact_pose(name: str, seed: int) -> None:
+def test_clean_points_give_the_exact_pose(name, seed):
     cuboid, rng = CUBOIDS[name], np.random.default_rng(seed)
     truth = look_at(cuboid, rng)
     result = solve_pnp(cuboid, project_keypoints(cuboid, truth, K), K)
@@ -93,7 +93,7 @@ def test_clean_points_give_the_exact_pose(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("count", [4, 5, 6, 8])
-def test_some_points_are_enough(count: int) -> None:
+def test_some_points_are_enough(count):
     rng, cuboid = np.random.default_rng(count), CUBOIDS["box"]
     good = 0
     for _ in range(30):
@@ -111,7 +111,7 @@ def test_some_points_are_enough(count: int) -> None:
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e4])
 @pytest.mark.parametrize("camera", [K, np.array([[600, 40.0, 1500], [0, 500, -900], [0, 0, 1]])])
-def test_any_unit_of_length_and_skew(size: float, camera: np.ndarray) -> None:
+def test_any_unit_of_length_and_skew(size, camera):
     rng, cuboid = np.random.default_rng(0), size * CUBOIDS["plate"]
     truth = look_at(cuboid, rng)
     result = solve_pnp(cuboid, project_keypoints(cuboid, truth, camera), camera)
@@ -119,7 +119,7 @@ def test_any_unit_of_length_and_skew(size: float, camera: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(("name", "count"), [*((name, 1) for name in CUBOIDS), ("box", 2)])
-def test_wild_corners_are_rejected(name: str, count: int) -> None:
+def test_wild_corners_are_rejected(name, count):
     cuboid, rng = CUBOIDS[name], np.random.default_rng(1)
     good, trials = 0, 20 * count
     for _ in range(trials):
@@ -144,7 +144,7 @@ def test_wild_corners_are_rejected(name: str, count: int) -> None:
     ],
     ids=str,
 )
-def test_a_point_without_a_proper_sigma_or_covariance_is_missing(bad: object) -> None:
+def test_a_point_without_a_proper_sigma_or_covariance_is_missing(bad):
     cuboid = CUBOIDS["box"]
     pixels = project_keypoints(cuboid, look_at(cuboid, np.random.default_rng(3)), K)
     pixels[2] += 100
@@ -170,7 +170,7 @@ def opencv(flag: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray | None]:
 
 
 @pytest.mark.parametrize("name", ["box", "can", "plate"])
-def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name: str) -> None:
+def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name):
     """Noise like a network's: 0.5–4 px, elongated any way; a wild corner in 40 % of images."""
     cuboid, rng = CUBOIDS[name], np.random.default_rng(4)
     sqpnp, epnp = opencv(cv2.SOLVEPNP_SQPNP), opencv(cv2.SOLVEPNP_EPNP)
@@ -212,7 +212,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("case", DEGENERATE)
-def test_degenerate_input_has_a_reason(case: str) -> None:
+def test_degenerate_input_has_a_reason(case):
     object_points, pixels, reason = DEGENERATE[case]
     with np.errstate(all="ignore"):
         object_points, pixels = np.array(object_points, float), np.array(pixels, float)
@@ -236,13 +236,13 @@ def test_degenerate_input_has_a_reason(case: str) -> None:
         max_size=9,
     )
 )
-def test_garbage_never_breaks_it(rows: list[list[float]]) -> None:
+def test_garbage_never_breaks_it(rows):
     table = np.array(rows, float).reshape(-1, 6)
     check(solve_pnp(table[:, :3], table[:, 3:5], K, table[:, 5]), table[:, :3])
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0, 30.0, 400.0, 1e5])
-def test_random_pixels_never_give_a_wild_pose(spread: float) -> None:
+def test_random_pixels_never_give_a_wild_pose(spread):
     rng = np.random.default_rng(7)
     for name, sigma in (("box", 1.0), ("plate", 1.0), ("plate", 8.0), ("box off its origin", 0.5)):
         for _ in range(60):
@@ -251,7 +251,7 @@ def test_random_pixels_never_give_a_wild_pose(spread: float) -> None:
             check(solve_pnp(CUBOIDS[name], pixels, K, sigma), CUBOIDS[name])
 
 
-def test_equal_points_and_pixels_never_give_a_wild_pose() -> None:
+def test_equal_points_and_pixels_never_give_a_wild_pose():
     rng, cuboid = np.random.default_rng(8), CUBOIDS["box"]
     for _ in range(150):
         pixels = rng.choice(rng.uniform(0, 400, (4, 2)), 9) + rng.choice([0, 1e-4]) * rng.normal()
@@ -260,7 +260,7 @@ def test_equal_points_and_pixels_never_give_a_wild_pose() -> None:
     check(solve_pnp(coincident, rng.uniform(0, 400, (9, 2)), K), coincident)
 
 
-def test_lengths_must_match_and_the_camera_be_one() -> None:
+def test_lengths_must_match_and_the_camera_be_one():
     cuboid = CUBOIDS["box"]
     with pytest.raises(ValueError, match="9 object points, 8 image points"):
         solve_pnp(cuboid, np.zeros((8, 2)), K)
@@ -271,7 +271,7 @@ def test_lengths_must_match_and_the_camera_be_one() -> None:
             solve_pnp(cuboid, cuboid[:, :2], bad)
 
 
-def test_the_mirrored_start_saves_plates_from_the_wrong_tilt() -> None:
+def test_the_mirrored_start_saves_plates_from_the_wrong_tilt():
     """Of two tilts with almost one image, the cost must decide, not the start."""
     cuboid, rng = CUBOIDS["plate"], np.random.default_rng(9)
     for _ in range(40):
@@ -294,7 +294,7 @@ def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["box", "box off its origin", "plate"])
-def test_the_covariance_is_that_of_the_poses(name: str) -> None:
+def test_the_covariance_is_that_of_the_poses(name):
     """Poses of many noisy observations scatter as each of them says."""
     rng = np.random.default_rng(5)
     cuboid = CUBOIDS[name]
@@ -321,7 +321,7 @@ def test_the_covariance_is_that_of_the_poses(name: str) -> None:
     )
 
 
-def test_a_covariance_that_is_a_circle_is_a_sigma() -> None:
+def test_a_covariance_that_is_a_circle_is_a_sigma():
     rng = np.random.default_rng(9)
     cuboid, sigma = CUBOIDS["can"], rng.uniform(0.5, 4, 9)
     pixels = project(transform(look_at(cuboid, rng), cuboid), K) + rng.normal(0, 1, (9, 2))
@@ -335,7 +335,7 @@ def test_a_covariance_that_is_a_circle_is_a_sigma() -> None:
 
 
 @pytest.mark.parametrize("name", ["box", "can", "plate"])
-def test_known_covariances_do_as_well_as_a_start_at_the_truth(name: str) -> None:
+def test_known_covariances_do_as_well_as_a_start_at_the_truth(name):
     """Against scipy's robust least squares, which is told the truth to start from."""
     rng = np.random.default_rng(11)
     cuboid, passed = CUBOIDS[name], np.zeros(2)

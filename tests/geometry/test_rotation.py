@@ -27,7 +27,7 @@ wide = settings(deadline=None, max_examples=200)
 
 @wide
 @given(QUATERNIONS)
-def test_quaternion_to_matrix_is_scipys(quaternion: list[float]) -> None:
+def test_quaternion_to_matrix_is_scipys(quaternion):
     w, x, y, z = quaternion
     expected = Rotation.from_quat([x, y, z, w]).as_matrix()
     assert_allclose(quaternion_to_matrix(np.array(quaternion)), expected, atol=1e-12)
@@ -35,7 +35,7 @@ def test_quaternion_to_matrix_is_scipys(quaternion: list[float]) -> None:
 
 @wide
 @given(QUATERNIONS)
-def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion: list[float]) -> None:
+def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion):
     matrix = Rotation.from_quat(quaternion).as_matrix()
     x, y, z, w = Rotation.from_matrix(matrix).as_quat()
     found = matrix_to_quaternion(matrix)
@@ -45,31 +45,31 @@ def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion: list[float]) -> N
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
-def test_half_turns_have_a_quaternion(axis: np.ndarray) -> None:
+def test_half_turns_have_a_quaternion(axis):
     matrix = 2 * np.outer(axis, axis) - np.eye(3)
     assert_allclose(quaternion_to_matrix(matrix_to_quaternion(matrix)), matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
-def test_quaternions_of_any_norm(scale: float) -> None:
+def test_quaternions_of_any_norm(scale):
     quaternion = np.array([0.5, -0.5, 0.5, 0.5])
     assert_allclose(quaternion_to_matrix(scale * quaternion), quaternion_to_matrix(quaternion))
 
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
-def test_no_quaternion(bad: list[float]) -> None:
+def test_no_quaternion(bad):
     with pytest.raises(ValueError, match="finite and non-zero"):
         quaternion_to_matrix(np.array(bad))
 
 
 @wide
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
-def test_rotation_vector_is_scipys(vector: list[float]) -> None:
+def test_rotation_vector_is_scipys(vector):
     expected = Rotation.from_rotvec(vector).as_matrix()
     assert_allclose(rotation_vector_to_matrix(np.array(vector)), expected, atol=1e-12)
 
 
-def test_rotation_vectors_come_in_batches_down_to_zero() -> None:
+def test_rotation_vectors_come_in_batches_down_to_zero():
     vectors = np.array([[[0.0, 0, 0], [1e-300, 0, 0]], [[1e-9, 2e-9, 0], [0.3, 0.2, -3]]])
     expected = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(2, 2, 3, 3)
     assert_allclose(rotation_vector_to_matrix(vectors), expected, atol=1e-15)
@@ -82,19 +82,19 @@ def test_rotation_vectors_come_in_batches_down_to_zero() -> None:
         st.floats(0, np.pi), st.floats(0, 1e-6), st.floats(0, 1e-6).map(lambda small: np.pi - small)
     ),
 )
-def test_rotation_angle_keeps_its_digits_near_0_and_pi(axis: list[float], angle: float) -> None:
+def test_rotation_angle_keeps_its_digits_near_0_and_pi(axis, angle):
     vector = np.array(axis) / np.linalg.norm(axis) * angle
     rotation = Rotation.from_rotvec(vector)
     assert rotation_angle(rotation.as_matrix()) == pytest.approx(rotation.magnitude(), abs=1e-12)
 
 
-def test_rotation_angle_of_a_batch() -> None:
+def test_rotation_angle_of_a_batch():
     rotations = Rotation.random(6, random_state=0)
     found = rotation_angle(rotations.as_matrix().reshape(2, 3, 3, 3))
     assert_allclose(found, rotations.magnitude().reshape(2, 3), atol=1e-12)
 
 
-def test_random_rotations_are_uniform() -> None:
+def test_random_rotations_are_uniform():
     """Over SO(3) the angle's distribution function is (θ − sin θ)/π, and no axis is preferred."""
     rng = np.random.default_rng(0)
     rotations = np.stack([random_rotation(rng) for _ in range(4000)])
@@ -104,7 +104,7 @@ def test_random_rotations_are_uniform() -> None:
     assert np.abs(rotations.mean(0)).max() < 0.04
 
 
-def test_is_rotation() -> None:
+def test_is_rotation():
     rotation = random_rotation(np.random.default_rng(0))
     assert is_rotation(rotation)
     assert not is_rotation(-rotation)

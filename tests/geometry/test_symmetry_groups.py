@@ -24,7 +24,7 @@ def is_group(elements: np.ndarray) -> bool:
 @pytest.mark.parametrize("name", ["C7", "C12", "D2", "D6", "D12", "T", "O", "I"])
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=5, deadline=None)
-def test_measured_generators_make_the_exact_group(name: str, seed: int) -> None:
+def test_measured_generators_make_the_exact_group(name, seed):
     rng = np.random.default_rng(seed)
     frame = Rotation.random(random_state=seed).as_matrix()
     true = frame @ Rotation.create_group(name).as_matrix() @ frame.T
@@ -37,7 +37,7 @@ def test_measured_generators_make_the_exact_group(name: str, seed: int) -> None:
     assert nearest.max() < np.radians(1.5)
 
 
-def test_exact_generators_stay_exact() -> None:
+def test_exact_generators_stay_exact():
     half_turns = np.array([np.diag([-1.0, -1, 1]), np.diag([1.0, -1, -1])])
     group = exact_group(half_turns)
     assert group is not None
@@ -50,12 +50,12 @@ def test_exact_generators_stay_exact() -> None:
     assert is_group(group)
 
 
-def test_rotations_of_no_small_group_are_refused() -> None:
+def test_rotations_of_no_small_group_are_refused():
     odd = Rotation.from_euler("zx", [[40, 10], [75, 50]], degrees=True).as_matrix()
     assert exact_group(odd) is None
 
 
-def test_an_axis_that_is_stated_twice_counts_once() -> None:
+def test_an_axis_that_is_stated_twice_counts_once():
     once = symmetry_group(None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))], 0.05)
     twice = symmetry_group(
         None, [((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)), ((0.0, 0.0, -2.0), (1.0, 0.0, 3.0))], 0.05
@@ -63,7 +63,7 @@ def test_an_axis_that_is_stated_twice_counts_once() -> None:
     assert np.array_equal(once, twice)
 
 
-def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them() -> None:
+def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them():
     centre = (0.1, -0.2, 0.3)
     axes = [(tuple(axis), centre) for axis in np.eye(3).tolist()]
     group = symmetry_group(None, axes)

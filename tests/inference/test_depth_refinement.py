@@ -74,7 +74,7 @@ def add(part: Part, one: np.ndarray, other: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", ["box", "plate"])
-def test_finds_the_pose_from_14_mm_away(name: str, box: Part) -> None:
+def test_finds_the_pose_from_14_mm_away(name, box):
     part = box if name == "box" else pivconnector()
     refiner, depth = DepthRefiner([part]), depth_of(part, TRUE)
     for seed in range(5):
@@ -87,7 +87,7 @@ def test_finds_the_pose_from_14_mm_away(name: str, box: Part) -> None:
         assert np.linalg.eigvalsh(refined.covariance).min() > 0
 
 
-def test_keeps_the_pose_when_depth_shows_something_else(box: Part) -> None:
+def test_keeps_the_pose_when_depth_shows_something_else(box):
     start = started(TRUE, np.random.default_rng(0))
     refiner = DepthRefiner([box])
     wall = np.full((480, 640), 0.9, np.float32)
@@ -101,7 +101,7 @@ def test_keeps_the_pose_when_depth_shows_something_else(box: Part) -> None:
         assert_allclose(kept.T_cam_obj, start)
 
 
-def test_keeps_the_pose_that_the_image_is_sure_of() -> None:
+def test_keeps_the_pose_that_the_image_is_sure_of():
     """Depth of the same plate 40 mm aside contradicts a pose known to a millimetre."""
     part, aside = pivconnector(), TRUE.copy()
     aside[0, 3] += 0.04
@@ -110,27 +110,27 @@ def test_keeps_the_pose_that_the_image_is_sure_of() -> None:
     assert np.linalg.norm(kept.T_cam_obj[:3, 3] - TRUE[:3, 3]) < 0.012
 
 
-def test_outside_the_view_or_behind_the_camera(box: Part) -> None:
+def test_outside_the_view_or_behind_the_camera(box):
     refiner, depth = DepthRefiner([box]), depth_of(box, TRUE)
     for x, z in ((5.0, 0.6), (0.0, -0.6), (0.0, 0.05)):
         off = make_transform(TILTED, np.array([x, 0.0, z]))
         assert refiner.refine("box", off, depth, K).reason
 
 
-def test_a_part_of_few_points_is_kept() -> None:
+def test_a_part_of_few_points_is_kept():
     corners = np.stack(np.meshgrid(*[[-0.04, 0.04]] * 3), -1).reshape(-1, 3)
     refiner = DepthRefiner([make_part("few", None, corners)])
     depth = np.full((480, 640), 0.6, np.float32)
     assert "few surface points" in refiner.refine("few", TRUE, depth, K).reason
 
 
-def test_without_the_extra(box: Part, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra(box, monkeypatch):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(UserError, match=r"without the package small_gicp.*dopepp\[depth\]"):
         DepthRefiner([box])
 
 
-def test_visible_points_agree_with_the_drawn_depth(box: Part) -> None:
+def test_visible_points_agree_with_the_drawn_depth(box):
     for part in (box, pivconnector()):
         surface = surface_points(part.points)
         right = []
@@ -148,7 +148,7 @@ def test_visible_points_agree_with_the_drawn_depth(box: Part) -> None:
         assert np.mean(right) > 0.85
 
 
-def test_normals_of_a_thin_plate_are_those_of_its_faces() -> None:
+def test_normals_of_a_thin_plate_are_those_of_its_faces():
     rng = np.random.default_rng(0)
     faces = rng.uniform(-0.04, 0.04, (2000, 2))
     points = np.column_stack([faces, np.repeat([-0.002, 0.002], 1000)])
@@ -157,7 +157,7 @@ def test_normals_of_a_thin_plate_are_those_of_its_faces() -> None:
     assert_allclose(surface.spacing, math.sqrt(2 * 0.08**2 / 2000), rtol=0.15)
 
 
-def test_outline_pulls_a_shifted_part_back(box: Part) -> None:
+def test_outline_pulls_a_shifted_part_back(box):
     """Seen face on, the pull of the outline is the shift, and nothing where there is none."""
     T = make_transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     depth, surface = depth_of(box, T), surface_points(box.points)
@@ -177,7 +177,7 @@ def test_outline_pulls_a_shifted_part_back(box: Part) -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
-def test_prior_measures_turns_and_shifts(values: list[float]) -> None:
+def test_prior_measures_turns_and_shifts(values):
     turn, shift = np.array(values[:3]), np.array(values[3:])
     prior = make_prior(TRUE, 0.1)
     moved = make_transform(rotation_vector_to_matrix(turn) @ TRUE[:3, :3], TRUE[:3, 3] + shift)
@@ -196,21 +196,21 @@ def test_prior_measures_turns_and_shifts(values: list[float]) -> None:
         (np.full((3, 4), -1.0, np.float32), "values down to -1"),
     ],
 )
-def test_depth_that_cannot_be_right(depth: np.ndarray, message: str) -> None:
+def test_depth_that_cannot_be_right(depth, message):
     with pytest.raises(UserError, match=message):
         checked_depth(depth, (4, 3))
     unknown = np.array([[np.nan, np.inf], [0.0, 1.5]])
     assert_allclose(checked_depth(unknown, (2, 2)), [[0, 0], [0, 1.5]])
 
 
-def test_depth_is_undistorted_without_mixing() -> None:
+def test_depth_is_undistorted_without_mixing():
     depth = np.where(np.arange(64) < 32, 0.5, 2.0).astype(np.float32)[None].repeat(48, axis=0)
     small = camera_matrix(60, 60, 31.5, 23.5)
     moved = undistorted_depth(depth, small, np.array([-0.2, 0.05, 0, 0]))
     assert set(np.unique(moved)) <= {0.0, 0.5, 2.0}
 
 
-def test_read_depth(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_read_depth(tmp_path):
     path = tmp_path / "depth.png"
     cv2.imwrite(str(path), np.array([[0, 1000], [250, 65535]], np.uint16))
     assert_allclose(read_depth(path, 0.001), [[0, 1], [0.25, 65.535]])

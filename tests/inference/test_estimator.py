@@ -3,7 +3,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -97,7 +96,7 @@ class Oracle(PoseEstimator):
         return belief[0], field[0]
 
 
-def test_loads_what_was_saved(estimator: PoseEstimator, parts: list[Part]) -> None:
+def test_loads_what_was_saved(estimator, parts):
     assert [part.name for part in estimator.parts] == ["bracket", "plate"]
     for ours, theirs in zip(estimator.parts, parts, strict=True):
         assert_allclose(ours.cuboid, theirs.cuboid)
@@ -108,7 +107,7 @@ def test_loads_what_was_saved(estimator: PoseEstimator, parts: list[Part]) -> No
 
 
 @pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
-def test_any_image_size(estimator: PoseEstimator, size: tuple[int, int]) -> None:
+def test_any_image_size(estimator, size):
     longest = max(size)
     K = camera_matrix(longest, longest, size[0] / 2 - 0.5, size[1] / 2 - 0.5)
     for one in estimator.predict(image(*size), K):
@@ -116,7 +115,7 @@ def test_any_image_size(estimator: PoseEstimator, size: tuple[int, int]) -> None
         assert np.isfinite(one.T_cam_obj).all()
 
 
-def test_the_network_sees_the_letterboxed_image(estimator: PoseEstimator) -> None:
+def test_the_network_sees_the_letterboxed_image(estimator):
     picture = image(640, 480)
     padded = letterboxed(picture, Letterbox.fit((640, 480), (416, 416)), 32)
     assert padded.shape == (320, 416, 3)
@@ -132,9 +131,7 @@ def test_the_network_sees_the_letterboxed_image(estimator: PoseEstimator) -> Non
 
 
 @pytest.mark.parametrize("size", [(640, 480), (416, 416), (2560, 1440), (200, 301)])
-def test_poses_and_pixels_refer_to_the_given_image(
-    checkpoint_path: Path, size: tuple[int, int]
-) -> None:
+def test_poses_and_pixels_refer_to_the_given_image(checkpoint_path, size):
     oracle, rng = Oracle.load(checkpoint_path), np.random.default_rng(1)
     assert isinstance(oracle, Oracle)
     width, height = size
@@ -159,9 +156,7 @@ def test_poses_and_pixels_refer_to_the_given_image(
             assert one.reprojection_error_px < 0.003 * width
 
 
-def test_distorted_images_are_undistorted_first(
-    estimator: PoseEstimator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_distorted_images_are_undistorted_first(estimator, monkeypatch):
     seen: list[np.ndarray] = []
     original = PoseEstimator.maps
 
@@ -179,7 +174,7 @@ def test_distorted_images_are_undistorted_first(
     assert_array_equal(seen[1], seen[2])
 
 
-def test_views_and_lists_are_taken(estimator: PoseEstimator) -> None:
+def test_views_and_lists_are_taken(estimator):
     bgr = image(640, 480)
     flipped = estimator.predict(bgr[..., ::-1], K_VGA)
     copied = estimator.predict(np.ascontiguousarray(bgr[..., ::-1]), K_VGA)
@@ -208,9 +203,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("bad", "message"), BAD)
-def test_bad_input(
-    estimator: PoseEstimator, checkpoint_path: Path, bad: dict[str, Any], message: str
-) -> None:
+def test_bad_input(estimator, checkpoint_path, bad, message):
     with pytest.raises(UserError, match=message) as caught:
         estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
@@ -218,7 +211,7 @@ def test_bad_input(
         PoseEstimator.load(checkpoint_path, refine="icp")
 
 
-def test_a_recovery_option_of_another_program() -> None:
+def test_a_recovery_option_of_another_program():
     with pytest.raises(UserError, match="recovery option 'nms_radius'"):
         parse_recovery({"nms_radius": 3.0})
     with pytest.raises(UserError, match="recovery option max_peaks=0"):
@@ -234,13 +227,13 @@ def loaded_after(code: str) -> set[str]:
     return set(run.stdout.split())
 
 
-def test_importing_dopepp_is_light() -> None:
+def test_importing_dopepp_is_light():
     loaded = loaded_after("import dopepp")
     assert "dopepp" in loaded
     assert not {"torch", "lightning", "cv2", "scipy"} & loaded
 
 
-def test_inference_needs_no_training_and_no_data() -> None:
+def test_inference_needs_no_training_and_no_data():
     loaded = loaded_after("from dopepp import PoseEstimator")
     assert "dopepp.inference.estimator" in loaded
     packages = {name.split(".")[0] for name in loaded}
@@ -249,14 +242,14 @@ def test_inference_needs_no_training_and_no_data() -> None:
     assert not {name for name in loaded if name.startswith(tuple(f"dopepp.{p}" for p in above))}
 
 
-def test_an_unknown_name_of_the_package() -> None:
+def test_an_unknown_name_of_the_package():
     import dopepp
 
     with pytest.raises(AttributeError, match="PoseEstimater"):
         _ = dopepp.PoseEstimater
 
 
-def test_refines_with_depth_where_it_is_given(tmp_path: Path) -> None:
+def test_refines_with_depth_where_it_is_given(tmp_path):
     pytest.importorskip("small_gicp")
     from dopepp.parts.catalogue import pivconnector, servoholder
     from dopepp.virtual import Scene, SceneObject, make_surface, render

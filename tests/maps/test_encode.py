@@ -41,7 +41,7 @@ def by_hand(
     return beliefs, fields
 
 
-def test_maps_are_what_their_definition_says() -> None:
+def test_maps_are_what_their_definition_says():
     """Several images, objects and instances, padding, absent and off-map keypoints."""
     rng = np.random.default_rng(0)
     keypoints = rng.uniform(-30, 150, (3, 4, 9, 2))
@@ -68,7 +68,7 @@ def test_maps_are_what_their_definition_says() -> None:
         (1e30, 0),
     ],
 )
-def test_an_absent_keypoint_leaves_its_channels_empty(where: tuple[float, float]) -> None:
+def test_an_absent_keypoint_leaves_its_channels_empty(where):
     keypoints = torch.full((1, 1, 9, 2), 30.0)
     keypoints[0, 0, 8] = 60.0
     keypoints[0, 0, 2] = torch.tensor(where)
@@ -81,14 +81,14 @@ def test_an_absent_keypoint_leaves_its_channels_empty(where: tuple[float, float]
 
 
 @pytest.mark.parametrize("instances", [0, 3])
-def test_padding_or_no_instance_at_all_draws_nothing(instances: int) -> None:
+def test_padding_or_no_instance_at_all_draws_nothing(instances):
     keypoints = torch.full((2, instances, 9, 2), 30.0)
     belief, field = encode(keypoints, torch.full((2, instances), -1), 2, (12, 10), GEOMETRY)
     assert torch.equal(belief, torch.zeros(2, 18, 12, 10))
     assert torch.equal(field, torch.zeros(2, 32, 12, 10))
 
 
-def test_a_corner_on_its_centroid_has_no_direction() -> None:
+def test_a_corner_on_its_centroid_has_no_direction():
     """The centre of cell (i, j) is pixel (8j + 3.5, 8i + 3.5)."""
     keypoints = torch.tensor([43.5, 19.5]).expand(1, 1, 9, 2)
     belief, field = encode(keypoints, torch.zeros(1, 1, dtype=torch.long), 1, (6, 9), GEOMETRY)

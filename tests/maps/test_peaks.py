@@ -34,7 +34,7 @@ def positions(peaks: Peaks, channel: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
-def test_decoding_an_encoded_pose_finds_its_keypoints(sigma: float) -> None:
+def test_decoding_an_encoded_pose_finds_its_keypoints(sigma):
     """Bias under 0.1 px and 99 % of errors under 0.5 px, at the border too."""
     rng = np.random.default_rng(0)
     geometry = MapGeometry(stride=8, sigma=sigma)
@@ -70,7 +70,7 @@ def test_decoding_an_encoded_pose_finds_its_keypoints(sigma: float) -> None:
 
 
 @pytest.mark.parametrize("corner", [(0.0, 0.0), (-0.4, 29.3), (29.4, -0.3), (12.0, 29.49)])
-def test_peaks_on_the_border_are_exact(corner: tuple[float, float]) -> None:
+def test_peaks_on_the_border_are_exact(corner):
     found = positions(find_peaks(gaussians(corner), GEOMETRY))
     assert found == pytest.approx(np.array([corner]), abs=1e-3)
 
@@ -78,7 +78,7 @@ def test_peaks_on_the_border_are_exact(corner: tuple[float, float]) -> None:
 @pytest.mark.parametrize(
     "centre", [(10.5, 10.0), (10.0, 10.5), (10.5, 10.5), (0.5, 0.0), (28.5, 28.5)]
 )
-def test_equal_neighbours_are_one_peak(centre: tuple[float, float]) -> None:
+def test_equal_neighbours_are_one_peak(centre):
     belief = gaussians(centre)
     assert (belief == belief.max()).sum() >= 2
     found = positions(find_peaks(belief, GEOMETRY))
@@ -87,9 +87,7 @@ def test_equal_neighbours_are_one_peak(centre: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("height", [1.3, 2.0, 3.0])
 @pytest.mark.parametrize("sigma", [1.0, 1.5])
-def test_a_clamped_belief_has_one_peak_in_the_middle_of_its_top(
-    height: float, sigma: float
-) -> None:
+def test_a_clamped_belief_has_one_peak_in_the_middle_of_its_top(height, sigma):
     """The activation cuts beliefs off at 1; the flanks still tell where the peak is."""
     rng = np.random.default_rng(1)
     for centre in rng.uniform(5, 25, (40, 2)):
@@ -112,7 +110,7 @@ PLATEAUS = {
 
 
 @pytest.mark.parametrize("name", PLATEAUS)
-def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name: str) -> None:
+def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name):
     shape = PLATEAUS[name]
     belief = torch.zeros(1, 1, NUM_CELLS, NUM_CELLS)
     belief[0, 0, 10 : 10 + shape.shape[0], 12 : 12 + shape.shape[1]] = shape
@@ -122,7 +120,7 @@ def test_a_plateau_of_any_shape_is_one_peak_near_its_middle(name: str) -> None:
     assert np.linalg.norm(found[0] - [12 + columns.mean(), 10 + rows.mean()]) < 1.0
 
 
-def test_the_steps_of_a_coarse_number_format_are_no_peaks() -> None:
+def test_the_steps_of_a_coarse_number_format_are_no_peaks():
     """A bf16 belief has terraces on its flanks: equal neighbours below the top."""
     for sigma in (2.0, 4.0):
         belief = gaussians((14.3, 15.6), sigma=sigma).bfloat16()
@@ -132,7 +130,7 @@ def test_the_steps_of_a_coarse_number_format_are_no_peaks() -> None:
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0])
 @pytest.mark.parametrize("apart", [3.0, 3.5, 4.0, 6.0])
-def test_two_instances_do_not_pull_at_each_other(sigma: float, apart: float) -> None:
+def test_two_instances_do_not_pull_at_each_other(sigma, apart):
     rng = np.random.default_rng(2)
     geometry = MapGeometry(8, sigma)
     for first, turn in zip(
@@ -146,14 +144,14 @@ def test_two_instances_do_not_pull_at_each_other(sigma: float, apart: float) -> 
             assert 8 * np.linalg.norm(found - truth, axis=1).min() < 0.5
 
 
-def test_a_weak_peak_beside_a_strong_one() -> None:
+def test_a_weak_peak_beside_a_strong_one():
     belief = torch.maximum(gaussians((10.2, 10.4)), gaussians((14.3, 10.1), height=0.2))
     peaks = find_peaks(belief, GEOMETRY)
     assert positions(peaks) == pytest.approx(np.array([[10.2, 10.4], [14.3, 10.1]]), abs=0.06)
     assert (np.diff(peaks.score[0, 0]) <= 0).all()
 
 
-def test_noise_on_a_peak_moves_it_little() -> None:
+def test_noise_on_a_peak_moves_it_little():
     rng = torch.Generator().manual_seed(0)
     belief = gaussians((14.3, 15.6)) + 0.02 * torch.randn(
         1, 200, NUM_CELLS, NUM_CELLS, generator=rng
@@ -164,7 +162,7 @@ def test_noise_on_a_peak_moves_it_little() -> None:
     assert 8 * np.sqrt((error**2).mean()) < 0.15
 
 
-def test_the_strongest_above_the_threshold_fill_the_slots() -> None:
+def test_the_strongest_above_the_threshold_fill_the_slots():
     heights = [0.3, 0.9, 0.5, 0.7]
     maps = [gaussians((5.0 + 6 * k, 15.0), height=h) for k, h in enumerate(heights)]
     belief = torch.cat([torch.stack(maps).amax(0), gaussians((9.0, 9.0), height=0.6)], dim=1)
@@ -179,12 +177,12 @@ def test_the_strongest_above_the_threshold_fill_the_slots() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_constant_map_of_nothing_has_no_peak(value: float) -> None:
+def test_a_constant_map_of_nothing_has_no_peak(value):
     peaks = find_peaks(torch.full((2, 9, 8, 8), value), GEOMETRY)
     assert not peaks.found.any()
 
 
-def test_beliefs_of_any_size() -> None:
+def test_beliefs_of_any_size():
     """An identity activation does not bound beliefs; the fit must not care."""
     for height in (1e3, 1e15):
         found = positions(find_peaks(gaussians((14.3, 15.6), height=height), GEOMETRY))
@@ -192,7 +190,7 @@ def test_beliefs_of_any_size() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3)])
-def test_tiny_maps(size: tuple[int, int]) -> None:
+def test_tiny_maps(size):
     peaks = find_peaks(
         torch.rand(3, 2, *size, generator=torch.Generator().manual_seed(0)), GEOMETRY
     )
@@ -200,7 +198,7 @@ def test_tiny_maps(size: tuple[int, int]) -> None:
     assert np.isfinite(peaks.position[peaks.found]).all()
 
 
-def test_random_maps_never_give_a_position_that_is_none() -> None:
+def test_random_maps_never_give_a_position_that_is_none():
     rng = torch.Generator().manual_seed(3)
     belief = torch.rand(4, 9, 20, 20, generator=rng)
     belief[0] = (belief[0] > 0.5).float()
@@ -216,7 +214,7 @@ def test_random_maps_never_give_a_position_that_is_none() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_a_blurred_peak_tells_its_covariance(noise: float) -> None:
+def test_a_blurred_peak_tells_its_covariance(noise):
     """Target variance off, the rest is Σ with its xy term; noise of the map alone adds little."""
     rng, generator = np.random.default_rng(5), torch.Generator().manual_seed(5)
     y, x = np.mgrid[:NUM_CELLS, :NUM_CELLS]
@@ -234,7 +232,7 @@ def test_a_blurred_peak_tells_its_covariance(noise: float) -> None:
         assert_allclose(found, covariance, atol=1e-4 if noise == 0 else 0.25)
 
 
-def test_the_vector_is_the_mean_of_its_disc() -> None:
+def test_the_vector_is_the_mean_of_its_disc():
     rng, generator = np.random.default_rng(6), torch.Generator().manual_seed(6)
     keypoints = torch.tensor(rng.uniform(20, 220, (40, 1, 9, 2)))
     belief, field = encode(

@@ -37,9 +37,7 @@ def finite_median(values: np.ndarray, axis: int = -1) -> np.ndarray:
     ("name", "reference", "confidence"),
     [("mean", np.mean, 0.8), ("mean", np.mean, 0.99), ("median", finite_median, 0.95)],
 )
-def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(  # type: ignore[no-untyped-def]
-    name, reference, confidence
-) -> None:
+def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(name, reference, confidence):
     rng = np.random.default_rng(11)
     mine, other = rng.gamma(2, 5, 121), rng.gamma(2, 6, 121)
     mine = 0.6 * mine + 0.4 * other
@@ -58,7 +56,7 @@ def test_with_one_seed_it_is_scipys_paired_percentile_bootstrap(  # type: ignore
     assert found.high == pytest.approx(expected.high, abs=0.04 * width)
 
 
-def test_seeds_and_instances_add_their_variances() -> None:
+def test_seeds_and_instances_add_their_variances():
     """Crossed resampling of S seeds and N instances: the closed form of its variance."""
     rng = np.random.default_rng(3)
     num_seeds, num = 12, 400
@@ -90,11 +88,11 @@ def covered(few_seeds: bool, num_seeds: int, trials: int = 150) -> float:
 
 
 @pytest.mark.parametrize("num_seeds", [2, 3, 5])
-def test_few_seeds_are_not_believed_too_much(num_seeds: int) -> None:
+def test_few_seeds_are_not_believed_too_much(num_seeds):
     assert covered(True, num_seeds) > 0.9
 
 
-def test_without_stretching_three_seeds_are() -> None:
+def test_without_stretching_three_seeds_are():
     """Of three seeds, plain resamples never leave their range: ¼ of all intervals is wrong."""
     assert covered(False, 3) < 0.88
 
@@ -104,9 +102,7 @@ def test_without_stretching_three_seeds_are() -> None:
     seed=st.integers(0, 10_000), num=st.integers(1, 30), seeds=st.integers(1, 3),
     name=st.sampled_from(["mean", "median"]), same=st.booleans(),
 )  # fmt: skip
-def test_the_methods_change_places_and_the_interval_its_sign(
-    seed: int, num: int, seeds: int, name: str, same: bool
-) -> None:
+def test_the_methods_change_places_and_the_interval_its_sign(seed, num, seeds, name, same):
     rng = np.random.default_rng(seed)
     mine, other = rng.integers(0, 4, (2, seeds, num)).astype(float)
     options = {"same_seeds": True, "num_resamples": 200, "seed": seed}
@@ -125,14 +121,14 @@ def test_the_methods_change_places_and_the_interval_its_sign(
 
 @settings(max_examples=60, deadline=None)
 @given(values=st.lists(st.floats(0, 180) | st.just(np.inf) | st.just(np.nan), min_size=1))
-def test_the_median_is_of_what_is_finite(values: list[float]) -> None:
+def test_the_median_is_of_what_is_finite(values):
     finite = [value for value in values if np.isfinite(value)]
     result = STATISTICS["median"](np.array([values, values]))
     expected = np.median(finite) if finite else np.nan
     np.testing.assert_allclose(result, [expected, expected], rtol=1e-12)
 
 
-def test_a_median_over_misses_does_not_exist() -> None:
+def test_a_median_over_misses_does_not_exist():
     hit, missed = np.full((1, 9), 5.0), np.full((1, 9), np.inf)
     assert paired_difference([hit], [missed], "median") is None
     # Nor that of the whole, where one of several seeds has found nothing.
@@ -140,7 +136,7 @@ def test_a_median_over_misses_does_not_exist() -> None:
     assert paired_difference([half], [np.concatenate([hit, hit])], "median") is None
 
 
-def test_resamples_without_a_hit_are_left_out() -> None:
+def test_resamples_without_a_hit_are_left_out():
     mine = np.array([[3.0, np.inf, np.inf, np.inf]])
     found = difference([mine], [np.full((1, 4), 5.0)], "median", num_resamples=500)
     assert (found.value, found.low, found.high) == (-2, -2, -2)
@@ -148,7 +144,7 @@ def test_resamples_without_a_hit_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("num", [1, 5, 6])
-def test_fewer_than_six_differing_instances_prove_nothing(num: int) -> None:
+def test_fewer_than_six_differing_instances_prove_nothing(num):
     other = np.zeros((1, 50))
     mine = other.copy()
     mine[0, :num] = 1
@@ -160,13 +156,13 @@ def test_fewer_than_six_differing_instances_prove_nothing(num: int) -> None:
     assert one.within_noise
 
 
-def test_the_sign_test_says_how_many() -> None:
+def test_the_sign_test_says_how_many():
     for confidence in (0.5, 0.8, 0.95, 0.99, 0.999):
         fewest = fewest_differing(confidence)
         assert 2 * 0.5**fewest <= 1 - confidence + 1e-12 < 2 * 0.5 ** (fewest - 1) + 1e-12
 
 
-def test_several_objects_count_alike() -> None:
+def test_several_objects_count_alike():
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 2, 30)), rng.random((2, 2, 300))
     found = difference([a[0], b[0]], [a[1], b[1]])
@@ -176,7 +172,7 @@ def test_several_objects_count_alike() -> None:
     assert found.high - found.low < alone.high - alone.low
 
 
-def test_pairs_of_seeds_cancel_what_they_share() -> None:
+def test_pairs_of_seeds_cancel_what_they_share():
     rng = np.random.default_rng(4)
     shared = rng.normal(0, 1, (4, 1))
     mine, other = shared + 0.2 + rng.normal(0, 0.01, (2, 4, 100))
@@ -206,7 +202,7 @@ PASSES = np.array([[0.0, 1.0, 1.0]])
         ([PASSES], [PASSES], {"num_resamples": 0}, "num_resamples=0"),
     ],
 )
-def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, message) -> None:  # type: ignore[no-untyped-def]
+def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, message):
     with pytest.raises(UserError, match=message):
         paired_difference(mine, baseline, **options)
 
@@ -218,9 +214,7 @@ def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, options, messa
     noise=st.floats(0, 0.02),
     seeds=st.integers(2, 6),
 )
-def test_as_many_seeds_as_it_says_tell_a_difference(
-    gain: float, spread: float, noise: float, seeds: int
-) -> None:
+def test_as_many_seeds_as_it_says_tell_a_difference(gain, spread, noise, seeds):
     """Of a known spread over seeds and images, the interval with so many just leaves out 0."""
     rng = np.random.default_rng(4)
     over_seeds, over_images = rng.normal(size=seeds), rng.normal(size=50)
@@ -241,7 +235,7 @@ def test_as_many_seeds_as_it_says_tell_a_difference(
         assert asked == seeds + 1 or reach(asked - 1) >= gain * (1 - 1e-9)
 
 
-def test_too_few_images_are_not_made_up_for_by_seeds() -> None:
+def test_too_few_images_are_not_made_up_for_by_seeds():
     mine, other = np.zeros((3, 10)), np.zeros((3, 10))
     mine[:, 0] = 1
     assert seeds_to_tell([mine], [other]) == np.inf

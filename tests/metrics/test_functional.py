@@ -55,7 +55,7 @@ def placed(R: Tensor, t: Tensor, points: Tensor) -> Array:
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_add_equals_the_loop(near: bool) -> None:
+def test_add_equals_the_loop(near):
     R_est, t_est, R_gt, t_gt = poses(7, 1, near)
     points = cloud(50)
     difference = placed(R_est, t_est, points) - placed(R_gt, t_gt, points)
@@ -63,7 +63,7 @@ def test_add_equals_the_loop(near: bool) -> None:
     np.testing.assert_allclose(add(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL)
 
 
-def test_add_s_runs_from_true_points_to_estimated_ones() -> None:
+def test_add_s_runs_from_true_points_to_estimated_ones():
     # Points 0 and 1 on a line, the estimate shrunk to one end: true point 1 is 1 away from it,
     # while seen from the estimate every point would lie on a true one.
     points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_add_s_runs_from_true_points_to_estimated_ones() -> None:
     assert add_s(0 * eye, zero, eye, zero, points).item() == pytest.approx(0.5, rel=REL)
 
 
-def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_change_nothing(monkeypatch):
     pose, points = poses(9, 4), cloud(64)
     whole = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
     monkeypatch.setattr("dopepp.metrics.functional.inputs._CHUNK_POINTS", 128)
@@ -85,7 +85,7 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     arrays(np.float64, 3, elements=st.floats(-4, 4)),
 )
 @settings(deadline=None, max_examples=40)
-def test_a_pure_translation_is_its_own_length(shift: Array, rotvec: Array) -> None:
+def test_a_pure_translation_is_its_own_length(shift, rotvec):
     R = torch.from_numpy(Rotation.from_rotvec(rotvec).as_matrix())[None]
     t = torch.tensor([[0.1, -0.2, 0.9]], dtype=torch.float64)
     moved = t + torch.from_numpy(shift)
@@ -95,7 +95,7 @@ def test_a_pure_translation_is_its_own_length(shift: Array, rotvec: Array) -> No
     assert add_s(R, moved, R, t, cloud(20)).item() <= add(R, moved, R, t, cloud(20)).item() + 1e-15
 
 
-def test_reprojection_error_equals_opencv() -> None:
+def test_reprojection_error_equals_opencv():
     R_est, t_est, R_gt, t_gt = poses(5, 6)
     points = cloud(40)
     camera = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
@@ -114,7 +114,7 @@ def test_reprojection_error_equals_opencv() -> None:
     torch.testing.assert_close(reprojection_error(R_est, t_est, R_gt, t_gt, points, each), result)
 
 
-def test_a_point_behind_the_camera_makes_the_reprojection_infinite() -> None:
+def test_a_point_behind_the_camera_makes_the_reprojection_infinite():
     R, t, _, _ = poses(2, 7)
     behind = t * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
     errors = reprojection_error(R, behind, R, t, cloud(5), K)
@@ -126,7 +126,7 @@ def test_a_point_behind_the_camera_makes_the_reprojection_infinite() -> None:
 @example(math.pi, np.array([0.0, 1, 0]), 0)
 @given(st.floats(0, math.pi), arrays(np.float64, 3, elements=st.floats(-1, 1)), st.integers(0, 99))
 @settings(deadline=None, max_examples=60)
-def test_rotation_error_equals_scipy(angle: float, axis: Array, seed: int) -> None:
+def test_rotation_error_equals_scipy(angle, axis, seed):
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-3 else np.array([1.0, 0, 0])
     base = Rotation.random(random_state=seed)
     turned = Rotation.from_rotvec(angle * axis) * base
@@ -140,7 +140,7 @@ def test_rotation_error_equals_scipy(angle: float, axis: Array, seed: int) -> No
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("which", range(4))
-def test_a_pose_that_is_not_finite_is_a_miss(bad: float, which: int) -> None:
+def test_a_pose_that_is_not_finite_is_a_miss(bad, which):
     pose = [tensor.clone() for tensor in poses(3, 8)]
     pose[which][1] = bad
     for errors in (
@@ -154,7 +154,7 @@ def test_a_pose_that_is_not_finite_is_a_miss(bad: float, which: int) -> None:
     assert single[which % 2][1] == math.inf
 
 
-def test_no_poses_have_no_errors() -> None:
+def test_no_poses_have_no_errors():
     none = torch.empty(0, 3, 3), torch.empty(0, 3), torch.empty(0, 3, 3), torch.empty(0, 3)
     K = torch.eye(3)
     for errors in (
@@ -176,9 +176,7 @@ def test_no_poses_have_no_errors() -> None:
         (poses(1, 0), cloud(3)[0], "points must be (V, 3) with V >= 1"),
     ],
 )
-def test_wrong_shapes_are_refused(
-    pose: tuple[Tensor, Tensor, Tensor, Tensor], points: Tensor, message: str
-) -> None:
+def test_wrong_shapes_are_refused(pose, points, message):
     for error in (add, add_s):
         with pytest.raises(ValueError, match=re.escape(message)):
             error(*pose, points)
@@ -186,7 +184,7 @@ def test_wrong_shapes_are_refused(
         reprojection_error(*poses(3, 0), cloud(3), torch.eye(3).expand(2, 3, 3))
 
 
-def test_single_precision_inputs_are_computed_in_double() -> None:
+def test_single_precision_inputs_are_computed_in_double():
     pose = poses(3, 9)
     rounded = [tensor.float() for tensor in pose]
     result = add(*rounded, cloud(10).float())

@@ -87,7 +87,7 @@ def run_rank(rank: int, folder: Path) -> None:
 
 
 @pytest.mark.ddp
-def test_two_processes_give_the_numbers_of_one(tmp_path: Path) -> None:
+def test_two_processes_give_the_numbers_of_one(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-W", "ignore", __file__]
     ranks = [

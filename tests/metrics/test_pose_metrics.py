@@ -51,7 +51,7 @@ def truth(name: str, T: Array, visible: float = 1.0) -> Instance:
 K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
 
 
-def test_rows_agree_with_the_functions() -> None:
+def test_rows_agree_with_the_functions():
     """Of a part with a symmetry, on images of two sizes; most poses are turned by it."""
     rng = np.random.default_rng(3)
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -120,9 +120,7 @@ BAD = [np.full((4, 4), bad) for bad in (math.nan, math.inf)]
         ([(0.9, BAD[1])], math.inf, (1, 0, 1)),
     ],
 )
-def test_what_stands_for_an_instance(
-    found: list[tuple[float, Array]], error: float, counts: tuple[float, ...]
-) -> None:
+def test_what_stands_for_an_instance(found, error, counts):
     metric = PoseMetrics([part("box")])
     metric.update([Detection("box", score, T) for score, T in found], [truth("box", pose())])
     row = metric.compute()["box"]
@@ -131,7 +129,7 @@ def test_what_stands_for_an_instance(
     assert not any(isinstance(v, float) and math.isnan(v) for v in row.to_record().values())
 
 
-def test_the_distance_is_taken_between_centres_not_origins() -> None:
+def test_the_distance_is_taken_between_centres_not_origins():
     # The origin lies half a metre beside the part: a small turn moves the centre out of reach.
     points = np.random.default_rng(0).uniform([0.45, -0.05, -0.05], [0.55, 0.05, 0.05], (50, 3))
     far = Part("far", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
@@ -140,7 +138,7 @@ def test_the_distance_is_taken_between_centres_not_origins() -> None:
     assert metric.compute()["far"].miss_rate == 1
 
 
-def test_an_instance_hardly_visible_neither_counts_nor_makes_a_false_positive() -> None:
+def test_an_instance_hardly_visible_neither_counts_nor_makes_a_false_positive():
     metric = PoseMetrics([part("box")])
     hidden = truth("box", pose(0.3), visible=0.0999)
     metric.update([Detection("box", 0.9, pose(0.3))], [truth("box", pose(0), 0.1), hidden])
@@ -151,7 +149,7 @@ def test_an_instance_hardly_visible_neither_counts_nor_makes_a_false_positive() 
     assert metric.compute()["box"].false_positives == 1
 
 
-def test_an_instance_that_counts_is_matched_before_a_hidden_one() -> None:
+def test_an_instance_that_counts_is_matched_before_a_hidden_one():
     metric = PoseMetrics([part("box")])
     metric.update(
         [Detection("box", 0.9, pose(0.01))],
@@ -160,7 +158,7 @@ def test_an_instance_that_counts_is_matched_before_a_hidden_one() -> None:
     assert metric.errors("box") == pytest.approx([0.01])
 
 
-def test_objects_do_not_match_each_other() -> None:
+def test_objects_do_not_match_each_other():
     metric = PoseMetrics([part("a"), part("b")])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()
@@ -168,19 +166,19 @@ def test_objects_do_not_match_each_other() -> None:
     assert (rows["b"].num_instances, rows["b"].miss_rate) == (1, 1)
 
 
-def test_a_detection_of_an_unknown_object_is_refused() -> None:
+def test_a_detection_of_an_unknown_object_is_refused():
     metric = PoseMetrics([part("a"), part("b")])
     with pytest.raises(UserError, match="got a detection of 'c'; allowed: the scored parts a, b"):
         metric.update([Detection("c", 1, pose())], [])
 
 
 @pytest.mark.parametrize("names", [[], ["a", "a"], ["a", "mean"]])
-def test_parts_must_have_names_of_their_own(names: list[str]) -> None:
+def test_parts_must_have_names_of_their_own(names):
     with pytest.raises(UserError, match="one or more parts of different names"):
         PoseMetrics([part(name) for name in names])
 
 
-def test_all_missed_gives_zero_and_no_nan() -> None:
+def test_all_missed_gives_zero_and_no_nan():
     metric = PoseMetrics([part("box")])
     for _ in range(3):
         metric.update([], [truth("box", pose())])
@@ -192,14 +190,14 @@ def test_all_missed_gives_zero_and_no_nan() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
-def test_nothing_at_all_is_not_available() -> None:
+def test_nothing_at_all_is_not_available():
     metric = PoseMetrics([part("a"), part("b")])
     for row in metric.compute().values():
         assert row == PoseRow(row.object, "estimate", num_instances=0, false_positives=0)
     assert metric.errors("a").shape == (0,)
 
 
-def test_an_object_without_ground_truth_stays_out_of_the_mean() -> None:
+def test_an_object_without_ground_truth_stays_out_of_the_mean():
     metric = PoseMetrics([part("a"), part("b"), part("c")])
     metric.update(
         [Detection("a", 1, pose()), Detection("c", 1, pose())],
@@ -215,7 +213,7 @@ def test_an_object_without_ground_truth_stays_out_of_the_mean() -> None:
     assert json.loads(json.dumps(rows["c"].to_record(), allow_nan=False))["add_01d"] is None
 
 
-def test_reset_pickle_and_copy() -> None:
+def test_reset_pickle_and_copy():
     metric = PoseMetrics([part("box")])
     metric.update([Detection("box", 0.9, pose(0.01))], [truth("box", pose())])
     for twin in (copy.deepcopy(metric), pickle.loads(pickle.dumps(metric))):
@@ -226,7 +224,7 @@ def test_reset_pickle_and_copy() -> None:
     assert metric.errors("box").tolist() == [math.inf]
 
 
-def test_references_use_the_instances_that_count() -> None:
+def test_references_use_the_instances_that_count():
     metric = PoseMetrics([part("a"), part("b")])
     for angle in (0.0, 0.1, 0.2):
         metric.update([], [truth("a", pose(0, (0, 0, angle))), truth("a", pose(0.3), 0.01)])
@@ -238,7 +236,7 @@ def test_references_use_the_instances_that_count() -> None:
         assert rows[MEAN].add_01d == rows["a"].add_01d
 
 
-def test_the_corners_of_the_mesh_count_where_there_is_one() -> None:
+def test_the_corners_of_the_mesh_count_where_there_is_one():
     vertices = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0]])
     box = replace(part("box"), mesh=Mesh(vertices, np.array([[0, 1, 2]], np.int32)))
     metric = PoseMetrics([box])
@@ -246,7 +244,7 @@ def test_the_corners_of_the_mesh_count_where_there_is_one() -> None:
     assert metric.errors("box", "mssd") == pytest.approx([2 * np.sin(0.1) * 0.1])
 
 
-def test_mspd_needs_every_camera() -> None:
+def test_mspd_needs_every_camera():
     metric = PoseMetrics([part("box")])
     metric.update([Detection("box", 1, pose())], [truth("box", pose())], K, 640)
     assert metric.compute()["box"].ar_mspd == 1
@@ -257,7 +255,7 @@ def test_mspd_needs_every_camera() -> None:
             metric.update([], [], camera, width)
 
 
-def test_average_precision_by_hand() -> None:
+def test_average_precision_by_hand():
     def run(found: list[tuple[float, float | None]], missed: int = 0) -> float | None:
         """Give (score, error in metres, or None for a stray), a picture each."""
         metric = PoseMetrics([part("box")])
@@ -282,7 +280,7 @@ def test_average_precision_by_hand() -> None:
     assert run([], missed=2) == 0
 
 
-def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not() -> None:
+def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not():
     metric = PoseMetrics([part("box")])
     twice = [Detection("box", s, pose()) for s in (0.9, 0.8)]
     metric.update(twice, [truth("box", pose())])
@@ -294,7 +292,7 @@ def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not() -> 
     assert metric.compute()["box"].average_precision == pytest.approx(expected)
 
 
-def test_plot_shows_one_curve_per_object() -> None:
+def test_plot_shows_one_curve_per_object():
     metric = PoseMetrics([part("a"), part("b")], method="DOPE++")
     metric.update([Detection("a", 1, pose(0.05))], [truth("a", pose()), truth("b", pose())])
     figure, axes = metric.plot()

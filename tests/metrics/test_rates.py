@@ -48,7 +48,7 @@ ERRORS = st.lists(
 
 @given(ERRORS)
 @settings(deadline=None, max_examples=80)
-def test_auc_equals_loops(errors: list[float]) -> None:
+def test_auc_equals_loops(errors):
     values = torch.tensor(errors, dtype=torch.float64)
     exact = sum(min(max(1 - e / 0.1, 0), 1) for e in errors) / max(len(errors), 1)
     assert auc(values, 0.1) == pytest.approx(exact, rel=REL, abs=1e-15)
@@ -61,19 +61,19 @@ def test_auc_equals_loops(errors: list[float]) -> None:
 
 @pytest.mark.parametrize("method", ["exact", "voc"])
 @pytest.mark.parametrize("errors", [[], [math.inf, math.inf], [math.nan], [0.3]])
-def test_auc_without_a_hit_is_zero(method: str, errors: list[float]) -> None:
+def test_auc_without_a_hit_is_zero(method, errors):
     values = torch.tensor(errors, dtype=torch.float64)
     assert auc(values, 0.1, method) == 0.0  # type: ignore[arg-type]
 
 
-def test_auc_refuses_other_methods_and_empty_ranges() -> None:
+def test_auc_refuses_other_methods_and_empty_ranges():
     with pytest.raises(UserError, match="got auc method 'coco'; allowed: exact, voc"):
         auc(torch.zeros(1), 0.1, "coco")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="got max_threshold=0"):
         auc(torch.zeros(1), 0)
 
 
-def test_pass_rate_is_strict_and_misses_count() -> None:
+def test_pass_rate_is_strict_and_misses_count():
     errors = torch.tensor([0.0, 0.05, 0.1, math.inf, math.nan], dtype=torch.float64)
     assert pass_rate(errors, 0.05) == 0.2
     assert pass_rate(errors, 0.1) == 0.4
@@ -81,13 +81,13 @@ def test_pass_rate_is_strict_and_misses_count() -> None:
     assert pass_rate(errors[3:], 0.1) == 0.0
 
 
-def test_match_breaks_ties_by_order_and_includes_the_limit() -> None:
+def test_match_breaks_ties_by_order_and_includes_the_limit():
     assert match(torch.ones(2), torch.full((2, 2), 0.1, dtype=torch.float64)).tolist() == [0, 1]
     assert match(torch.ones(1), torch.tensor([[0.1000001]])).tolist() == [-1]
     assert match(torch.ones(1), torch.tensor([[0.02, 0.02]])).tolist() == [0]
 
 
-def test_match_of_nothing_and_of_nan() -> None:
+def test_match_of_nothing_and_of_nan():
     assert match(torch.empty(0), torch.empty(0, 3)).tolist() == []
     assert match(torch.ones(2), torch.empty(2, 0)).tolist() == [-1, -1]
     nan = torch.tensor([[math.nan, 0.02], [0.01, math.nan]])
@@ -98,7 +98,7 @@ def test_match_of_nothing_and_of_nan() -> None:
 
 @given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
 @settings(deadline=None, max_examples=60)
-def test_match_equals_a_plain_loop(p: int, g: int, seed: int) -> None:
+def test_match_equals_a_plain_loop(p, g, seed):
     rng = np.random.default_rng(seed)
     scores, distances = rng.random(p), rng.uniform(0, 0.2, (p, g))
     expected, taken = [-1] * p, set()
@@ -128,7 +128,7 @@ def loop_average_precision(scores: Array, correct: NDArray[np.bool_], instances:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 100_000), count=st.integers(1, 40))
-def test_average_precision_is_its_definition(seed: int, count: int) -> None:
+def test_average_precision_is_its_definition(seed, count):
     rng = np.random.default_rng(seed)
     scores = rng.integers(0, 10, count) / 10.0
     correct = rng.random(count) < 0.6
@@ -138,7 +138,7 @@ def test_average_precision_is_its_definition(seed: int, count: int) -> None:
     assert result == pytest.approx(expected, abs=1e-12)
 
 
-def test_average_precision_at_the_ends() -> None:
+def test_average_precision_at_the_ends():
     none = torch.zeros(0)
     assert average_precision(none, none.bool(), 3) == 0.0
     assert average_precision(torch.ones(2), torch.zeros(2, dtype=torch.bool), 0) == 0.0
@@ -151,7 +151,7 @@ def test_average_precision_at_the_ends() -> None:
         average_precision(torch.ones(3), torch.ones(2, dtype=torch.bool), 2)
 
 
-def test_average_recall_is_the_mean_of_strict_pass_rates() -> None:
+def test_average_recall_is_the_mean_of_strict_pass_rates():
     errors = torch.tensor([0.05, 0.07, 0.3, torch.inf, torch.nan])
     rates = [pass_rate(errors, threshold) for threshold in BOP_THRESHOLDS]
     assert rates[0] == 0.0
@@ -168,7 +168,7 @@ def test_average_recall_is_the_mean_of_strict_pass_rates() -> None:
     counts=st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
     confidence=st.floats(0.5, 0.999),
 )
-def test_wilsons_interval_is_scipys(counts: tuple[int, int], confidence: float) -> None:
+def test_wilsons_interval_is_scipys(counts, confidence):
     passed, num = counts
     low, high = wilson_interval(passed, num, confidence)
     if num == 0:  # without trials the rate is unknown
@@ -180,14 +180,14 @@ def test_wilsons_interval_is_scipys(counts: tuple[int, int], confidence: float) 
 
 
 @pytest.mark.parametrize("arguments", [(-1, 2), (3, 2), (1, 2, 0.0), (1, 2, 1.0)])
-def test_impossible_counts_are_refused(arguments: tuple[int, ...]) -> None:
+def test_impossible_counts_are_refused(arguments):
     with pytest.raises(ValueError, match=f"passed={arguments[0]}"):
         wilson_interval(*arguments)
 
 
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 60), bins=st.integers(1, 20))
-def test_calibration_error_is_its_definition(seed: int, count: int, bins: int) -> None:
+def test_calibration_error_is_its_definition(seed, count, bins):
     rng = np.random.default_rng(seed)
     scores, correct = rng.integers(0, 41, count) / 40, rng.random(count) < 0.5
     expected = 0.0
@@ -201,7 +201,7 @@ def test_calibration_error_is_its_definition(seed: int, count: int, bins: int) -
     assert result == pytest.approx(expected, abs=1e-12)
 
 
-def test_calibration_error_at_the_ends_and_of_mistakes() -> None:
+def test_calibration_error_at_the_ends_and_of_mistakes():
     none = torch.zeros(0)
     assert expected_calibration_error(none, none.bool()) == 0.0
     assert expected_calibration_error(torch.ones(3), torch.ones(3, dtype=torch.bool)) == 0.0

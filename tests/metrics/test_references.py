@@ -36,7 +36,7 @@ def poses(rotations: Rotation) -> Array:
 
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 @pytest.mark.parametrize("reference", [CHANCE_ALL, CHANCE_RANGE])
-def test_chance_over_all_rotations_has_the_closed_form(reference: str, offset: float) -> None:
+def test_chance_over_all_rotations_has_the_closed_form(reference, offset):
     T = poses(Rotation.random(400, random_state=0))
     row = reference_rows(dumbbell(offset), T)[reference]
     # P(|Qp − p| < e) = e² / (4·r²) with r = 5 cm; four standard errors of 2,000 draws.
@@ -52,7 +52,7 @@ def test_chance_over_all_rotations_has_the_closed_form(reference: str, offset: f
     assert (row.ar_mspd, row.average_precision) == (None, None)
 
 
-def test_a_test_set_of_one_orientation_is_solved_by_a_constant() -> None:
+def test_a_test_set_of_one_orientation_is_solved_by_a_constant():
     T = poses(Rotation.from_rotvec(np.tile([0.3, 0.2, 0.1], (50, 1))))
     rows = reference_rows(plate(), T)
     for reference in (CHANCE_RANGE, BEST_CONSTANT):
@@ -61,7 +61,7 @@ def test_a_test_set_of_one_orientation_is_solved_by_a_constant() -> None:
     assert rows[CHANCE_ALL].add_01d < 0.05  # type: ignore[operator]
 
 
-def test_two_orientations_are_half_known_to_the_best_constant() -> None:
+def test_two_orientations_are_half_known_to_the_best_constant():
     angles = np.array([0.0] * 30 + [np.pi / 2] * 10)
     T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
     rows = reference_rows(plate(), T)
@@ -70,7 +70,7 @@ def test_two_orientations_are_half_known_to_the_best_constant() -> None:
     assert rows[CHANCE_RANGE].add_01d == pytest.approx(960 / 1560)
 
 
-def test_the_mean_orientation_is_tried_too() -> None:
+def test_the_mean_orientation_is_tried_too():
     # ADD of a turn by a about z is 2·sin(a/2)·mean radius (2.9 cm): ±20° is right from 0° only.
     angles = np.radians([-20.0] * 5 + [20.0] * 5)
     T = poses(Rotation.from_rotvec(angles[:, None] * np.array([0, 0, 1.0])))
@@ -79,7 +79,7 @@ def test_the_mean_orientation_is_tried_too() -> None:
     assert rows[BEST_CONSTANT].median_rotation_deg == pytest.approx(20)
 
 
-def test_rows_depend_on_the_seed_only() -> None:
+def test_rows_depend_on_the_seed_only():
     T = poses(Rotation.random(60, random_state=1))
     rows = reference_rows(plate(), T, seed=3)
     assert rows == reference_rows(plate(), T[::-1], seed=3)
@@ -89,7 +89,7 @@ def test_rows_depend_on_the_seed_only() -> None:
         assert (row.miss_rate, row.precision, row.false_positives) == (None, None, None)
 
 
-def test_without_instances_and_with_a_single_one() -> None:
+def test_without_instances_and_with_a_single_one():
     for row in reference_rows(plate(), np.empty((0, 4, 4))).values():
         assert (row.num_instances, row.add_01d) == (0, None)
     rows = reference_rows(plate(), poses(Rotation.random(1, random_state=0)))
@@ -98,7 +98,7 @@ def test_without_instances_and_with_a_single_one() -> None:
     assert rows[BEST_CONSTANT].add_01d == 1.0
 
 
-def test_symmetries_hold_wherever_the_origin_lies() -> None:
+def test_symmetries_hold_wherever_the_origin_lies():
     """A half turn about the dumbbell's own centre, which the origin is far from."""
     centre = np.array([1.0, 1.0, 1.0])
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -58,9 +58,7 @@ def pixels(points: Array) -> Array:
     turning=st.sampled_from([None, (0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]),
     is_near=st.booleans(),
 )
-def test_mssd_and_mspd_are_their_formulas(
-    seed: int, count: int, turning: tuple[float, float, float] | None, is_near: bool
-) -> None:
+def test_mssd_and_mspd_are_their_formulas(seed, count, turning, is_near):
     """Also where most symmetries are left out early, because others are surely nearer."""
     axes = [(turning, (0.01, 0.0, 0.0))] if turning else []
     group = symmetry_group(half_turn()[None], axes, 0.2)
@@ -85,14 +83,14 @@ def test_mssd_and_mspd_are_their_formulas(
     np.testing.assert_allclose(found[1], image, rtol=1e-9, atol=1e-9)
 
 
-def test_mspd_ignores_the_last_row_of_k() -> None:
+def test_mspd_ignores_the_last_row_of_k():
     arguments = tensors(*poses(5, 0), cloud(20))
     odd = torch.from_numpy(K).clone()
     odd[2] = torch.tensor([0.1, 0.2, 2.0])
     np.testing.assert_array_equal(mspd(*arguments, odd), mspd(*arguments, torch.from_numpy(K)))
 
 
-def test_symmetries_are_taken_as_they_are() -> None:
+def test_symmetries_are_taken_as_they_are():
     R, t = torch.eye(3).double()[None], torch.tensor([[0.0, 0.0, 1.0]])
     only_half_turn = torch.from_numpy(half_turn()[None])
     assert float(mssd(R, t, R, t, torch.from_numpy(cloud(9)), only_half_turn)[0]) > 0.01
@@ -103,7 +101,7 @@ def test_symmetries_are_taken_as_they_are() -> None:
             mssd(R, t, R, t, torch.from_numpy(cloud(9)), wrong)
 
 
-def test_misses_are_infinite_and_behind_the_camera_is_a_miss() -> None:
+def test_misses_are_infinite_and_behind_the_camera_is_a_miss():
     R_est, t_est, R_gt, t_gt = tensors(*poses(3, 3))
     points = torch.from_numpy(cloud(10))
     t_est[0], t_est[1, 2] = torch.nan, -1.0
@@ -118,7 +116,7 @@ def test_misses_are_infinite_and_behind_the_camera_is_a_miss() -> None:
     count=st.sampled_from([1, 2, 7, 8, 9, 16, 17, 33, 200, 1000]),
     scale=st.floats(0.5, 2.0),
 )
-def test_add_s_is_exact_for_any_matrix(seed: int, count: int, scale: float) -> None:
+def test_add_s_is_exact_for_any_matrix(seed, count, scale):
     """Rotations, scaled ones, skewed ones, and one that is flat."""
     R_est, t_est, R_gt, t_gt = poses(5, seed)
     R_est[1] *= scale
@@ -138,7 +136,7 @@ def test_add_s_is_exact_for_any_matrix(seed: int, count: int, scale: float) -> N
     np.testing.assert_allclose(pairs, expected, rtol=1e-9, atol=1e-15)
 
 
-def test_group_of_a_can() -> None:
+def test_group_of_a_can():
     """A can: any turn about its axis, and upside down. The axis misses the origin."""
     axis_point = np.array([0.02, -0.01, 0.0])
     upside_down = np.eye(4)
@@ -160,7 +158,7 @@ def test_group_of_a_can() -> None:
     assert np.abs(group - product).max(axis=(1, 2)).min() < 1e-12
 
 
-def test_a_bad_axis_or_step_is_refused() -> None:
+def test_a_bad_axis_or_step_is_refused():
     with pytest.raises(ValueError, match="axis of symmetry"):
         symmetry_group(None, [((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
     with pytest.raises(ValueError, match="max_step"):

@@ -169,7 +169,7 @@ def test_arguments_are_checked(arguments):
 
 
 @pytest.mark.parametrize("loss", [MapMSE(), SpatialCrossEntropy(1.0, field_weight=0.2)])
-def test_losses_of_the_images_have_the_loss_as_their_mean(loss) -> None:
+def test_losses_of_the_images_have_the_loss_as_their_mean(loss):
     generator = torch.Generator().manual_seed(3)
     belief, field = torch.rand(4, 9, 8, 8, generator=generator), torch.zeros(4, 16, 8, 8)
     field[:, :, 2:5, 2:5] = 0.7
@@ -181,7 +181,7 @@ def test_losses_of_the_images_have_the_loss_as_their_mean(loss) -> None:
     assert images.mean().item() == pytest.approx(loss(stages, belief, field)[0].item(), rel=1e-5)
 
 
-def test_an_image_is_charged_for_itself_alone() -> None:
+def test_an_image_is_charged_for_itself_alone():
     belief, field = torch.rand(3, 9, 8, 8), torch.ones(3, 16, 8, 8)
     wrong = belief.clone()
     wrong[1] += 0.5

@@ -80,9 +80,7 @@ def test_every_part_stands_behind_a_registry(make_spec, part):
         build_network(spec)
 
 
-def test_a_refused_target_is_not_even_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refused_target_is_not_even_imported(tmp_path, monkeypatch):
     (tmp_path / "never_imported.py").write_text("x = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(UserError, match=r"never_imported\.x"):

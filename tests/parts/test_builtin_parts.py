@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from dopepp.parts import Part, pivconnector, servoholder
 
 SIZES = {servoholder: (0.077, 0.077, 0.007), pivconnector: (0.105, 0.052, 0.007)}
 PARTS = pytest.mark.parametrize("build", SIZES, ids=lambda build: build.__name__)
-Build = Callable[[], Part]
 
 
 def to_trimesh(part: Part) -> trimesh.Trimesh:
@@ -38,7 +36,7 @@ def share_moved(solid: Manifold, rotation: np.ndarray) -> float:
 
 
 @PARTS
-def test_has_the_papers_size_about_the_origin(build: Build) -> None:
+def test_has_the_papers_size_about_the_origin(build):
     part = build()
     half = np.array(SIZES[build]) / 2
     assert part.name == build.__name__
@@ -51,7 +49,7 @@ def test_has_the_papers_size_about_the_origin(build: Build) -> None:
 
 
 @PARTS
-def test_is_one_printable_solid(build: Build) -> None:
+def test_is_one_printable_solid(build):
     mesh = to_trimesh(build())
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -64,7 +62,7 @@ def test_is_one_printable_solid(build: Build) -> None:
 
 @PARTS
 @pytest.mark.parametrize("about", ["bounding box", "centre of mass"])
-def test_no_rotation_maps_it_onto_itself(build: Build, about: str) -> None:
+def test_no_rotation_maps_it_onto_itself(build, about):
     # A symmetry fixes the centre of mass and the axes of the inertia tensor where its moments
     # differ, which leaves rotations about z and flips about axes in the plane.
     part = build()
@@ -84,7 +82,7 @@ def test_no_rotation_maps_it_onto_itself(build: Build, about: str) -> None:
 
 
 @PARTS
-def test_front_and_back_differ_where_both_are_solid(build: Build) -> None:
+def test_front_and_back_differ_where_both_are_solid(build):
     # Depth maps of both faces over one grid: raised features in front, recesses behind.
     part = build()
     solid = to_solid(part, part.cuboid[8])
@@ -94,7 +92,7 @@ def test_front_and_back_differ_where_both_are_solid(build: Build) -> None:
 
 
 @PARTS
-def test_walls_of_features_are_visible_from_straight_above_and_below(build: Build) -> None:
+def test_walls_of_features_are_visible_from_straight_above_and_below(build):
     mesh = to_trimesh(build())
     tilt = mesh.face_normals[:, 2]
     sloping = (np.abs(tilt) > 0.2) & (np.abs(tilt) < 0.98)
@@ -102,7 +100,7 @@ def test_walls_of_features_are_visible_from_straight_above_and_below(build: Buil
     assert mesh.area_faces[sloping & (tilt < 0)].sum() > 5e-5
 
 
-def test_has_one_hash_in_every_process() -> None:
+def test_has_one_hash_in_every_process():
     code = (
         "from dopepp.parts import *; print(servoholder().mesh_hash, pivconnector().mesh_hash);"
         "import sys; print([m for m in ('torch', 'lightning', 'trimesh') if m in sys.modules])"

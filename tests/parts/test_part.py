@@ -14,7 +14,7 @@ def box(size: tuple[float, float, float]) -> Mesh:
     return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
 
 
-def test_measures_a_box() -> None:
+def test_measures_a_box():
     part = make_part("box", box((0.03, 0.04, 0.12)))
     assert part.name == "box"
     assert part.diameter == pytest.approx(0.13, rel=1e-15)
@@ -25,7 +25,7 @@ def test_measures_a_box() -> None:
     assert part.symmetries_continuous == ()
 
 
-def test_points_alone_make_a_part_without_mesh() -> None:
+def test_points_alone_make_a_part_without_mesh():
     points = np.array([[0, 0, 0], [0.03, 0, 0], [0.03, 0.04, 0], [0.0, 0.04, 0.1]])
     np.testing.assert_array_equal(make_part("box", box((0.1, 0.1, 0.1)), points).points, points)
     with pytest.raises(ValueError, match="a mesh or points"):
@@ -37,7 +37,7 @@ def test_points_alone_make_a_part_without_mesh() -> None:
     np.testing.assert_allclose(part.cuboid[8], [0.015, 0.02, 0.05])
 
 
-def test_hash_tells_meshes_apart() -> None:
+def test_hash_tells_meshes_apart():
     mesh = box((0.1, 0.1, 0.1))
     moved = Mesh(np.nextafter(mesh.vertices, 1), mesh.faces)
     turned = Mesh(mesh.vertices, mesh.faces[:, [1, 2, 0]])
@@ -56,9 +56,7 @@ def test_hash_tells_meshes_apart() -> None:
         (0.0, "mm", r"diameter of 0 m, .* fix: check the file's size"),
     ],
 )
-def test_an_unlikely_size_names_the_unit_and_suggests_one(
-    scale: float, unit: str, message: str
-) -> None:
+def test_an_unlikely_size_names_the_unit_and_suggests_one(scale, unit, message):
     mesh = servoholder().mesh
     assert mesh is not None
     with pytest.raises(UserError, match=message):
@@ -66,12 +64,12 @@ def test_an_unlikely_size_names_the_unit_and_suggests_one(
 
 
 @pytest.mark.parametrize("diameter", [0.005, 5.0])
-def test_the_allowed_sizes_include_their_ends(diameter: float) -> None:
+def test_the_allowed_sizes_include_their_ends(diameter):
     points = np.array([[0.0, 0, 0], [diameter, 0, 0]])
     assert make_part("rod", None, points).diameter == diameter
 
 
 @pytest.mark.parametrize("name", ["", "x" * 201, "two\nlines"])
-def test_a_name_must_be_printable(name: str) -> None:
+def test_a_name_must_be_printable(name):
     with pytest.raises(UserError, match=r"part name .* printable characters"):
         make_part(name, box((0.1, 0.1, 0.1)))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ SCALED = np.eye(4) * 2
 
 
 @pytest.mark.parametrize("part", [servoholder(), symmetric_part()], ids=lambda p: p.name)
-def test_a_record_survives_json_without_loss(part: Part) -> None:
+def test_a_record_survives_json_without_loss(part):
     again = Part.from_record(json.loads(json.dumps(part.to_record())))
     assert again.mesh is None
     assert (again.name, again.diameter) == (part.name, part.diameter)
@@ -54,7 +53,7 @@ def test_a_record_survives_json_without_loss(part: Part) -> None:
     assert again.to_record() == part.to_record()
 
 
-def test_no_symmetries_differ_from_unknown_ones() -> None:
+def test_no_symmetries_differ_from_unknown_ones():
     known = Part.from_record({**RECORD, "symmetries_discrete": []})
     assert known.symmetries_discrete is not None
     assert known.symmetries_discrete.shape == (0, 4, 4)
@@ -107,7 +106,7 @@ def test_no_symmetries_differ_from_unknown_ones() -> None:
         *[("cuboid", rows, "cuboid") for rows in BAD_CUBOIDS.values()],
     ],
 )
-def test_a_bad_field_is_named(field: str, value: Any, message: str) -> None:
+def test_a_bad_field_is_named(field, value, message):
     with pytest.raises(UserError, match=message) as caught:
         Part.from_record({**RECORD, field: value})
     assert "\n" not in str(caught.value)
@@ -121,7 +120,7 @@ def test_a_bad_field_is_named(field: str, value: Any, message: str) -> None:
         *[{key: RECORD[key] for key in RECORD if key != field} for field in FIELDS],
     ],
 )
-def test_another_thing_is_no_record(record: object) -> None:
+def test_another_thing_is_no_record(record):
     with pytest.raises(UserError, match=r"part record: .* a mapping with the fields name, cuboid"):
         Part.from_record(record)
 
@@ -139,9 +138,7 @@ JUNK = st.recursive(
     place=st.none() | st.tuples(st.integers(0, 1), st.integers(0, 2)),
     junk=JUNK,
 )
-def test_junk_in_a_field_or_a_number_is_refused_or_valid(
-    field: str, place: tuple[int, int] | None, junk: Any
-) -> None:
+def test_junk_in_a_field_or_a_number_is_refused_or_valid(field, place, junk):
     record = copy.deepcopy(RECORD)
     if place is None or field not in ("cuboid", "points"):
         record[field] = junk

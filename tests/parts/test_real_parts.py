@@ -20,7 +20,7 @@ TEXTURED = (
 )
 
 
-def test_somebody_elses_stl_parts_load_as_they_are(shared_data: Path) -> None:
+def test_somebody_elses_stl_parts_load_as_they_are(shared_data):
     paths = sorted(p for p in (shared_data / "parts").rglob("*") if p.suffix.lower() == ".stl")
     assert len(paths) == 6
     for path in paths:
@@ -38,7 +38,7 @@ def test_somebody_elses_stl_parts_load_as_they_are(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("name", TEXTURED)
-def test_a_textured_model_agrees_with_trimesh(ycb_root: Path, name: str) -> None:
+def test_a_textured_model_agrees_with_trimesh(ycb_root, name):
     part = ycb_part(ycb_root, name)
     folder = ycb_root / "models" / name
     reference = trimesh.load_mesh(folder / "textured.obj", process=False)
@@ -60,7 +60,7 @@ def _sorted(triangles: np.ndarray) -> np.ndarray:
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def test_every_ycb_object_has_all_its_points_and_a_sane_size(ycb_root: Path) -> None:
+def test_every_ycb_object_has_all_its_points_and_a_sane_size(ycb_root):
     names = sorted(path.name for path in (ycb_root / "models").iterdir() if path.is_dir())
     assert len(names) == 21
     for name in names:
@@ -85,13 +85,13 @@ def copied_root(ycb_root: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_an_unknown_object_lists_the_known_ones(copied_root: Path) -> None:
+def test_an_unknown_object_lists_the_known_ones(copied_root):
     for name in ("009_gelatin", "../models/009_gelatin_box", "", "*"):
         with pytest.raises(UserError, match=r"unknown object .*; allowed: 009_gelatin_box; "):
             ycb_part(copied_root, name)
 
 
-def test_a_folder_that_is_no_ycb_video_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_ycb_video_is_refused(tmp_path):
     for root in (tmp_path, tmp_path / "gone"):
         with pytest.raises(UserError, match=r"no models/NAME/points\.xyz; .*data\.root"):
             ycb_part(root, "009_gelatin_box")
@@ -100,14 +100,14 @@ def test_a_folder_that_is_no_ycb_video_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "1 2\n3 4\n", "1 2 3\n4 5\n", "1 2 x\n", "1 2 nan\n"], ids=repr
 )
-def test_damaged_points_are_refused(copied_root: Path, text: str) -> None:
+def test_damaged_points_are_refused(copied_root, text):
     path = copied_root / "models" / "009_gelatin_box" / "points.xyz"
     path.write_text(text)
     with pytest.raises(UserError, match=r"points\.xyz.*; allowed: lines of three finite numbers"):
         ycb_part(copied_root, "009_gelatin_box")
 
 
-def test_a_broken_mesh_is_no_missing_mesh(copied_root: Path) -> None:
+def test_a_broken_mesh_is_no_missing_mesh(copied_root):
     mesh_path = copied_root / "models" / "009_gelatin_box" / "textured.obj"
     mesh_path.write_bytes(mesh_path.read_bytes()[:500_000])
     with pytest.raises(UserError, match=r"textured\.obj"):

@@ -76,7 +76,7 @@ CASES = [
         for case in CASES
     ],
 )
-def test_the_group_of_a_known_shape_is_found(name: str, as_drawn: bool) -> None:
+def test_the_group_of_a_known_shape_is_found(name, as_drawn):
     shape, num_discrete, num_axes = SHAPES[name]
     mesh = as_mesh(shape if as_drawn else moved(shape, seed=len(name)))
     discrete, continuous = find_symmetries(mesh)
@@ -93,7 +93,7 @@ def test_the_group_of_a_known_shape_is_found(name: str, as_drawn: bool) -> None:
         assert np.abs(products - group.reshape(1, -1, 16)).max(2).min(1).max() < 1e-9
 
 
-def test_a_box_has_its_half_turns_exactly_and_about_its_middle() -> None:
+def test_a_box_has_its_half_turns_exactly_and_about_its_middle():
     shape = box((3, 2, 1)).apply_translation((10, 20, 30))
     discrete, _ = find_symmetries(as_mesh(shape))
     diagonals = {tuple(np.diag(S)) for S in discrete}
@@ -102,7 +102,7 @@ def test_a_box_has_its_half_turns_exactly_and_about_its_middle() -> None:
     assert np.abs(discrete @ middle - middle).max() < 1e-12
 
 
-def test_a_cylinder_has_its_axis_through_the_point_nearest_the_origin() -> None:
+def test_a_cylinder_has_its_axis_through_the_point_nearest_the_origin():
     shape = cylinder(33, 100, sections=48).apply_translation((5, -7, 400))
     (flip,), ((axis, offset),) = find_symmetries(as_mesh(shape))
     assert np.allclose(axis, (0, 0, 1), atol=1e-9)
@@ -110,13 +110,13 @@ def test_a_cylinder_has_its_axis_through_the_point_nearest_the_origin() -> None:
     assert np.allclose(flip[:3, :3] @ (0, 0, 1), (0, 0, -1), atol=1e-9)
 
 
-def test_a_larger_tolerance_overlooks_a_smaller_hole() -> None:
+def test_a_larger_tolerance_overlooks_a_smaller_hole():
     mesh = as_mesh(plate((30, 10, 4)))
     assert len(find_symmetries(mesh, 0.01)[0]) == 0
     assert len(find_symmetries(mesh, 0.05)[0]) == 3
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, 0.5, float("nan")])
-def test_a_tolerance_without_meaning_is_refused(tolerance: float) -> None:
+def test_a_tolerance_without_meaning_is_refused(tolerance):
     with pytest.raises(UserError, match=r"tolerance of .*0\.0001 – 0\.1 diameters"):
         find_symmetries(as_mesh(box((1, 1, 1))), tolerance)

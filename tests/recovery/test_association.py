@@ -47,7 +47,7 @@ def crowd(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]
     return centroids[None] + np.einsum("nij,kj->kni", affine, CORNER_SIGNS), centroids
 
 
-def test_a_corner_goes_where_its_vector_points() -> None:
+def test_a_corner_goes_where_its_vector_points():
     left, right = group(one_corner([[40, 0], [60, 0]], [[1, 0], [-1, 0]], [[0, 0], [100, 0]]))
     assert_array_equal(left.position[0], [60, 0])
     assert_array_equal(right.position[0], [40, 0])
@@ -56,24 +56,24 @@ def test_a_corner_goes_where_its_vector_points() -> None:
 
 
 @pytest.mark.parametrize("vector", [[0, 1], [1, 0], [np.nan, 0], [np.inf, 0]])
-def test_a_vector_that_points_elsewhere_joins_nobody(vector: list[float]) -> None:
+def test_a_vector_that_points_elsewhere_joins_nobody(vector):
     (alone,) = group(one_corner([[40, 0]], [vector], [[0, 0]]))
     assert np.isnan(alone.position[0]).all()
 
 
-def test_the_stronger_of_two_peaks_wins() -> None:
+def test_the_stronger_of_two_peaks_wins():
     score = np.array([0.5, 0.9])
     (one,) = group(one_corner([[40, 0], [0, 50]], [[-1, 0], [0, -1]], [[0, 0]], score))
     assert_array_equal(one.position[0], [0, 50])
 
 
-def test_a_corner_on_the_centroid_needs_no_direction() -> None:
+def test_a_corner_on_the_centroid_needs_no_direction():
     found = one_corner([[3, 0]], [[1, 0]], [[0, 0]])
     assert direction_evidence(found, WIDE, 8.0)[0, 0, 0] == 0
     assert direction_evidence(found, WIDE, 2.0)[0, 0, 0] == -np.inf
 
 
-def test_corners_in_one_direction_are_told_apart_by_the_others() -> None:
+def test_corners_in_one_direction_are_told_apart_by_the_others():
     """Vectors say only which way; the affine camera says how far."""
     rng = np.random.default_rng(0)
     right = total = 0
@@ -92,7 +92,7 @@ def test_corners_in_one_direction_are_told_apart_by_the_others() -> None:
     assert right >= 0.97 * total
 
 
-def test_a_pose_found_before_decides() -> None:
+def test_a_pose_found_before_decides():
     found = one_corner([[40, 0], [60, 0]], [[-1, 0], [-1, 0]], [[0, 0]])
     expected = np.full((1, 8, 2), np.nan)
     expected[0, 0] = 61, 1
@@ -100,5 +100,5 @@ def test_a_pose_found_before_decides() -> None:
     assert_array_equal(associate(found, evidence, expected)[0].position[0], [60, 0])
 
 
-def test_no_centroid_no_instance() -> None:
+def test_no_centroid_no_instance():
     assert group(one_corner([[1, 1]], [[1, 0]], np.zeros((0, 2)))) == []

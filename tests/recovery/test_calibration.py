@@ -42,14 +42,14 @@ def detection(**changes: object) -> Detection:
     return Detection(**fields)  # type: ignore[arg-type]
 
 
-def test_without_fitted_weights_the_score_is_the_mean_belief() -> None:
+def test_without_fitted_weights_the_score_is_the_mean_belief():
     weights = np.array([float(name == "belief") for name in FEATURES])
     for belief in (0.01, 0.3, 0.97):
         features = detection_features(detection(belief=belief), CUBOID, K)
         assert score(features, weights) == pytest.approx(belief)
 
 
-def test_the_spread_is_what_poses_with_this_covariance_scatter_by() -> None:
+def test_the_spread_is_what_poses_with_this_covariance_scatter_by():
     rng = np.random.default_rng(0)
     root = rng.normal(0, 1, (6, 6)) * [0.01, 0.01, 0.01, 0.001, 0.001, 0.001]
     covariance = root.T @ root
@@ -64,7 +64,7 @@ def test_the_spread_is_what_poses_with_this_covariance_scatter_by() -> None:
     assert features[FEATURES.index("spread")] == pytest.approx(expected, abs=0.05)
 
 
-def test_the_distance_changes_along_the_ray_through_the_origin() -> None:
+def test_the_distance_changes_along_the_ray_through_the_origin():
     before = detection(belief=0.7)
     after = calibrated(before, CUBOID, K, RecoveryOptions(distance_factor=0.9))
     assert np.array_equal(after.T_cam_obj[:3, :3], T[:3, :3])
@@ -81,7 +81,7 @@ def test_the_distance_changes_along_the_ray_through_the_origin() -> None:
     assert np.array_equal(same.T_cam_obj, T)
 
 
-def test_the_factor_is_the_median_ratio_of_distances() -> None:
+def test_the_factor_is_the_median_ratio_of_distances():
     rng = np.random.default_rng(0)
     true = np.tile(T, (201, 1, 1))
     true[:, :3, 3] += rng.uniform(-0.1, 0.1, (201, 3))
@@ -93,7 +93,7 @@ def test_the_factor_is_the_median_ratio_of_distances() -> None:
     assert fit_distance_factor(100 * true, true) == DISTANCE_FACTORS[0]
 
 
-def test_missing_keypoints_and_worse_fits_are_seen() -> None:
+def test_missing_keypoints_and_worse_fits_are_seen():
     peaks = project(transform(T, CUBOID), K)
     peaks[[1, 4, 6]] = np.nan
     whole, poor = (
@@ -106,7 +106,7 @@ def test_missing_keypoints_and_worse_fits_are_seen() -> None:
     assert poor[misfit] - whole[misfit] == pytest.approx(np.log(5))
 
 
-def test_corners_behind_the_camera_have_no_say() -> None:
+def test_corners_behind_the_camera_have_no_say():
     near = T.copy()
     near[2, 3] = 0.02
     assert np.isnan(project(transform(near, CUBOID[:8]), K)).any()
@@ -115,9 +115,7 @@ def test_corners_behind_the_camera_have_no_say() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
-def test_features_are_finite_whatever_the_detection(
-    belief: float, error: float, variance: float
-) -> None:
+def test_features_are_finite_whatever_the_detection(belief, error, variance):
     one = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))
     features = detection_features(one, CUBOID, K)
     assert features.shape == (len(FEATURES),)
@@ -125,7 +123,7 @@ def test_features_are_finite_whatever_the_detection(
     assert 0 < float(score(features, 10 * np.ones(len(FEATURES)))) < 1
 
 
-def test_the_fit_is_the_maximum_of_the_likelihood() -> None:
+def test_the_fit_is_the_maximum_of_the_likelihood():
     rng = np.random.default_rng(3)
     features = np.column_stack([np.ones(400), rng.normal(size=(400, 4))])
     truth = np.array([0.5, 1.5, -1.0, 0.0, 0.3])
@@ -142,7 +140,7 @@ def test_the_fit_is_the_maximum_of_the_likelihood() -> None:
     np.testing.assert_allclose(fitted, truth, atol=0.5)
 
 
-def test_perfectly_told_ones_keep_the_weights_finite() -> None:
+def test_perfectly_told_ones_keep_the_weights_finite():
     features = np.column_stack([np.ones(20), np.linspace(-1, 1, 20)])
     weights = fit_weights(features, features[:, 1] > 0)
     assert np.isfinite(weights).all()
@@ -150,6 +148,6 @@ def test_perfectly_told_ones_keep_the_weights_finite() -> None:
 
 
 @pytest.mark.parametrize("correct", [np.ones(5, bool), np.zeros(5, bool), np.zeros(0, bool)])
-def test_right_and_wrong_ones_are_needed(correct: np.ndarray) -> None:
+def test_right_and_wrong_ones_are_needed(correct):
     with pytest.raises(ValueError, match="right and wrong"):
         fit_weights(np.ones((len(correct), 2)), correct)

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -17,7 +14,6 @@ from dopepp.maps.peaks import Peaks
 from dopepp.recovery import Detection, RecoveryOptions, explain, recover, recover_batch
 from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
 
-Make = Callable[..., Any]
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
 
 
@@ -30,9 +26,7 @@ def same(one: Detection, other: Detection) -> None:
 
 @pytest.mark.parametrize("name", ["box", "plate", "origin elsewhere"])
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_all_instances_come_back(
-    name: str, count: int, box: np.ndarray, plate: np.ndarray, make_scene: Make, pose: Make
-) -> None:
+def test_all_instances_come_back(name, count, box, plate, make_scene, pose):
     elsewhere = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
     cuboid = {"box": box, "plate": plate, "origin elsewhere": elsewhere}[name]
     rng = np.random.default_rng(count)
@@ -49,9 +43,7 @@ def test_all_instances_come_back(
         assert len({tuple(np.round(centre / 0.09).astype(int)) for centre in centres}) == count
 
 
-def test_instances_side_by_side_keep_their_own_corners(
-    make_scene: Make, box: np.ndarray, pose: Make
-) -> None:
+def test_instances_side_by_side_keep_their_own_corners(make_scene, box, pose):
     """Their outlines interlock, so only the vector field tells whose corner is whose."""
     rng, right, total = np.random.default_rng(0), 0, 0
     for _ in range(20):
@@ -62,9 +54,7 @@ def test_instances_side_by_side_keep_their_own_corners(
     assert right >= 0.9 * total
 
 
-def test_two_objects_in_one_network(
-    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
-) -> None:
+def test_two_objects_in_one_network(make_scene, box, plate, pose):
     rng = np.random.default_rng(1)
     for _ in range(8):
         scene = make_scene(box, plate)
@@ -77,9 +67,7 @@ def test_two_objects_in_one_network(
 
 
 @pytest.mark.parametrize("name", ["box", "plate"])
-def test_three_missing_corners_are_borne(
-    name: str, request: pytest.FixtureRequest, make_scene: Make, pose: Make
-) -> None:
+def test_three_missing_corners_are_borne(name, request, make_scene, pose):
     cuboid, rng = request.getfixturevalue(name), np.random.default_rng(3)
     good = 0
     for _ in range(40):
@@ -96,7 +84,7 @@ def test_three_missing_corners_are_borne(
     assert good >= 36
 
 
-def test_what_a_detection_says(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+def test_what_a_detection_says(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(4)))
     (one,) = recover(*scene.maps(), scene.cuboids, scene.K, names=["bracket"])
     assert one.object == "bracket"
@@ -110,9 +98,7 @@ def test_what_a_detection_says(make_scene: Make, box: np.ndarray, pose: Make) ->
     assert_array_equal(one.T_cam_obj[3], [0, 0, 0, 1])
 
 
-def test_best_score_comes_first_and_stays_within_one(
-    make_scene: Make, box: np.ndarray, pose: Make
-) -> None:
+def test_best_score_comes_first_and_stays_within_one(make_scene, box, pose):
     rng = np.random.default_rng(5)
     scene = make_scene(box).place(0, pose(rng, -0.1)).place(0, pose(rng, 0.1))
     belief, field = scene.maps()
@@ -125,9 +111,7 @@ def test_best_score_comes_first_and_stays_within_one(
     assert len(recover(belief, field, scene.cuboids, scene.K, centroid_threshold=0.7)) == 1
 
 
-def test_what_is_absent_is_not_found(
-    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
-) -> None:
+def test_what_is_absent_is_not_found(make_scene, box, plate, pose):
     scene = make_scene(box, plate).place(1, pose(np.random.default_rng(2)))
     belief, field = scene.maps()
     assert [one.object for one in recover(belief, field, scene.cuboids, scene.K)] == ["1"]
@@ -135,7 +119,7 @@ def test_what_is_absent_is_not_found(
 
 
 @pytest.mark.parametrize("kind", ["uniform", "sparse", "constant", "nan", "inf", "field nan"])
-def test_noise_gives_no_exception(kind: str, box: np.ndarray, K: np.ndarray) -> None:
+def test_noise_gives_no_exception(kind, box, K):
     rng = torch.Generator().manual_seed(0)
     belief = torch.rand(18, 20, 24, generator=rng)
     field = torch.randn(32, 20, 24, generator=rng)
@@ -155,9 +139,7 @@ def test_noise_gives_no_exception(kind: str, box: np.ndarray, K: np.ndarray) -> 
         assert 0 <= one.score <= 1
 
 
-def test_a_batch_is_its_images_each_with_its_own_camera(
-    make_scene: Make, box: np.ndarray, plate: np.ndarray, pose: Make
-) -> None:
+def test_a_batch_is_its_images_each_with_its_own_camera(make_scene, box, plate, pose):
     rng = np.random.default_rng(7)
     cameras = [camera_matrix(f, 1.02 * f, 200.0 + k, 210.0) for k, f in enumerate((450, 500, 600))]
     scenes = [
@@ -177,9 +159,7 @@ def test_a_batch_is_its_images_each_with_its_own_camera(
             assert scene.error(int(one.object), one.T_cam_obj) < 0.1
 
 
-def test_maps_in_half_precision_and_channels_last(
-    make_scene: Make, box: np.ndarray, pose: Make
-) -> None:
+def test_maps_in_half_precision_and_channels_last(make_scene, box, pose):
     """What a network under autocast hands over."""
     scene = make_scene(box).place(0, pose(np.random.default_rng(8)))
     belief, field = (
@@ -199,10 +179,7 @@ def test_maps_in_half_precision_and_channels_last(
         ((9, 20, 20), (16, 20, 20), ["a", "b"], "1 objects need as many names"),
     ],
 )
-def test_maps_and_names_must_fit_the_objects(
-    belief: tuple[int, ...], field: tuple[int, ...], names: list[str] | None, message: str,
-    box: np.ndarray, K: np.ndarray,
-) -> None:  # fmt: skip
+def test_maps_and_names_must_fit_the_objects(belief, field, names, message, box, K):
     with pytest.raises(ValueError, match=message):
         recover(torch.zeros(belief), torch.zeros(field), box[None], K, names=names)
     with pytest.raises(ValueError, match="2 images need as many camera matrices"):
@@ -221,12 +198,12 @@ def test_maps_and_names_must_fit_the_objects(
         ("min_score", 1.5),
     ],
 )
-def test_bad_option(option: str, value: float) -> None:
+def test_bad_option(option, value):
     with pytest.raises(UserError, match=f"recovery option {option}={value}"):
         RecoveryOptions(**{option: value})
 
 
-def test_the_reason_for_no_detection(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+def test_the_reason_for_no_detection(make_scene, box, pose):
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     assert explain(belief, field, scene.cuboids, scene.K) == []
@@ -242,9 +219,7 @@ def test_the_reason_for_no_detection(make_scene: Make, box: np.ndarray, pose: Ma
 
 
 @pytest.mark.parametrize(("name", "sigma"), [("box", 2.0), ("plate", 2.0), ("box", 0.5)])
-def test_crowds_with_noise_on_their_maps(
-    name: str, sigma: float, request: pytest.FixtureRequest, make_scene: Make, pose: Make
-) -> None:
+def test_crowds_with_noise_on_their_maps(name, sigma, request, make_scene, pose):
     cuboid, rng = request.getfixturevalue(name), np.random.default_rng(11)
     generator = torch.Generator().manual_seed(11)
     places = [(x, y) for x in (-0.13, -0.04, 0.04, 0.13) for y in (-0.1, 0.0, 0.1)]
@@ -262,7 +237,7 @@ def test_crowds_with_noise_on_their_maps(
     assert right >= 36
 
 
-def test_the_covariance_is_that_of_the_peaks(make_scene: Make, box: np.ndarray, pose: Make) -> None:
+def test_the_covariance_is_that_of_the_peaks(make_scene, box, pose):
     """Wider peaks, a wider pose; symmetric and positive."""
     scene = make_scene(box).place(0, pose(np.random.default_rng(12)))
     (sharp,) = recover(*scene.maps(), scene.cuboids, scene.K)
@@ -273,7 +248,7 @@ def test_the_covariance_is_that_of_the_peaks(make_scene: Make, box: np.ndarray, 
     assert np.trace(wide.covariance) > 4 * np.trace(sharp.covariance)
 
 
-def test_peaks_at_the_border_are_less_certain() -> None:
+def test_peaks_at_the_border_are_less_certain():
     inside, outside = [(8.0, 8.0), (71.0, 30.0)], [(7.0, 30.0), (30.0, 7.0), (73.0, 30.0), (-3, -3)]
     position = np.full((1, 9, 6, 2), np.nan)
     position[0, 0] = inside + outside
@@ -287,7 +262,7 @@ def test_peaks_at_the_border_are_less_certain() -> None:
     assert own.area_px == 80 * 48
 
 
-def test_corners_pulled_in_at_the_border_harm_the_pose_less(plate: np.ndarray, pose: Make) -> None:
+def test_corners_pulled_in_at_the_border_harm_the_pose_less(plate, pose):
     """A network's peaks in the outermost cells lie half a cell too far inside."""
     rng, K, size = np.random.default_rng(11), camera_matrix(153, 153, 63.5, 63.5), 128
     ours, plain = [], []

@@ -1,14 +1,10 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from dopepp.geometry.camera import project_keypoints, transform
 from dopepp.recovery.association import KeypointGroup
 from dopepp.recovery.detection import solve_group
-
-Pose = Callable[..., np.ndarray]
 
 
 def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
@@ -17,7 +13,7 @@ def error(T: np.ndarray | None, truth: np.ndarray, cuboid: np.ndarray) -> float:
     return float(np.linalg.norm(transform(T, cuboid) - transform(truth, cuboid), axis=1).mean())
 
 
-def test_wide_peaks_count_less(box: np.ndarray, K: np.ndarray, pose: Pose) -> None:
+def test_wide_peaks_count_less(box, K, pose):
     """The same noisy pixels with and without the width that betrays the noisy ones."""
     rng = np.random.default_rng(0)
     errors = []
@@ -39,9 +35,7 @@ def test_wide_peaks_count_less(box: np.ndarray, K: np.ndarray, pose: Pose) -> No
     assert told < 0.5 * untold
 
 
-def test_maps_narrower_than_their_errors_still_give_poses(
-    box: np.ndarray, K: np.ndarray, pose: Pose
-) -> None:
+def test_maps_narrower_than_their_errors_still_give_poses(box, K, pose):
     rng = np.random.default_rng(1)
     good = 0
     for _ in range(40):

@@ -3,7 +3,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
 
 
-def test_falls_with_the_error_of_the_pose() -> None:
+def test_falls_with_the_error_of_the_pose():
     factory = Factory([servoholder()], PRESETS["table"].resized(320, 240), 3)
     errors, values, right = [], [], []
     for index in range(4):
@@ -40,7 +39,7 @@ def test_falls_with_the_error_of_the_pose() -> None:
     assert all(0 <= value <= 1 for value in values)
 
 
-def test_nothing_agrees_with_an_empty_image_or_outside_it() -> None:
+def test_nothing_agrees_with_an_empty_image_or_outside_it():
     item = Factory([servoholder()], PRESETS["paper"], 0).scene(0, 0).objects[0]
     K = PRESETS["paper"].K
     grey = np.full((480, 640, 3), 90, np.uint8)
@@ -54,9 +53,7 @@ def known(name: str, mesh_hash: str) -> Part:
     return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
 
 
-def test_meshes_are_found_by_name_and_compared(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_meshes_are_found_by_name_and_compared(tmp_path, caplog):
     own = servoholder().mesh_hash
     with caplog.at_level(logging.WARNING):
         found = meshes_of([known("servoholder", own), known("other", own)], ["other=servoholder"])
@@ -67,7 +64,7 @@ def test_meshes_are_found_by_name_and_compared(
     assert "is not the one the checkpoint was trained on" in caplog.text
 
 
-def test_missing_or_unknown_meshes() -> None:
+def test_missing_or_unknown_meshes():
     part = known("bracket", "")
     with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
         meshes_of([part], [])

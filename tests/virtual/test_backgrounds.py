@@ -28,7 +28,7 @@ def draw(backgrounds: PhotoBackgrounds, seed: int) -> np.ndarray:
     return backgrounds.draw(np.random.default_rng(seed), 32, 24)
 
 
-def test_a_choice_by_name(tmp_path: Path) -> None:
+def test_a_choice_by_name(tmp_path):
     assert isinstance(find_backgrounds(None), ProceduralBackgrounds)
     assert find_backgrounds("procedural").identity() == ["procedural"]
     for folder in ("nowhere", tmp_path):
@@ -36,7 +36,7 @@ def test_a_choice_by_name(tmp_path: Path) -> None:
             find_backgrounds(folder)
 
 
-def test_bundled_photos_come_without_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bundled_photos_come_without_a_network(monkeypatch):
     pytest.importorskip("skimage")
     backgrounds = find_backgrounds("skimage")
     assert isinstance(backgrounds, PhotoBackgrounds)
@@ -49,7 +49,7 @@ def test_bundled_photos_come_without_a_network(monkeypatch: pytest.MonkeyPatch) 
         find_backgrounds("skimage")
 
 
-def test_a_deep_tree_is_opened_without_decoding(tmp_path: Path) -> None:
+def test_a_deep_tree_is_opened_without_decoding(tmp_path):
     content = b"never read"
     for place in ("VOC2007/JPEGImages/b.JPG", "VOC2007/JPEGImages/a.jpg", "a.png", "z/y/x/w.webp"):
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def test_a_deep_tree_is_opened_without_decoding(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path: Path) -> None:
+def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path):
     write_photos(tmp_path / "a", 3)
     write_photos(tmp_path / "b", 3)
     first, again = (PhotoBackgrounds(tmp_path / name).identity() for name in "ab")
@@ -81,7 +81,7 @@ def test_the_identity_knows_names_and_sizes_but_not_the_place(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "bmp", "webp"])
-def test_half_a_photo_is_damaged(tmp_path: Path, suffix: str) -> None:
+def test_half_a_photo_is_damaged(tmp_path, suffix):
     write_photos(tmp_path / "whole", 1, 200)
     path = tmp_path / f"photo.{suffix}"
     Image.open(tmp_path / "whole" / "0000.jpg").save(path)
@@ -97,9 +97,7 @@ def test_half_a_photo_is_damaged(tmp_path: Path, suffix: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_one_bad_photo_of_many_is_replaced_whatever_came_before(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_one_bad_photo_of_many_is_replaced_whatever_came_before(tmp_path, caplog):
     write_photos(tmp_path, 200)
     bad = tmp_path / "0100.jpg"
     bad.write_bytes(bad.read_bytes()[:200])
@@ -117,7 +115,7 @@ def test_one_bad_photo_of_many_is_replaced_whatever_came_before(
 
 
 @pytest.mark.parametrize(("count", "allowed"), [(99, 0), (100, 1), (1500, 10)])
-def test_damage_is_capped(tmp_path: Path, count: int, allowed: int) -> None:
+def test_damage_is_capped(tmp_path, count, allowed):
     for number in range(count):
         (tmp_path / f"{number}.jpg").write_bytes(b"")
     backgrounds = PhotoBackgrounds(tmp_path)
@@ -127,7 +125,7 @@ def test_damage_is_capped(tmp_path: Path, count: int, allowed: int) -> None:
         draw(backgrounds, 0)
 
 
-def test_a_photo_that_vanishes_counts_as_damaged(tmp_path: Path) -> None:
+def test_a_photo_that_vanishes_counts_as_damaged(tmp_path):
     write_photos(tmp_path, 1)
     backgrounds = PhotoBackgrounds(tmp_path)
     (tmp_path / "0000.jpg").unlink()
@@ -140,16 +138,14 @@ def test_a_photo_that_vanishes_counts_as_damaged(tmp_path: Path) -> None:
     ("size", "message"),
     [((9000, 200), "9000×200 pixels"), ((12_000, 12_000), "12000×12000 pixels")],
 )
-def test_a_photo_of_absurd_size_is_not_decoded(
-    tmp_path: Path, size: tuple[int, int], message: str
-) -> None:
+def test_a_photo_of_absurd_size_is_not_decoded(tmp_path, size, message):
     Image.new("1", size).save(tmp_path / "bomb.png")
     assert (tmp_path / "bomb.png").stat().st_size < 50_000
     with pytest.raises(UserError, match=rf"bomb\.png: .*{message}"):
         draw(PhotoBackgrounds(tmp_path), 0)
 
 
-def test_large_photos_are_reduced_as_opencv_would(tmp_path: Path) -> None:
+def test_large_photos_are_reduced_as_opencv_would(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
     photo = cv2.GaussianBlur(noise, (0, 0), 20)
     Image.fromarray(photo).save(tmp_path / "a.png")
@@ -162,7 +158,7 @@ def test_large_photos_are_reduced_as_opencv_would(tmp_path: Path) -> None:
     np.testing.assert_allclose(fast.astype(int), expected.astype(int), atol=6)
 
 
-def test_pickling_leaves_the_decoded_photos_behind(tmp_path: Path) -> None:
+def test_pickling_leaves_the_decoded_photos_behind(tmp_path):
     write_photos(tmp_path, 3, 400)
     backgrounds = PhotoBackgrounds(tmp_path)
     images = [draw(backgrounds, seed) for seed in range(9)]
@@ -172,7 +168,7 @@ def test_pickling_leaves_the_decoded_photos_behind(tmp_path: Path) -> None:
     np.testing.assert_array_equal([draw(copy, seed) for seed in range(9)], images)
 
 
-def test_memory_for_photos_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_for_photos_is_bounded(tmp_path, monkeypatch):
     write_photos(tmp_path, 9, 100)
     monkeypatch.setattr("dopepp.virtual.backgrounds.photos._KEPT_BYTES", 3 * 100 * 120 * 3)
     backgrounds = PhotoBackgrounds(tmp_path)
@@ -181,7 +177,7 @@ def test_memory_for_photos_is_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
     assert len(backgrounds._photos) == 3
 
 
-def test_crops_lie_inside_of_their_photo(tmp_path: Path) -> None:
+def test_crops_lie_inside_of_their_photo(tmp_path):
     # Colours ramp over the photo, so a crop's corners tell where it was taken.
     x, y = np.meshgrid(np.linspace(0, 200, 300), np.linspace(0, 200, 200))
     Image.fromarray(np.stack([x, y, 0 * x], axis=2).astype(np.uint8)).save(tmp_path / "a.png")
@@ -198,13 +194,13 @@ def test_crops_lie_inside_of_their_photo(tmp_path: Path) -> None:
     np.testing.assert_allclose(spans, 24 / 32 * 1.5, rtol=0.1)
 
 
-def test_real_photos(shared_data: Path) -> None:
+def test_real_photos(shared_data):
     photos = PhotoBackgrounds(shared_data / "backgrounds")
     assert min(draw(photos, seed).std() for seed in range(5)) > 5
 
 
 @pytest.mark.parametrize("size", [(640, 480), (97, 301), (33, 20), (7, 5), (1, 1)])
-def test_procedural_pictures_depend_on_the_generator_only(size: tuple[int, int]) -> None:
+def test_procedural_pictures_depend_on_the_generator_only(size):
     one, other = ProceduralBackgrounds(), ProceduralBackgrounds()
     images = [one.draw(np.random.default_rng(seed), *size) for seed in range(8)]
     for seed in reversed(range(8)):
@@ -213,7 +209,7 @@ def test_procedural_pictures_depend_on_the_generator_only(size: tuple[int, int])
         np.testing.assert_array_equal(again, images[seed])
 
 
-def test_procedural_pictures_have_detail_at_every_size() -> None:
+def test_procedural_pictures_have_detail_at_every_size():
     backgrounds = ProceduralBackgrounds()
     for size in ((320, 240), (128, 128)):
         images = [backgrounds.draw(np.random.default_rng(seed), *size) for seed in range(60)]

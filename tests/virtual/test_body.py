@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import trimesh
 
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.part import Mesh
 from dopepp.virtual.body import Body, make_hull
-from dopepp.virtual.surface import Surface, make_surface
-
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
+from dopepp.virtual.surface import make_surface
 
 
-def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of: MakeSurface) -> None:
+def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of):
     sides = np.array([0.10, 0.06, 0.02])
     normals, shares = make_hull(surface_of(trimesh.creation.box(sides))).rests
     assert len(normals) == 6
@@ -29,7 +24,7 @@ def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of: M
         assert share == pytest.approx(angle / (4 * np.pi), rel=1e-9)
 
 
-def test_the_stable_faces_are_trimeshs() -> None:
+def test_the_stable_faces_are_trimeshs():
     mesh = pivconnector().mesh
     assert mesh is not None
     hull = make_hull(make_surface(mesh))
@@ -46,7 +41,7 @@ def test_the_stable_faces_are_trimeshs() -> None:
     assert shares.sum() == pytest.approx(1.0)
 
 
-def test_a_leaning_tower_does_not_stand(surface_of: MakeSurface) -> None:
+def test_a_leaning_tower_does_not_stand(surface_of):
     tower = trimesh.creation.box((0.02, 0.02, 0.1))
     tower.vertices[:, 0] += 0.5 * tower.vertices[:, 2]  # its centre is beside its foot
     normals, _ = make_hull(surface_of(tower)).rests
@@ -54,7 +49,7 @@ def test_a_leaning_tower_does_not_stand(surface_of: MakeSurface) -> None:
     assert np.abs(normals[:, 2]).max() < 0.99
 
 
-def test_a_cone_never_stands_on_its_tip(surface_of: MakeSurface) -> None:
+def test_a_cone_never_stands_on_its_tip(surface_of):
     cone = trimesh.creation.cone(0.03, 0.1, sections=32)
     hull = make_hull(surface_of(cone))
     np.testing.assert_allclose(hull.centre, [0, 0, 0.025], atol=1e-9)
@@ -64,19 +59,19 @@ def test_a_cone_never_stands_on_its_tip(surface_of: MakeSurface) -> None:
     assert len(shares) == 33
 
 
-def test_a_ball_of_many_faces_rests_on_any(surface_of: MakeSurface) -> None:
+def test_a_ball_of_many_faces_rests_on_any(surface_of):
     normals, shares = make_hull(surface_of(trimesh.creation.icosphere(3, 0.05))).rests
     assert len(normals) > 600
     assert np.linalg.norm(shares @ normals) < 0.02
 
 
-def test_a_flat_sheet_lies_on_either_side(sheet: Callable[..., Mesh]) -> None:
+def test_a_flat_sheet_lies_on_either_side(sheet):
     normals, _ = make_hull(make_surface(sheet(0.1))).rests
     np.testing.assert_allclose(np.abs(normals), np.tile([0, 0, 1.0], (len(normals), 1)), atol=1e-3)
     assert {round(z) for z in normals[:, 2]} == {-1, 1}
 
 
-def test_a_stretched_hull_is_the_stretched_bodys_hull() -> None:
+def test_a_stretched_hull_is_the_stretched_bodys_hull():
     mesh = pivconnector().mesh
     assert mesh is not None
     body, scale = Body(make_surface(mesh)), np.array([0.5, 1.2, 3.0])

@@ -14,7 +14,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Rendered, Sensors, render
 from dopepp.virtual.sensor import capture
 
@@ -45,7 +45,7 @@ def digest(rendered: Rendered) -> str:
     return content.hexdigest()
 
 
-def test_shapes_and_types() -> None:
+def test_shapes_and_types():
     rendered = make_factory().render(0, 0)
     assert rendered.image.shape == (128, 128, 3)
     assert rendered.image.dtype == np.uint8
@@ -58,7 +58,7 @@ def test_shapes_and_types() -> None:
     assert rendered.scene.targets == (0,)
 
 
-def test_a_distractor_has_no_keypoints() -> None:
+def test_a_distractor_has_no_keypoints():
     factory = make_factory()
     scene = next(s for s in (factory.scene(0, i) for i in range(20)) if len(s.objects) > 1)
     assert scene.objects[1].label == "distractor"
@@ -70,7 +70,7 @@ def test_a_distractor_has_no_keypoints() -> None:
     "name",
     ["table", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quickstart", "bin"))],
 )
-def test_same_bytes_in_another_process_and_order(name: str) -> None:
+def test_same_bytes_in_another_process_and_order(name):
     items = [(0, 0), (0, 1), (3, 1), (0, 12)]
     factory = make_factory(preset=small(name))
     expected = [digest(factory.render(*item)) for item in reversed(items)][::-1]
@@ -83,14 +83,14 @@ def test_same_bytes_in_another_process_and_order(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_a_pickled_factory_renders_the_same(name: str) -> None:
+def test_a_pickled_factory_renders_the_same(name):
     factory = make_factory(preset=small(name))
     factory.render(0, 1)  # what it keeps for later images must change none
     copy = pickle.loads(pickle.dumps(factory))
     assert digest(copy.render(2, 5)) == digest(factory.render(2, 5))
 
 
-def test_the_sensor_takes_the_renderers_picture() -> None:
+def test_the_sensor_takes_the_renderers_picture():
     noisy = Sensors(noise_probability=1.0, blur_probability=1.0, jpeg_probability=1.0)
     factory = make_factory(preset=replace(PRESETS["quickstart"], sensors=noisy))
     ideal, taken = render(factory.scene(0, 3)), factory.render(0, 3)
@@ -121,7 +121,7 @@ def with_distractors(**changes: float) -> Preset:
     return replace(PRESETS["ycb"], distractors=Distractors((3, 3), **changes))
 
 
-def test_other_parts_stand_among_the_distractors() -> None:
+def test_other_parts_stand_among_the_distractors():
     factory = Factory([pivconnector()], with_distractors(lookalike_share=0.5), 0)
     assert [part.name for part in factory.negatives] == ["servoholder"]
     radii, others = lookalikes(factory)
@@ -130,7 +130,7 @@ def test_other_parts_stand_among_the_distractors() -> None:
     assert 0.6 < min(radii) < max(radii) <= 1.3
 
 
-def test_without_lookalikes_or_other_parts_there_are_only_primitives() -> None:
+def test_without_lookalikes_or_other_parts_there_are_only_primitives():
     none = Factory([pivconnector()], with_distractors(lookalike_share=0.0), 0)
     assert lookalikes(none)[0] == []
     both = Factory([pivconnector(), servoholder()], with_distractors(lookalike_share=1.0), 0)
@@ -138,24 +138,24 @@ def test_without_lookalikes_or_other_parts_there_are_only_primitives() -> None:
     assert lookalikes(both)[1] > 20
 
 
-def test_given_negatives_come_first_and_once(box_part: Part) -> None:
+def test_given_negatives_come_first_and_once(box_part):
     factory = Factory([pivconnector()], with_distractors(lookalike_share=1.0), 0,
                       negatives=[box_part, servoholder()])  # fmt: skip
     assert [part.name for part in factory.negatives] == ["box", "servoholder"]
     assert lookalikes(factory)[1] == 0
 
 
-def test_a_renamed_built_in_part_is_no_negative() -> None:
+def test_a_renamed_built_in_part_is_no_negative():
     renamed = Factory([replace(servoholder(), name="mine")], PRESETS["quickstart"], 0)
     assert [part.name for part in renamed.negatives] == ["pivconnector"]
 
 
-def test_seed_epoch_and_index_all_matter() -> None:
+def test_seed_epoch_and_index_all_matter():
     factories, places = [make_factory(0), make_factory(1)], [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert len({digest(one.render(*place)) for one in factories for place in places}) == 8
 
 
-def test_import_is_free_of_torch() -> None:
+def test_import_is_free_of_torch():
     script = (
         "import sys, dopepp.virtual; print([m for m in ('torch', 'lightning') if m in sys.modules])"
     )
@@ -182,8 +182,6 @@ THING = replace(BOX, name="thing", mesh=None, mesh_hash="")
         ([pivconnector()], 0, [THING], "part thing without a mesh"),
     ],
 )
-def test_wrong_factories_are_refused(
-    parts: list[Part], seed: int, negatives: list[Part], message: str
-) -> None:
+def test_wrong_factories_are_refused(parts, seed, negatives, message):
     with pytest.raises(UserError, match=message):
         Factory(parts, PRESETS["quickstart"], seed, negatives=negatives)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,15 +21,12 @@ from dopepp.virtual import (
     Rendered,
     Scene,
     SceneObject,
-    Surface,
     make_surface,
     render,
     silhouette,
     visible_fractions,
 )  # fmt: skip
 
-MakeScene = Callable[..., Scene]
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 FLOOR = Plane((0.0, -1.0, 0.0), -0.3)
 
 
@@ -50,7 +46,7 @@ def check(scene: Scene) -> Rendered:
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 100_000))
-def test_any_triangle_soup(seed: int) -> None:
+def test_any_triangle_soup(seed):
     rng = np.random.default_rng(seed)
     vertices = rng.normal(size=(30, 3)) * 10 ** rng.uniform(-3, 1, 3)
     # Repeated vertices make faces without area, equal faces, and edges of many faces.
@@ -69,13 +65,13 @@ def test_any_triangle_soup(seed: int) -> None:
     check(Scene(K, background, (SceneObject(surface, pose, material),), lights, Ambient()))
 
 
-def test_vertices_on_the_camera_plane_and_at_the_camera(scene_of: MakeScene) -> None:
+def test_vertices_on_the_camera_plane_and_at_the_camera(scene_of):
     corners = np.array([(0, 0, 0), (0.2, 0, 0), (0, 0.2, 0.5), (-0.2, -0.2, 1e-9), (0.1, 0, 1)])
     faces = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (0, 4, 1)], np.int32)
     check(scene_of(SceneObject(make_surface(Mesh(corners, faces)), np.eye(4))))
 
 
-def test_a_mesh_around_camera_and_lights(scene_of: MakeScene, surface_of: MakeSurface) -> None:
+def test_a_mesh_around_camera_and_lights(scene_of, surface_of):
     room = trimesh.creation.box((0.5, 0.4, 1.0))
     lights = (Light((0, 0, 0)), Light(tuple(room.vertices[0])), Light((0.1, 0.1, 0.2)))
     for inside_out in (False, True):
@@ -84,14 +80,14 @@ def test_a_mesh_around_camera_and_lights(scene_of: MakeScene, surface_of: MakeSu
         room.invert()
 
 
-def test_extreme_sizes(scene_of: MakeScene, surface_of: MakeSurface) -> None:
+def test_extreme_sizes(scene_of, surface_of):
     for size, depth in ((1e-7, 0.1), (1e4, 3e4), (1e-3, 1e6), (0.1, 0.1001)):
         surface = surface_of(trimesh.creation.icosphere(2, size))
         pose = make_transform(np.eye(3), np.array([0.0, 0.0, depth]))
         check(scene_of(SceneObject(surface, pose, Material(grooves=Grooves(), noise=0.1))))
 
 
-def test_nothing_but_faces_without_area(scene_of: MakeScene) -> None:
+def test_nothing_but_faces_without_area(scene_of):
     flat = Mesh(np.zeros((3, 3)), np.array([(0, 1, 2), (0, 0, 0)], np.int32))
     line = Mesh(np.array([(0, 0, 0), (1, 0, 0), (2, 0, 0)], float), np.array([(0, 1, 2)], np.int32))
     pose = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
@@ -101,7 +97,7 @@ def test_nothing_but_faces_without_area(scene_of: MakeScene) -> None:
         assert check(scene_of(SceneObject(surface, pose))).visible_fractions[0] == 0
 
 
-def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of: MakeScene) -> None:
+def test_a_hub_of_many_faces_takes_no_square_of_time(scene_of):
     # All pairs of these faces would take minutes.
     count = 150_000
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)

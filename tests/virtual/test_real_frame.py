@@ -50,21 +50,21 @@ def rendered(ycb_root: Path, frame: Frame) -> Rendered:
 
 
 @pytest.mark.parametrize(("index", "class_index"), list(enumerate(CLASSES)))
-def test_mask_and_depth(rendered: Rendered, frame: Frame, index: int, class_index: int) -> None:
+def test_mask_and_depth(rendered, frame, index, class_index):
     mask, real = rendered.instances == index, frame["label"] == class_index
     assert (mask & real).sum() / (mask | real).sum() > 0.85
     known = mask & real & (frame["depth"] > 0)
     assert np.median(np.abs(rendered.depth - frame["depth"])[known]) < 0.01
 
 
-def test_occlusion_order(rendered: Rendered) -> None:
+def test_occlusion_order(rendered):
     # The bottle stands before the can and the box.
     assert rendered.visible_fractions[2] > 0.99
     assert (rendered.visible_fractions[:2] < 0.9).all()
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_texture_is_upright(ycb_root: Path, rendered: Rendered, frame: Frame, axis: int) -> None:
+def test_texture_is_upright(ycb_root, rendered, frame, axis):
     scene = rendered.scene
     part = scene.objects[0].part
     assert part is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +24,7 @@ def picture() -> np.ndarray:
     return cv2.GaussianBlur(noise, (9, 9), 2)
 
 
-def test_a_zero_sensor_changes_nothing(picture: np.ndarray) -> None:
+def test_a_zero_sensor_changes_nothing(picture):
     assert capture(picture, Sensor()) is picture
 
 
@@ -41,9 +40,8 @@ def test_a_zero_sensor_changes_nothing(picture: np.ndarray) -> None:
     size=st.tuples(st.integers(1, 20), st.integers(1, 20)),
 )
 def test_capture_is_pure_and_keeps_the_shape(
-    exposure: float, blur: float, motion: tuple[float, float], read: float, shot: float,
-    quality: int | None, seed: int, size: tuple[int, int],
-) -> None:  # fmt: skip
+    exposure, blur, motion, read, shot, quality, seed, size
+):
     image = np.random.default_rng(1).integers(0, 256, (*size, 3), np.uint8)
     before, sensor = image.copy(), Sensor(exposure, blur, motion, read, shot, quality, seed)
     first = capture(image, sensor)
@@ -58,7 +56,7 @@ def linear(codes: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("exposure", [-2.0, -0.3, 0.5, 1.0])
-def test_exposure_multiplies_the_light(exposure: float) -> None:
+def test_exposure_multiplies_the_light(exposure):
     codes = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     exposed = capture(codes, Sensor(exposure_ev=exposure))
     wanted = np.minimum(linear(codes) * 2**exposure, 1.0)
@@ -68,7 +66,7 @@ def test_exposure_multiplies_the_light(exposure: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5])
-def test_defocus_is_scipys_gaussian(picture: np.ndarray, sigma: float) -> None:
+def test_defocus_is_scipys_gaussian(picture, sigma):
     expected = scipy.ndimage.gaussian_filter(
         picture.astype(float), (sigma, sigma, 0), mode="mirror", truncate=4
     )
@@ -77,9 +75,7 @@ def test_defocus_is_scipys_gaussian(picture: np.ndarray, sigma: float) -> None:
 
 
 @pytest.mark.parametrize("motion", [(7.0, 0.0), (0.0, -4.5), (3.0, 2.0), (0.3, 0.1), (-6.0, 9.0)])
-def test_motion_blur_is_the_mean_of_shifted_pictures(
-    picture: np.ndarray, motion: tuple[float, float]
-) -> None:
+def test_motion_blur_is_the_mean_of_shifted_pictures(picture, motion):
     shifts = [
         scipy.ndimage.shift(picture.astype(float), (t * motion[1], t * motion[0], 0), order=1,
                             mode="mirror")
@@ -90,7 +86,7 @@ def test_motion_blur_is_the_mean_of_shifted_pictures(
 
 
 @pytest.mark.parametrize(("level", "read", "shot"), [(128, 6, 0), (40, 0, 8), (200, 3, 5)])
-def test_noise_has_the_stated_spread(level: int, read: float, shot: float) -> None:
+def test_noise_has_the_stated_spread(level, read, shot):
     flat = np.full((300, 400, 3), level, np.uint8)
     noise = add_noise(flat, read, shot, 3).astype(float) - level
     # Rounding to whole levels adds a variance of 1/12.
@@ -101,7 +97,7 @@ def test_noise_has_the_stated_spread(level: int, read: float, shot: float) -> No
     assert abs(scipy.stats.skew(noise.reshape(-1))) < 0.03
 
 
-def test_noise_is_independent_of_place_channel_and_seed() -> None:
+def test_noise_is_independent_of_place_channel_and_seed():
     flat = np.full((300, 400, 3), 128, np.uint8)
     noise = add_noise(flat, 8, 0, 3).astype(float) - 128
     other = add_noise(flat, 8, 0, 4).astype(float) - 128
@@ -113,7 +109,7 @@ def test_noise_is_independent_of_place_channel_and_seed() -> None:
         assert abs(np.corrcoef(a.reshape(-1), b.reshape(-1))[0, 1]) < 0.015
 
 
-def test_jpeg_is_pillows(picture: np.ndarray) -> None:
+def test_jpeg_is_pillows(picture):
     for quality in (30, 90):
         stream = io.BytesIO()
         Image.fromarray(picture).save(stream, "jpeg", quality=quality, subsampling=2)
@@ -132,12 +128,12 @@ def test_jpeg_is_pillows(picture: np.ndarray) -> None:
         {"jpeg_quality": 101}, {"noise_seed": -1}, {"noise_seed": 2**32},
     ],
 )  # fmt: skip
-def test_impossible_sensors_are_refused(picture: np.ndarray, change: dict[str, Any]) -> None:
+def test_impossible_sensors_are_refused(picture, change):
     with pytest.raises(UserError, match="change the sensor's settings"):
         capture(picture, Sensor(**change))
 
 
-def test_drawn_sensors_keep_to_their_ranges() -> None:
+def test_drawn_sensors_keep_to_their_ranges():
     ranges, rng = Sensors(), np.random.default_rng(0)
     drawn = [ranges.draw(rng) for _ in range(2000)]
     for sensor in drawn:
@@ -152,7 +148,7 @@ def test_drawn_sensors_keep_to_their_ranges() -> None:
     assert len({s.noise_seed for s in drawn}) > 1990
 
 
-def test_everything_off_is_the_zero_sensor() -> None:
+def test_everything_off_is_the_zero_sensor():
     off = Sensors(
         exposure_probability=0, blur_probability=0, motion_probability=0, noise_probability=0,
         jpeg_probability=0,

@@ -36,7 +36,7 @@ def trained(small_spec: dict[str, Any]) -> Checkpoint:
     )  # fmt: skip
 
 
-def test_it_is_the_network_in_half_precision(trained: Checkpoint, tmp_path: Path) -> None:
+def test_it_is_the_network_in_half_precision(trained, tmp_path):
     path = tmp_path / "bracket.safetensors"
     released.write_content(trained.to_file(), path)
     with safe_open(path, "pt") as file:  # by the library itself
@@ -51,7 +51,7 @@ def test_it_is_the_network_in_half_precision(trained: Checkpoint, tmp_path: Path
         torch.testing.assert_close(value, expected, rtol=2**-11, atol=2**-24)
 
 
-def test_nothing_in_it_names_a_local_path(trained: Checkpoint, tmp_path: Path) -> None:
+def test_nothing_in_it_names_a_local_path(trained, tmp_path):
     path = tmp_path / "bracket.safetensors"
     released.write_content(trained.to_file(), path)
     assert b"someone" not in path.read_bytes()
@@ -61,7 +61,7 @@ def test_nothing_in_it_names_a_local_path(trained: Checkpoint, tmp_path: Path) -
     assert config["virtual"] == {"backgrounds": None, "preset": "wide"}
 
 
-def test_weights_beyond_half_precision_are_refused(trained: Checkpoint, tmp_path: Path) -> None:
+def test_weights_beyond_half_precision_are_refused(trained, tmp_path):
     name = next(iter(trained.state_dict))
     trained.state_dict[name] = torch.full_like(trained.state_dict[name], 1e6)
     with pytest.raises(UserError, match=f"{name} with values up to 1e\\+06"):
@@ -69,9 +69,7 @@ def test_weights_beyond_half_precision_are_refused(trained: Checkpoint, tmp_path
     assert not any(tmp_path.iterdir())
 
 
-def test_a_name_stands_for_a_file_of_the_package(
-    trained: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_stands_for_a_file_of_the_package(trained, tmp_path, monkeypatch):
     path = tmp_path / "bracket.safetensors"
     released.write_content(trained.to_file(), path)
     monkeypatch.setattr(released, "released_paths", lambda: {"bracket": path})
@@ -86,7 +84,7 @@ def test_a_name_stands_for_a_file_of_the_package(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[" * 100_000, json.dumps({"spec": 1})])
-def test_a_file_without_a_description(text: str, trained: Checkpoint, tmp_path: Path) -> None:
+def test_a_file_without_a_description(text, trained, tmp_path):
     path = tmp_path / "other.safetensors"
     released.write_safetensors(path, {"network.a": torch.zeros(2)}, {"dopepp": text})
     with pytest.raises(UserError, match=r"other\.safetensors"):
@@ -94,7 +92,7 @@ def test_a_file_without_a_description(text: str, trained: Checkpoint, tmp_path: 
 
 
 @pytest.mark.parametrize("name", sorted(released.released_paths()))
-def test_what_is_released_loads_and_is_small_and_portable(name: str) -> None:
+def test_what_is_released_loads_and_is_small_and_portable(name):
     path = released.released_paths()[name]
     assert path.stat().st_size <= 5_000_000
     assert f"pretrained/{name}" in path.with_suffix(".md").read_text()

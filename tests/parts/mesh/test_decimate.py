@@ -27,7 +27,7 @@ def distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
     return cKDTree(trimesh.sample.sample_surface(solid, 400_000, seed=0)[0]).query(points)[0]
 
 
-def test_a_part_keeps_its_shape() -> None:
+def test_a_part_keeps_its_shape():
     mesh = servoholder().mesh
     assert mesh is not None
     vertices, faces = subdivided(mesh, 0.0015)
@@ -48,7 +48,7 @@ def test_a_part_keeps_its_shape() -> None:
     np.testing.assert_allclose(np.ptp(fewer, axis=0), np.ptp(vertices, axis=0), rtol=1e-3)
 
 
-def test_a_ball_stays_a_ball_that_faces_outwards() -> None:
+def test_a_ball_stays_a_ball_that_faces_outwards():
     ball = trimesh.creation.icosphere(subdivisions=6, radius=0.05)
     vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
     fewer, kept, _, moved = decimate(vertices, faces, None, 5000)
@@ -69,7 +69,7 @@ def test_a_ball_stays_a_ball_that_faces_outwards() -> None:
     size=st.sampled_from([0.02, 0.5, 3.0]),
     flat=st.booleans(),
 )
-def test_any_triangles_are_taken(seed: int, num_faces: int, size: float, flat: bool) -> None:
+def test_any_triangles_are_taken(seed, num_faces, size, flat):
     rng = np.random.default_rng(seed)
     corners = rng.random((num_faces, 1, 3)) + size * rng.random((num_faces, 3, 3))
     if flat:
@@ -87,7 +87,7 @@ def test_any_triangles_are_taken(seed: int, num_faces: int, size: float, flat: b
     assert moved <= np.linalg.norm(np.ptp(vertices, axis=0))
 
 
-def test_texture_coordinates_stay_on_their_side_of_a_seam() -> None:
+def test_texture_coordinates_stay_on_their_side_of_a_seam():
     # A tube unrolled: at the seam one position has u = 0 and u = 1.
     count, rings = 240, 200
     angle, height = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, rings + 1))
@@ -110,9 +110,7 @@ def test_texture_coordinates_stay_on_their_side_of_a_seam() -> None:
     np.testing.assert_allclose(coordinates[:, 1], fewer[:, 2] / 3, atol=0.02)
 
 
-def test_the_part_is_measured_before_it_is_decimated(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_part_is_measured_before_it_is_decimated(monkeypatch, caplog):
     mesh = servoholder().mesh
     assert mesh is not None
     whole = make_part("a", mesh)
@@ -134,7 +132,7 @@ def test_the_part_is_measured_before_it_is_decimated(
     np.testing.assert_array_equal(fewer.points, whole.points)
 
 
-def test_specks_that_no_triangle_can_stand_for_are_refused() -> None:
+def test_specks_that_no_triangle_can_stand_for_are_refused():
     # Far more separate specks than the limit, each inside of a cell of any grid that is tried.
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 1, 3) + 0.45
     specks = grid + 1e-6 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])

@@ -9,7 +9,6 @@ import re
 import struct
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,6 @@ from dopepp.parts.mesh.library import UNITS_3MF
 BOX = trimesh.creation.box((10.0, 20.0, 30.0))
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 TURN = trimesh.transformations.rotation_matrix(0.3, [1, 2, 3], [4, 5, 6])
-Write = Callable[[str, str | bytes], Path]
-Refused = Callable[[str, str | bytes, str], None]
 
 
 def obj(faces: str, before: str = "") -> str:
@@ -72,7 +69,7 @@ WRONG: dict[str, tuple[str | bytes, int, int | str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_trimesh_makes_of_it(write: Write, refused: Refused, name: str) -> None:
+def test_what_trimesh_makes_of_it(write, refused, name):
     """Where one of these fails, trimesh has learned it and a check or a reader here can go."""
     content, theirs, ours = WRONG[name]
     path = write(name, content)
@@ -87,7 +84,7 @@ def test_what_trimesh_makes_of_it(write: Write, refused: Refused, name: str) -> 
         assert len(read_mesh(path, "cm").faces) == ours
 
 
-def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write: Write) -> None:
+def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write):
     path = write("a.obj", obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n")
     theirs = trimesh.load_mesh(path, process=False)
     assert theirs.vertices[theirs.faces[0]].tolist() == [[1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -95,7 +92,7 @@ def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write: Write
     assert ours.vertices[ours.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
 
 
-def test_trimesh_splits_vertices_where_normals_differ(write: Write) -> None:
+def test_trimesh_splits_vertices_where_normals_differ(write):
     box = BOX.copy()
     normals = box.face_normals.tolist()
     text = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices.tolist())
@@ -107,7 +104,7 @@ def test_trimesh_splits_vertices_where_normals_differ(write: Write) -> None:
     assert len(read_mesh(path, "mm").vertices) == 8
 
 
-def test_trimesh_puts_the_triangles_of_quads_in_another_order(write: Write) -> None:
+def test_trimesh_puts_the_triangles_of_quads_in_another_order(write):
     """A mesh's hash, which checkpoints and render caches know it by, depends on the order."""
     path = write("a.ply", ply_faces(*QUADS))
     theirs, ours = trimesh.load_mesh(path, process=False).faces, read_mesh(path, "mm").faces
@@ -119,18 +116,18 @@ def test_trimesh_puts_the_triangles_of_quads_in_another_order(write: Write) -> N
 
 
 @pytest.mark.parametrize("count", [0, 1, 11, 13, 10**9, 2**32 - 1])
-def test_a_binary_stl_that_lies_about_its_triangles(refused: Refused, count: int) -> None:
+def test_a_binary_stl_that_lies_about_its_triangles(refused, count):
     binary = export_stl(BOX)
     lie = binary[:80] + struct.pack("<I", count) + binary[84:]
     refused("a.stl", lie, rf"684 bytes where its header promises {count} triangles")
 
 
-def test_a_binary_stl_may_begin_like_text(write: Write) -> None:
+def test_a_binary_stl_may_begin_like_text(write):
     path = write("a.stl", b"solid part".ljust(80) + export_stl(BOX)[80:])
     assert len(read_mesh(path, "mm").faces) == 12
 
 
-def test_a_text_stl_may_be_laid_out_in_any_way(write: Write) -> None:
+def test_a_text_stl_may_be_laid_out_in_any_way(write):
     text = export_stl_ascii(BOX)
     for number, (num_faces, dialect) in enumerate([
         (12, text.upper()),
@@ -143,7 +140,7 @@ def test_a_text_stl_may_be_laid_out_in_any_way(write: Write) -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), [("-5", "nan"), ("vertex", "vertex x")])
-def test_a_text_stl_of_no_numbers_is_refused(refused: Refused, old: str, new: str) -> None:
+def test_a_text_stl_of_no_numbers_is_refused(refused, old, new):
     refused("m.stl", export_stl_ascii(BOX).replace(old, new, 1), "m.stl with")
 
 
@@ -201,9 +198,7 @@ def volume(mesh: Mesh) -> float:
 # GLB
 
 
-def test_a_glb_file_is_in_metres_and_another_unit_is_said(
-    write: Write, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_glb_file_is_in_metres_and_another_unit_is_said(write, caplog):
     small = BOX.copy()
     small.apply_scale(0.001)
     path = write("box.glb", exported(small, "glb"))
@@ -217,7 +212,7 @@ def test_a_glb_file_is_in_metres_and_another_unit_is_said(
         load_part(write("large.glb", exported(BOX, "glb")))
 
 
-def test_a_glb_scene_is_one_mesh_where_its_nodes_are(write: Write) -> None:
+def test_a_glb_scene_is_one_mesh_where_its_nodes_are(write):
     scene = trimesh.Scene()
     scene.add_geometry(BOX, transform=TURN)
     scene.add_geometry(BOX, transform=np.diag([1, 1, -2, 1]))
@@ -231,7 +226,7 @@ def test_a_glb_scene_is_one_mesh_where_its_nodes_are(write: Write) -> None:
     assert volume(loaded) == pytest.approx(3 * 6e-6, rel=1e-6)
 
 
-def test_a_glb_file_has_one_hash(write: Write) -> None:
+def test_a_glb_file_has_one_hash(write):
     """trimesh gives the pieces of one mesh random names."""
 
     def edit(header: dict[str, Any]) -> None:
@@ -242,7 +237,7 @@ def test_a_glb_file_has_one_hash(write: Write) -> None:
     assert len({load_part(path, "mm").mesh_hash for _ in range(5)}) == 1
 
 
-def test_a_glb_texture_lies_as_that_of_an_obj_file(tmp_path: Path, write: Write) -> None:
+def test_a_glb_texture_lies_as_that_of_an_obj_file(tmp_path, write):
     square = textured_square()
     loaded = read_mesh(write("a.glb", exported(square, "glb")))
     assert loaded.uv is not None
@@ -300,21 +295,19 @@ GLB_CASES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("name", GLB_CASES)
-def test_what_trimesh_passes_over_in_a_glb_file_is_refused(
-    write: Write, refused: Refused, name: str
-) -> None:
+def test_what_trimesh_passes_over_in_a_glb_file_is_refused(write, refused, name):
     edit, message = GLB_CASES[name]
     content = edited(exported(textured_square(), "glb"), edit)
     trimesh.load_scene(write("a.glb", content))  # without a word
     refused("a.glb", content, message)
 
 
-def test_one_texture_must_cover_a_glb_file(refused: Refused) -> None:
+def test_one_texture_must_cover_a_glb_file(refused):
     scene = trimesh.Scene([textured_square(), BOX])
     refused("a.glb", exported(scene, "glb"), r"faces of 2 textures; .* bake")
 
 
-def test_a_glb_file_without_its_data_is_cut_short(refused: Refused) -> None:
+def test_a_glb_file_without_its_data_is_cut_short(refused):
     content = exported(BOX, "glb")
     end = 20 + int.from_bytes(content[12:16], "little")
     nothing = content[:8] + struct.pack("<I", end) + content[12:end]
@@ -327,9 +320,7 @@ def test_a_glb_file_without_its_data_is_cut_short(refused: Refused) -> None:
 
 
 @pytest.mark.parametrize("unit", UNITS_3MF)
-def test_a_3mf_file_states_its_unit(
-    write: Write, unit: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_3mf_file_states_its_unit(write, unit, caplog):
     metres = {"millimeter": 1e-3, "centimeter": 1e-2, "meter": 1, "inch": 0.0254}[unit]
     content = repacked(
         exported(BOX, "3mf"), lambda model: model.replace(b"millimeter", unit.encode())
@@ -344,7 +335,7 @@ def test_a_3mf_file_states_its_unit(
         assert f"is in {UNITS_3MF[unit]} by its format: taken as inch" in caplog.text
 
 
-def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write: Write) -> None:
+def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write):
     content = exported(BOX, "3mf")
     bare = repacked(content, lambda model: model.replace(b'unit="millimeter"', b""))
     loaded = read_mesh(write("bare.3mf", bare))
@@ -354,7 +345,7 @@ def test_a_3mf_file_in_no_unit_is_in_millimetres_and_in_feet_is_refused(write: W
         read_mesh(write("feet.3mf", feet))
 
 
-def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write: Write) -> None:
+def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write):
     def transform(x: float) -> str:
         return f'transform="1 0 0 0 0 1 0 -1 0 {x} 0 7"'
 
@@ -385,7 +376,7 @@ def test_a_3mf_build_is_one_mesh_where_it_puts_its_objects(write: Write) -> None
     )
 
 
-def test_a_3mf_model_that_ends_too_early_is_refused(refused: Refused) -> None:
+def test_a_3mf_model_that_ends_too_early_is_refused(refused):
     content = exported(BOX, "3mf")
     size = len(repacked(content, lambda model: model))
     for length in range(500, size, 97):

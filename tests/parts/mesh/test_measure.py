@@ -24,9 +24,7 @@ from dopepp.parts.mesh.measure import (
     rank=st.integers(1, 3),
     far=st.sampled_from([0.0, 10.0]),
 )
-def test_largest_distance_is_the_largest_of_all_pairs(
-    num_points: int, seed: int, rank: int, far: float
-) -> None:
+def test_largest_distance_is_the_largest_of_all_pairs(num_points, seed, rank, far):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(num_points, rank)) @ rng.normal(size=(rank, 3)) + far
     assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-9)
@@ -48,13 +46,13 @@ BALL /= np.linalg.norm(BALL, axis=1, keepdims=True)
     ],
     ids=["one", "coincident", "duplicates", "cube", "many", "all on the hull"],
 )
-def test_largest_distance_of_special_sets(points: np.ndarray) -> None:
+def test_largest_distance_of_special_sets(points):
     expected = pdist(points).max() if len(points) > 1 else 0.0
     assert largest_distance(points) == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
 @pytest.mark.parametrize("shape", ["ball", "noisy ball", "egg", "corner", "lens"])
-def test_largest_distance_of_rounded_sets_without_all_pairs(shape: str) -> None:
+def test_largest_distance_of_rounded_sets_without_all_pairs(shape):
     # More corners than are compared with each other; every point is one.
     rng = np.random.default_rng(2)
     points = rng.normal(size=(7000, 3))
@@ -72,20 +70,20 @@ def test_largest_distance_of_rounded_sets_without_all_pairs(shape: str) -> None:
     assert exact * (1 - 9e-4) < largest_distance(points) <= exact * (1 + 1e-12)
 
 
-def test_largest_distance_of_many_points_in_a_plane_but_one() -> None:
+def test_largest_distance_of_many_points_in_a_plane_but_one():
     x, y = np.meshgrid(np.linspace(0, 1, 100), np.linspace(0, 1, 100))
     points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     points[1] = [0.5, 0.5, 3]
     assert largest_distance(points) == pytest.approx(np.sqrt(9.5), rel=1e-12)
 
 
-def test_face_areas_agree_with_trimesh() -> None:
+def test_face_areas_agree_with_trimesh():
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
     areas = face_areas(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     np.testing.assert_allclose(areas, mesh.area_faces, rtol=1e-12)
 
 
-def test_samples_lie_on_the_surface() -> None:
+def test_samples_lie_on_the_surface():
     mesh = servoholder().mesh
     assert mesh is not None
     points = sample_surface(mesh.vertices, mesh.faces, num_points=300)
@@ -95,7 +93,7 @@ def test_samples_lie_on_the_surface() -> None:
     assert distances.max() < 1e-9
 
 
-def test_samples_are_uniform_over_the_surface() -> None:
+def test_samples_are_uniform_over_the_surface():
     # A box cut into one huge and many small triangles: shares follow area, not faces.
     size = np.array([0.1, 0.2, 0.3])
     box = trimesh.creation.box(size)
@@ -116,7 +114,7 @@ def test_samples_are_uniform_over_the_surface() -> None:
     np.testing.assert_allclose(face[:, 1:].var(axis=0), 1 / 12, atol=0.005)
 
 
-def test_samples_depend_on_the_seed_only() -> None:
+def test_samples_depend_on_the_seed_only():
     mesh = trimesh.creation.box((1, 1, 1))
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     first, again = sample_surface(vertices, faces), sample_surface(vertices, faces)
@@ -124,7 +122,7 @@ def test_samples_depend_on_the_seed_only() -> None:
     assert (sample_surface(vertices, faces, seed=1) != first).any()
 
 
-def test_a_face_without_area_gets_no_sample() -> None:
+def test_a_face_without_area_gets_no_sample():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]])
     faces = np.array([[3, 3, 3], [0, 1, 2], [0, 3, 3]])
     assert sample_surface(vertices, faces).max() <= 1
@@ -133,7 +131,7 @@ def test_a_face_without_area_gets_no_sample() -> None:
             sampler(np.zeros((3, 3)), np.array([[0, 1, 2]]))
 
 
-def test_weld_merges_equal_positions_and_the_two_zeros() -> None:
+def test_weld_merges_equal_positions_and_the_two_zeros():
     soup = trimesh.creation.box((1, 2, 3)).triangles.reshape(-1, 3)
     vertices, faces = weld(soup, np.arange(36).reshape(12, 3))
     assert len(vertices) == 8
@@ -149,7 +147,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_distances_are_those_to_all_triangles(name: str) -> None:
+def test_distances_are_those_to_all_triangles(name):
     mesh = SHAPES[name]
     surface = SurfaceTree(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (500, 3)) * mesh.extents
@@ -160,7 +158,7 @@ def test_distances_are_those_to_all_triangles(name: str) -> None:
     assert np.quantile(np.abs(found - expected), 0.98) < 1e-12
 
 
-def test_points_are_spread_by_area_and_lie_on_their_triangles() -> None:
+def test_points_are_spread_by_area_and_lie_on_their_triangles():
     mesh = SHAPES["box"]
     surface = SurfaceTree(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     points, owners = surface.spread(3000, seed=0)

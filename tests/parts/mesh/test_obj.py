@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,8 +13,6 @@ from dopepp.parts import read_mesh
 
 SQUARE = "v 0 0 0\nv 100 0 0\nv 100 100 0\nv 0 100 0\n"
 TEXTURED = f"mtllib a.mtl\n{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3 4/4\n"
-Write = Callable[[str, str | bytes], Path]
-Refused = Callable[[str, str | bytes, str], None]
 
 
 def write_texture(path: Path) -> np.ndarray:
@@ -25,7 +22,7 @@ def write_texture(path: Path) -> np.ndarray:
     return rgb
 
 
-def test_dialects(write: Write) -> None:
+def test_dialects(write):
     text = (
         "# made by hand\r\no thing\r\nv\t0 0 0 1 1 1\r\nv 10 0 0 \r\nv 10 10 0\r\nv 0 10 0\r\n"
         "vn 0 0 1\r\ng side\r\ns off\r\nf -4//1 -3//1 \\\r\n -2//1\r\nf 1 3 4\r\nl 1 2\r\n"
@@ -35,7 +32,7 @@ def test_dialects(write: Write) -> None:
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.01, 0.01, 0])
 
 
-def test_a_concave_polygon_whose_fan_fills_it_is_taken(write: Write) -> None:
+def test_a_concave_polygon_whose_fan_fills_it_is_taken(write):
     text = "v 0 0 0\nv 2 0 0\nv 0.5 0.5 0\nv 0 2 0\nf 1 2 3 4\n"  # the fan starts at 0 0 0
     loaded = read_mesh(write("m.obj", text), "m")
     assert trimesh.Trimesh(loaded.vertices, loaded.faces, process=False).area == pytest.approx(1.0)
@@ -56,12 +53,12 @@ def test_a_concave_polygon_whose_fan_fills_it_is_taken(write: Write) -> None:
         ),
     ],
 )
-def test_a_damaged_line_is_named(refused: Refused, text: str, message: str) -> None:
+def test_a_damaged_line_is_named(refused, text, message):
     refused("m.obj", text, message)
 
 
 @pytest.mark.parametrize("name", ["t.png", "maps/t.png", "maps\\t.png", "my texture ü.png"])
-def test_texture_and_uv_are_read(tmp_path: Path, write: Write, name: str) -> None:
+def test_texture_and_uv_are_read(tmp_path, write, name):
     (tmp_path / "maps").mkdir()
     rgb = write_texture(tmp_path / name.replace("\\", "/"))
     write("a.mtl", f"newmtl m\nKd 1 1 1\nmap_Kd {name} \n")
@@ -71,7 +68,7 @@ def test_texture_and_uv_are_read(tmp_path: Path, write: Write, name: str) -> Non
     np.testing.assert_allclose(loaded.vertices[:, :2], 0.1 * loaded.uv)
 
 
-def test_a_vertex_on_a_seam_is_split(tmp_path: Path, write: Write) -> None:
+def test_a_vertex_on_a_seam_is_split(tmp_path, write):
     write_texture(tmp_path / "t.png")
     write("a.mtl", "newmtl m\nmap_Kd t.png\n")
     text = TEXTURED.replace("f 1/1 2/2 3/3 4/4", "f 1/1 2/2 3/3\nf 1/4 3/3 4/2")
@@ -106,9 +103,7 @@ def test_a_vertex_on_a_seam_is_split(tmp_path: Path, write: Write) -> None:
         ("map_Kd t.png\n", "faces without texture coordinates"),
     ],
 )
-def test_a_bad_texture_is_refused(
-    tmp_path: Path, refused: Refused, materials: str, message: str
-) -> None:
+def test_a_bad_texture_is_refused(tmp_path, refused, materials, message):
     folder = tmp_path / "part"
     (folder / "maps").mkdir(parents=True)
     write_texture(tmp_path / "out.png")
@@ -135,16 +130,14 @@ def test_a_bad_texture_is_refused(
         ("other.mtl", "uses the material 'm'; allowed: materials of other.mtl"),
     ],
 )
-def test_a_material_file_must_be_in_the_folder(
-    tmp_path: Path, write: Write, refused: Refused, library: str, message: str
-) -> None:
+def test_a_material_file_must_be_in_the_folder(tmp_path, write, refused, library, message):
     (tmp_path / "part").mkdir()
     write("a.mtl", "newmtl m\n")
     write("part/other.mtl", "newmtl other\nmap_Kd t.png\n")
     refused("part/m.obj", TEXTURED.replace("a.mtl", library), message)
 
 
-def test_materials_without_a_texture_are_fine(write: Write) -> None:
+def test_materials_without_a_texture_are_fine(write):
     write("a.mtl", "newmtl m\nKd 1 0 0\nnewmtl other\nmap_Kd gone.png\n")
     loaded = read_mesh(write("m.obj", TEXTURED), "mm")
     assert loaded.texture is loaded.uv is None

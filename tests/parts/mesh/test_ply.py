@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +21,6 @@ QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [
 MIXED = [*QUADS[:3], [2, 3, 7], [2, 7, 6], *QUADS[4:]]
 CODES = {"uchar": "B", "int": "i", "uint": "I", "ushort": "H", "int32": "i", "uint8": "B"}
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-Write = Callable[[str, str | bytes], Path]
-Refused = Callable[[str, str | bytes, str], None]
 
 
 def ply(
@@ -75,9 +71,7 @@ def ply(
 @pytest.mark.parametrize("faces", [TRIANGLES, QUADS, MIXED], ids=["triangles", "quads", "mixed"])
 @pytest.mark.parametrize("extra", [False, True])
 @pytest.mark.parametrize("types", [("uchar", "int"), ("uint8", "int32"), ("uint", "ushort")])
-def test_every_dialect_gives_the_box(
-    write: Write, form: str, faces: list[list[int]], extra: bool, types: tuple[str, str]
-) -> None:
+def test_every_dialect_gives_the_box(write, form, faces, extra, types):
     loaded = read_mesh(write("a.ply", ply(form, faces, extra=extra, types=types)), "mm")
     assert loaded.uv is None
     solid = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
@@ -88,15 +82,13 @@ def test_every_dialect_gives_the_box(
 
 @pytest.mark.parametrize("newline", ["\r\n", "\r"])
 @pytest.mark.parametrize("form", FORMATS)
-def test_line_ends_of_every_system(write: Write, form: str, newline: str) -> None:
+def test_line_ends_of_every_system(write, form, newline):
     assert len(read_mesh(write("a.ply", ply(form, MIXED, newline=newline)), "mm").faces) == 12
 
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
-def test_a_texture_and_its_coordinates_by_any_name(
-    tmp_path: Path, write: Write, form: str, names: tuple[str, str]
-) -> None:
+def test_a_texture_and_its_coordinates_by_any_name(tmp_path, write, form, names):
     pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "t.png")
     content = ply(form, TRIANGLES, uv=names, extra=True)
@@ -107,7 +99,7 @@ def test_a_texture_and_its_coordinates_by_any_name(
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
-def test_agrees_with_trimesh(tmp_path: Path, encoding: str) -> None:
+def test_agrees_with_trimesh(tmp_path, encoding):
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
     ball.export(tmp_path / "a.ply", encoding=encoding)
@@ -134,9 +126,7 @@ def test_agrees_with_trimesh(tmp_path: Path, encoding: str) -> None:
         ({"count": 2}, "face 0 of fewer than 3|bytes more"),
     ],
 )
-def test_a_header_or_a_list_that_lies_is_refused(
-    refused: Refused, form: str, options: dict[str, object], message: str
-) -> None:
+def test_a_header_or_a_list_that_lies_is_refused(refused, form, options, message):
     refused("a.ply", ply(form, TRIANGLES, **options), message)  # type: ignore[arg-type]
 
 
@@ -158,7 +148,7 @@ def test_a_header_or_a_list_that_lies_is_refused(
         ("obj_info none", "comment TextureFile t.png", "1 textures, no uv"),
     ],
 )
-def test_damage_is_named(refused: Refused, old: str, new: str, message: str) -> None:
+def test_damage_is_named(refused, old, new, message):
     content = ply("ascii", TRIANGLES)
     assert old.encode() in content
     refused("a.ply", content.replace(old.encode(), new.encode(), 1), message)
@@ -167,21 +157,19 @@ def test_damage_is_named(refused: Refused, old: str, new: str, message: str) -> 
 @pytest.mark.parametrize(
     ("name", "message"), [("gone.png", "does not exist"), ("../t.png", "outside of its folder")]
 )
-def test_a_texture_elsewhere_is_refused(refused: Refused, name: str, message: str) -> None:
+def test_a_texture_elsewhere_is_refused(refused, name, message):
     content = ply("ascii", TRIANGLES, uv=("u", "v")).replace(b"t.png", name.encode())
     refused("a.ply", content, f"TextureFile '{name}' .*{message}")
 
 
-def test_a_folded_polygon_is_named(refused: Refused) -> None:
+def test_a_folded_polygon_is_named(refused):
     content = ply("binary_little_endian", [[0, 3, 1, 2], *QUADS[1:]])
     refused("a.ply", content, "a polygon that is not convex, face 0")
 
 
 @settings(deadline=None, max_examples=100)
 @given(st.data())
-def test_a_changed_byte_gives_a_mesh_or_one_line(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_a_changed_byte_gives_a_mesh_or_one_line(tmp_path_factory, data):
     form = data.draw(st.sampled_from(sorted(FORMATS)))
     content = bytearray(ply(form, MIXED, extra=True))
     for _ in range(data.draw(st.integers(1, 3))):

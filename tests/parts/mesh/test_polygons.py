@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -26,7 +23,7 @@ def off(faces: list[list[int]], vertices: np.ndarray = BOX.vertices) -> str:
     return f"OFF\n{len(vertices)} {len(faces)} 0\n" + "\n".join(rows) + "\n"
 
 
-def test_fans_lie_around_first_corners() -> None:
+def test_fans_lie_around_first_corners():
     triangles = fans(ROUND, np.arange(12), np.array([3, 5, 4]))
     assert triangles.tolist() == [
         [0, 1, 2], [3, 4, 5], [3, 5, 6], [3, 6, 7], [8, 9, 10], [8, 10, 11]
@@ -36,7 +33,7 @@ def test_fans_lie_around_first_corners() -> None:
 
 
 @pytest.mark.parametrize("other", [DART, SQUARE[[0, 2, 1, 3]]], ids=["dart", "bow tie"])
-def test_a_fan_over_a_dent_is_folded(other: np.ndarray) -> None:
+def test_a_fan_over_a_dent_is_folded(other):
     corners, counts = np.arange(8), np.array([4, 4])
     assert len(fans(np.vstack([SQUARE, SQUARE]), corners, counts)) == 4
     with pytest.raises(FoldedPolygonError, match="not convex, face 1"):
@@ -45,7 +42,7 @@ def test_a_fan_over_a_dent_is_folded(other: np.ndarray) -> None:
     assert len(fans(np.vstack([SQUARE, other]), corners + 1, counts)) == 4
 
 
-def test_off_polygons_and_dialects(write: Callable[[str, str], Path]) -> None:
+def test_off_polygons_and_dialects(write):
     text = off([*QUADS[:3], [2, 3, 7], [2, 7, 6], *QUADS[4:]])
     for number, dialect in enumerate([
         text, off(BOX.faces.tolist()), off(QUADS), export_off(BOX),
@@ -60,7 +57,7 @@ def test_off_polygons_and_dialects(write: Callable[[str, str], Path]) -> None:
         assert len(loaded.faces) == 12
 
 
-def test_a_prism_of_hexagons_in_an_off_file(write: Callable[[str, str], Path]) -> None:
+def test_a_prism_of_hexagons_in_an_off_file(write):
     ring = ROUND[::2]
     sides = [[i, (i + 1) % 6, 6 + (i + 1) % 6, 6 + i] for i in range(6)]
     faces = [[5, 4, 3, 2, 1, 0], *sides, [6, 7, 8, 9, 10, 11]]
@@ -84,7 +81,5 @@ def test_a_prism_of_hexagons_in_an_off_file(write: Callable[[str, str], Path]) -
         ("-5.0", "nan", "not a finite number, vertex 1"),
     ],
 )
-def test_a_damaged_off_file_is_named(
-    refused: Callable[[str, str, str], None], old: str, new: str, message: str
-) -> None:
+def test_a_damaged_off_file_is_named(refused, old, new, message):
     refused("a.off", off(QUADS).replace(old, new, 1), message)

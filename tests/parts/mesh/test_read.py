@@ -34,17 +34,13 @@ FILES = {
 }
 UNSTATED = [name for name in FILES if name not in ("box.glb", "box.3mf")]
 SQUARE = "v 0 0 0\nv 100 0 0\nv 100 100 0\nv 0 100 0\n"
-Write = Callable[[str, str | bytes], Path]
-Refused = Callable[[str, str | bytes, str], None]
 
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize(
     ("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1), ("inch", 0.0254)]
 )
-def test_every_format_and_unit_gives_the_same_box(
-    write: Write, name: str, unit: str, metres: float
-) -> None:
+def test_every_format_and_unit_gives_the_same_box(write, name, unit, metres):
     loaded = read_mesh(write(name, FILES[name]), unit)
     size = np.ptp(loaded.vertices, axis=0)
     np.testing.assert_allclose(size, metres * np.array([10, 20, 30]), rtol=1e-7)
@@ -57,9 +53,7 @@ def test_every_format_and_unit_gives_the_same_box(
 
 
 @pytest.mark.parametrize("name", UNSTATED)
-def test_millimetres_are_assumed_and_said(
-    write: Write, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_millimetres_are_assumed_and_said(write, name, caplog):
     path = write(name, FILES[name])
     with caplog.at_level(logging.WARNING):
         stated = read_mesh(path, "mm")
@@ -71,7 +65,7 @@ def test_millimetres_are_assumed_and_said(
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_cut_anywhere_is_never_half_a_mesh(refused: Refused, name: str) -> None:
+def test_a_file_cut_anywhere_is_never_half_a_mesh(refused, name):
     content = FILES[name].rstrip(b"\n")
     for length in [0, *np.linspace(1, len(content) - 2, 25).astype(int)]:
         lines = content[:length].split(b"\n")
@@ -98,15 +92,13 @@ def test_a_file_cut_anywhere_is_never_half_a_mesh(refused: Refused, name: str) -
         ],
     ],
 )
-def test_another_format_under_a_suffix_is_refused(
-    refused: Refused, name: str, content: bytes
-) -> None:
+def test_another_format_under_a_suffix_is_refused(refused, name, content):
     refused(name, content, name)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["a.stl", "text.stl", "a.ply", "text.ply", "a.obj"])
-def test_a_coordinate_that_is_no_number_is_named(refused: Refused, name: str, value: float) -> None:
+def test_a_coordinate_that_is_no_number_is_named(refused, name, value):
     box = BOX.copy()
     # Value 7 of the box is its third vertex's y.
     box.vertices = np.where(np.arange(24).reshape(8, 3) == 7, value, box.vertices)
@@ -130,7 +122,7 @@ def test_a_coordinate_that_is_no_number_is_named(refused: Refused, name: str, va
     refused(name, content, rf"{name} with .*{place}")
 
 
-def test_a_path_or_unit_that_cannot_be_is_refused(tmp_path: Path, write: Write) -> None:
+def test_a_path_or_unit_that_cannot_be_is_refused(tmp_path, write):
     path = write("box.stl", FILES["binary.stl"])
     with pytest.raises(
         UserError, match=r"box\.step; allowed: files ending in \.stl, \.obj, \.ply, \.glb, "
@@ -146,9 +138,7 @@ def test_a_path_or_unit_that_cannot_be_is_refused(tmp_path: Path, write: Write) 
             read_mesh(tmp_path / name, "mm")
 
 
-def test_flat_triangles_are_dropped_and_counted(
-    write: Write, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_flat_triangles_are_dropped_and_counted(write, caplog):
     text = SQUARE + "v 50 0 0\nv 7 7 7\nf 1 2 3 4\nf 1 2 5\nf 1 1 2\nf 6 6 6\n"
     with caplog.at_level(logging.INFO):
         loaded = read_mesh(write("m.obj", text), "mm")
@@ -168,13 +158,11 @@ def test_flat_triangles_are_dropped_and_counted(
         ("m.stl", "solid a\nendsolid a\n", "0 vertices and 0 faces"),
     ],
 )
-def test_a_file_without_a_surface_is_refused(
-    refused: Refused, name: str, content: str, message: str
-) -> None:
+def test_a_file_without_a_surface_is_refused(refused, name, content, message):
     refused(name, content, message)
 
 
-def test_load_part_by_name_and_by_path(write: Write, caplog: pytest.LogCaptureFixture) -> None:
+def test_load_part_by_name_and_by_path(write, caplog):
     assert load_part("servoholder").name == "servoholder"
     assert load_part("pivconnector", "inch") is load_part("pivconnector")  # unit is for files
     path = write("My_Box.stl", FILES["binary.stl"])
@@ -197,7 +185,7 @@ def test_load_part_by_name_and_by_path(write: Write, caplog: pytest.LogCaptureFi
         ("a.mtl", r"a\.mtl of 10000 MB; allowed: up to 10 MB"),
     ],
 )
-def test_a_huge_file_is_not_read(tmp_path: Path, write: Write, name: str, message: str) -> None:
+def test_a_huge_file_is_not_read(tmp_path, write, name, message):
     mesh = write("a.obj", "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with (tmp_path / name).open("wb") as file:
         file.truncate(10**10)
@@ -237,9 +225,7 @@ def write_torus(path: Path, sections: int) -> None:
 @pytest.mark.parametrize(
     ("sections", "most_mb"), [(320, 400), pytest.param(1000, 1200, marks=pytest.mark.slow)]
 )
-def test_millions_of_faces_are_decimated_in_bounded_memory(
-    tmp_path: Path, sections: int, most_mb: int
-) -> None:
+def test_millions_of_faces_are_decimated_in_bounded_memory(tmp_path, sections, most_mb):
     write_torus(tmp_path / "torus.stl", sections)
     command = [sys.executable, "-c", _LOAD, str(tmp_path / "torus.stl")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ def cyclic(faces: np.ndarray) -> set[tuple[int, ...]]:
     return {tuple(np.roll(face, -int(face.argmin())).tolist()) for face in faces}
 
 
-def test_edges_agree_with_trimesh() -> None:
+def test_edges_agree_with_trimesh():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     vertices, faces = arrays(mesh)
     assert find_topology(vertices, faces).is_closed
@@ -48,7 +47,7 @@ def test_edges_agree_with_trimesh() -> None:
 
 @settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1), whole=st.booleans())
-def test_any_closed_solid_ends_up_facing_outwards(seed: int, share: float, whole: bool) -> None:
+def test_any_closed_solid_ends_up_facing_outwards(seed, share, whole):
     rng = np.random.default_rng(seed)
     mesh = trimesh.creation.annulus(0.3, 1.0, 0.5, sections=16)
     vertices, faces = arrays(mesh)
@@ -57,7 +56,7 @@ def test_any_closed_solid_ends_up_facing_outwards(seed: int, share: float, whole
     assert cyclic(result) == cyclic(faces)
 
 
-def test_an_open_surface_follows_its_majority() -> None:
+def test_an_open_surface_follows_its_majority():
     vertices, faces = arrays(trimesh.creation.icosphere(subdivisions=2))
     bowl = faces[vertices[faces].mean(axis=1)[:, 2] < 0.3]
     wrong = np.arange(len(bowl)) % 5 == 0
@@ -66,7 +65,7 @@ def test_an_open_surface_follows_its_majority() -> None:
     assert cyclic(repaired(vertices, inwards)) == cyclic(bowl[:, ::-1])
 
 
-def test_every_body_is_repaired_by_itself_and_a_cavity_stays() -> None:
+def test_every_body_is_repaired_by_itself_and_a_cavity_stays():
     outer, inner = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 0.5)
     inner.invert()
     hollow = trimesh.util.concatenate([outer, inner])
@@ -76,7 +75,7 @@ def test_every_body_is_repaired_by_itself_and_a_cavity_stays() -> None:
     assert cyclic(repaired(vertices, mixed)) == cyclic(faces)
 
 
-def test_one_body_of_several_that_faces_inwards_is_turned() -> None:
+def test_one_body_of_several_that_faces_inwards_is_turned():
     ball = trimesh.creation.icosphere(2, 1.0)
     beside = trimesh.creation.box((0.5, 0.5, 0.5))
     beside.apply_translation((2, 0, 0))
@@ -86,7 +85,7 @@ def test_one_body_of_several_that_faces_inwards_is_turned() -> None:
     assert cyclic(repaired(vertices, faces)) == cyclic(faces)
 
 
-def test_a_moebius_strip_is_left_alone() -> None:
+def test_a_moebius_strip_is_left_alone():
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rims = []
     for side in (-0.2, 0.2):
@@ -107,9 +106,7 @@ def test_a_moebius_strip_is_left_alone() -> None:
 @pytest.mark.parametrize(
     ("share", "message"), [(0.1, "turned over [0-9]+ triangles"), (1.0, "turned over 320 tri")]
 )
-def test_a_file_that_faces_the_wrong_way_is_repaired_and_said(
-    tmp_path: Path, share: float, message: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_that_faces_the_wrong_way_is_repaired_and_said(tmp_path, share, message, caplog):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
     ball.faces = turn_over(ball.faces, np.random.default_rng(0).random(len(ball.faces)) < share)
     (tmp_path / "a.stl").write_bytes(export_stl(ball))
@@ -122,7 +119,7 @@ def test_a_file_that_faces_the_wrong_way_is_repaired_and_said(
     assert solid.volume > 0
 
 
-def test_holes_are_counted_in_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_holes_are_counted_in_one_line(tmp_path, caplog):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=20)
     ball.update_faces(np.arange(len(ball.faces)) >= 1)
     (tmp_path / "a.stl").write_bytes(export_stl(ball))
@@ -134,9 +131,7 @@ def test_holes_are_counted_in_one_line(tmp_path: Path, caplog: pytest.LogCapture
     assert len(loaded.faces) == 319
 
 
-def test_bodies_that_pass_through_each_other_are_taken(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_bodies_that_pass_through_each_other_are_taken(tmp_path, caplog):
     boxes = [trimesh.creation.box((20, 20, 20)), trimesh.creation.box((10, 10, 40))]
     (tmp_path / "a.stl").write_bytes(export_stl(trimesh.util.concatenate(boxes)))
     with caplog.at_level(logging.INFO):
@@ -145,7 +140,7 @@ def test_bodies_that_pass_through_each_other_are_taken(
     np.testing.assert_allclose(np.ptp(loaded.vertices, axis=0), [0.02, 0.02, 0.04])
 
 
-def test_a_good_part_is_not_touched() -> None:
+def test_a_good_part_is_not_touched():
     mesh = servoholder().mesh
     assert mesh is not None
     np.testing.assert_array_equal(repaired(mesh.vertices, mesh.faces), mesh.faces)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -12,7 +11,6 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Part
 from dopepp.virtual import Factory, Scene, SceneObject
 from dopepp.virtual.arrange.random_scene import approach
 from dopepp.virtual.presets.preset import customised_preset
@@ -56,7 +54,7 @@ def centre(item: SceneObject) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [0.25, *SCALES])
-def test_a_part_keeps_its_place_and_its_distance_is_divided(scale: float) -> None:
+def test_a_part_keeps_its_place_and_its_distance_is_divided(scale):
     for scene, near in zip(scenes("wide", 1), scenes("wide", scale), strict=True):
         (index,), (there,) = scene.targets, near.targets
         item = scene.objects[index]
@@ -70,7 +68,7 @@ def test_a_part_keeps_its_place_and_its_distance_is_divided(scale: float) -> Non
 
 @pytest.mark.parametrize("name", ["wide", "table"])
 @pytest.mark.parametrize("scale", SCALES)
-def test_only_the_camera_moves(name: str, scale: float) -> None:
+def test_only_the_camera_moves(name, scale):
     for scene, near in zip(scenes(name, 1), scenes(name, scale), strict=True):
         middles = [
             np.mean([centre(o.objects[i]) for i in o.targets], axis=0) for o in (scene, near)
@@ -99,7 +97,7 @@ def test_only_the_camera_moves(name: str, scale: float) -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_the_picture_on_a_table_stays_where_it_lies(scale: float) -> None:
+def test_the_picture_on_a_table_stays_where_it_lies(scale):
     rng, differences = np.random.default_rng(0), []
     for scene, near in zip(scenes("table", 1), scenes("table", scale), strict=True):
         assert scene.plane is not None
@@ -119,26 +117,26 @@ def test_the_picture_on_a_table_stays_where_it_lies(scale: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "table"])
-def test_once_as_large_is_the_image_itself(name: str) -> None:
+def test_once_as_large_is_the_image_itself(name):
     usual, same = factory(name).render(0, 0), factory(name).render(0, 0, 1.0)
     for field in ("image", "depth", "instances", "visible_fractions"):
         assert getattr(usual, field).tobytes() == getattr(same, field).tobytes()
 
 
-def test_without_a_part_the_camera_stays() -> None:
+def test_without_a_part_the_camera_stays():
     distractors = [one for scene in scenes("wide", 1) for one in scene.objects if not one.is_target]
     assert distractors
     np.testing.assert_array_equal(approach(distractors, 3.0), np.zeros(3))
 
 
-def test_what_the_camera_reaches_is_no_longer_in_the_scene() -> None:
+def test_what_the_camera_reaches_is_no_longer_in_the_scene():
     assert len(factory("paper").scene(0, 0).targets) == 1
     rendered = factory("paper").render(0, 0, 15.0)
     assert rendered.scene.objects == ()
     assert (rendered.instances == -1).all()
 
 
-def test_a_camera_stays_above_the_table(sized_box: Callable[[str, float], Part]) -> None:
+def test_a_camera_stays_above_the_table(sized_box):
     low = {"distance": [0.3, 0.3], "elevation_deg": [10.0, 10.0]}
     preset = customised_preset("table", {"table": low, "min_visible_fraction": 0.1})
     factory = Factory([sized_box("high", 8.0)], preset, 0)

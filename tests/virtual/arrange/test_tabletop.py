@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import manifold3d
@@ -21,7 +20,6 @@ from dopepp.virtual import (
     Preset,
     Scene,
     SceneObject,
-    Surface,
     Table,
     customised_preset,
     visible_fractions,
@@ -30,7 +28,6 @@ from dopepp.virtual.arrange.tabletop import HeightMap
 
 NUM_SCENES = 25
 CONTACT = 1e-4
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 
 
 class Constant:
@@ -72,7 +69,7 @@ def heaps(parts: list[Part]) -> list[Scene]:
     return [factory.scene(0, index) for index in range(NUM_SCENES)]
 
 
-def test_everything_on_a_table_touches_it_and_nothing_is_below(tables: list[Scene]) -> None:
+def test_everything_on_a_table_touches_it_and_nothing_is_below(tables):
     for scene in tables:
         for item in scene.objects:
             assert -1e-9 <= heights(scene, item).min() <= CONTACT
@@ -80,7 +77,7 @@ def test_everything_on_a_table_touches_it_and_nothing_is_below(tables: list[Scen
     assert {len(scene.objects) - len(scene.targets) for scene in tables} >= {1, 4, 7}
 
 
-def test_what_does_not_lean_rests_on_a_face(parts: list[Part]) -> None:
+def test_what_does_not_lean_rests_on_a_face(parts):
     factory = Factory(parts, small("table", table={"tilted_share": 0.0}), 1, Constant())
     leaning = Factory(parts, small("table", table={"tilted_share": 1.0}), 1, Constant())
     for index in range(8):
@@ -93,7 +90,7 @@ def test_what_does_not_lean_rests_on_a_face(parts: list[Part]) -> None:
         assert all(-1e-9 <= values.min() <= CONTACT for values in low)
 
 
-def test_heaps_stand_on_the_plane(heaps: list[Scene]) -> None:
+def test_heaps_stand_on_the_plane(heaps):
     for scene in heaps:
         assert -1e-9 <= min(heights(scene, item).min() for item in scene.objects) <= CONTACT
     assert any(max(heights(s, i).min() for i in s.objects) > 0.005 for s in heaps)
@@ -110,9 +107,7 @@ def solid(item: SceneObject) -> manifold3d.Manifold:
 
 
 @pytest.mark.parametrize(("name", "most"), [("table", 1e-4), ("bin", 0.02)])
-def test_objects_do_not_pierce_each_other(
-    name: str, most: float, tables: list[Scene], heaps: list[Scene]
-) -> None:
+def test_objects_do_not_pierce_each_other(name, most, tables, heaps):
     shares = []
     for scene in (tables if name == "table" else heaps)[:12]:
         solids = [solid(item) for item in scene.objects]
@@ -125,7 +120,7 @@ def test_objects_do_not_pierce_each_other(
     assert max(shares) < most
 
 
-def test_heaps_hide_but_not_too_much(parts: list[Part]) -> None:
+def test_heaps_hide_but_not_too_much(parts):
     preset = small("bin")
     factory = Factory(parts, preset, 2, Constant())
     scenes = [factory.scene(0, index) for index in range(12)]
@@ -134,7 +129,7 @@ def test_heaps_hide_but_not_too_much(parts: list[Part]) -> None:
     assert np.mean(fractions < 0.8) > 0.2
 
 
-def test_the_cameras_place_keeps_to_its_ranges(tables: list[Scene]) -> None:
+def test_the_cameras_place_keeps_to_its_ranges(tables):
     distances, elevations = [], []
     for scene in tables:
         assert scene.plane is not None
@@ -149,7 +144,7 @@ def test_the_cameras_place_keeps_to_its_ranges(tables: list[Scene]) -> None:
     assert 30 - 1e-9 <= min(elevations) < 45 < 70 < max(elevations) <= 85 + 1e-9
 
 
-def test_the_background_is_a_picture_that_lies_on_the_plane(parts: list[Part]) -> None:
+def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
     wide = {"picture_width": (8.0, 8.0), "elevation_deg": (45.0, 85.0)}
     preset = replace(customised_preset("table", {"table": wide}), width=256, height=256)
     factory = Factory(parts, preset, 4, Ramp())
@@ -172,7 +167,7 @@ def test_the_background_is_a_picture_that_lies_on_the_plane(parts: list[Part]) -
                                    atol=0.05 * similarity[0, 0])  # fmt: skip
 
 
-def test_beyond_the_horizon_is_another_picture(parts: list[Part]) -> None:
+def test_beyond_the_horizon_is_another_picture(parts):
     preset = small("table", table={"elevation_deg": (12.0, 12.0), "roll_deg": 0.0})
     background = Factory(parts, preset, 4, Constant()).scene(0, 0).background
     assert len(np.unique(background)) == 2
@@ -182,7 +177,7 @@ def test_beyond_the_horizon_is_another_picture(parts: list[Part]) -> None:
     assert horizon < edge < horizon + focal * 0.05
 
 
-def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None:
+def test_an_image_without_targets_has_its_distractors(parts):
     for name in ("table", "bin", "paper", "quickstart", "ycb"):
         preset = replace(
             PRESETS[name].resized(96, 72), targets_per_image=(0, 0), distractors=Distractors((3, 3))
@@ -196,9 +191,7 @@ def test_an_image_without_targets_has_its_distractors(parts: list[Part]) -> None
 
 
 @pytest.mark.parametrize("preset", [PRESETS["table"], PRESETS["bin"]])
-def test_parts_no_table_can_show_are_an_error(
-    preset: Preset, sized_box: Callable[[str, float], Part]
-) -> None:
+def test_parts_no_table_can_show_are_an_error(preset, sized_box):
     far = replace(preset, table=Table(distance=(20.0, 20.0)))
     for part, where in ((sized_box("huge", 40), preset), (sized_box("tiny", 0.06), far)):
         with pytest.raises(UserError, match=f"part {part.name} of diameter"):
@@ -206,7 +199,7 @@ def test_parts_no_table_can_show_are_an_error(
 
 
 @pytest.mark.parametrize("name", ["table", "bin"])
-def test_somebody_elses_parts_lie_well(name: str, request: pytest.FixtureRequest) -> None:
+def test_somebody_elses_parts_lie_well(name, request):
     shared = request.getfixturevalue("shared_data")
     path = sorted((shared / "parts" / "so_arm100").glob("*.stl"))[0]
     theirs = [
@@ -222,7 +215,7 @@ def test_somebody_elses_parts_lie_well(name: str, request: pytest.FixtureRequest
         assert name == "bin" or max(lowest) <= CONTACT
 
 
-def test_a_dropped_box_lands_on_what_is_there(surface_of: MakeSurface) -> None:
+def test_a_dropped_box_lands_on_what_is_there(surface_of):
     surface = surface_of(trimesh.creation.box((0.04, 0.02, 0.03)))
     table = HeightMap(0.001, 0.1)
     footprint = table.footprint(surface, np.eye(3), -0.015)
@@ -242,7 +235,7 @@ def test_a_dropped_box_lands_on_what_is_there(surface_of: MakeSurface) -> None:
     assert table.height(lying, (0, 0)) == pytest.approx(0.06, abs=1e-6)
 
 
-def test_a_slope_is_met_where_it_is_highest(surface_of: MakeSurface) -> None:
+def test_a_slope_is_met_where_it_is_highest(surface_of):
     profile, ends = ((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05)), (-0.05, 0.05)
     wedge = trimesh.convex.convex_hull(np.array([[x, y, z] for x, z in profile for y in ends]))
     table = HeightMap(0.001, 0.1)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.parts.part import Mesh
 from dopepp.virtual import (
     DistancePlacement,
     Distractors,
@@ -18,7 +16,6 @@ from dopepp.virtual import (
     Lighting,
     Materials,
     OffsetPlacement,
-    Surface,
     Table,
     make_surface,
 )
@@ -53,11 +50,11 @@ def planck_rgb(temperature: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("temperature", [2700, 4000, 4001, 5000, 6504, 9000, 15000])
-def test_black_body_colours_follow_plancks_law(temperature: float) -> None:
+def test_black_body_colours_follow_plancks_law(temperature):
     np.testing.assert_allclose(black_body_rgb(temperature), planck_rgb(temperature), atol=0.05)
 
 
-def test_lights_stand_above_their_plane() -> None:
+def test_lights_stand_above_their_plane():
     ranges, rng = Lighting(num_lights=(1, 3)), np.random.default_rng(0)
     normal = np.array([0.3, -0.6, -0.5]) / np.linalg.norm([0.3, -0.6, -0.5])
     centre, counts = np.array([0.0, 0.0, 0.5]), set()
@@ -74,7 +71,7 @@ def test_lights_stand_above_their_plane() -> None:
     assert counts == {1, 2, 3}
 
 
-def test_materials_keep_to_their_ranges_and_shares(box_surface: Surface) -> None:
+def test_materials_keep_to_their_ranges_and_shares(box_surface):
     ranges = Materials(metal_share=0.3, brushed_share=0.5, print_share=0.6)
     rng = np.random.default_rng(0)
     drawn = [ranges.draw(rng, box_surface) for _ in range(3000)]
@@ -99,7 +96,7 @@ def test_materials_keep_to_their_ranges_and_shares(box_surface: Surface) -> None
     assert np.mean([axis == (0, 0, 1) for axis in axes]) == pytest.approx(7 / 9, abs=0.05)
 
 
-def test_textured_surfaces_keep_their_colours(sheet: Callable[..., Mesh]) -> None:
+def test_textured_surfaces_keep_their_colours(sheet):
     surface = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -145,6 +142,6 @@ def test_textured_surfaces_keep_their_colours(sheet: Callable[..., Mesh]) -> Non
         lambda: FacingTurning(tilt_deg=-1),
     ],
 )
-def test_wrong_ranges_are_refused(make: Callable[[], object]) -> None:
+def test_wrong_ranges_are_refused(make):
     with pytest.raises(UserError, match=r"allowed: .*fix: (change|move)"):
         make()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +53,7 @@ def angles(rotation: np.ndarray) -> tuple[float, float]:
     return float(in_plane), float(tilt)
 
 
-def test_quickstart_poses(quickstart_scenes: list[Scene]) -> None:
+def test_quickstart_poses(quickstart_scenes):
     in_plane, tilt = zip(
         *(angles(s.objects[0].T_cam_obj[:3, :3]) for s in quickstart_scenes), strict=True
     )
@@ -66,7 +64,7 @@ def test_quickstart_poses(quickstart_scenes: list[Scene]) -> None:
     assert all(s.plane is None for s in quickstart_scenes)
 
 
-def test_quickstart_fill(quickstart_scenes: list[Scene]) -> None:
+def test_quickstart_fill(quickstart_scenes):
     shares = []
     for scene in quickstart_scenes:
         item = scene.objects[0]
@@ -78,9 +76,7 @@ def test_quickstart_fill(quickstart_scenes: list[Scene]) -> None:
     assert 0.90 < max(shares) < 0.953
 
 
-def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(
-    parts: list[Part],
-) -> None:
+def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_nor_rotation(parts):
     preset = PRESETS["paper"]
     factory = Factory(parts, preset.resized(80, 60), seed=90125)
     drawn = [factory.scene(0, index) for index in range(600)]
@@ -100,7 +96,7 @@ def test_what_the_camera_does_not_see_of_the_papers_box_skews_no_place_across_no
     assert z.mean() == pytest.approx(0.219, abs=0.005)
 
 
-def test_a_place_that_no_depth_suits_is_given_up(sized_box: Callable[[str, float], Part]) -> None:
+def test_a_place_that_no_depth_suits_is_given_up(sized_box):
     preset = replace(PRESETS["paper"].resized(80, 60), placement=OffsetPlacement(lateral=0.25))
     factory = Factory([sized_box("large", 3)], preset, seed=0)
     places = np.array([factory.scene(0, n).objects[0].T_cam_obj[:3, 3] for n in range(20)])
@@ -109,7 +105,7 @@ def test_a_place_that_no_depth_suits_is_given_up(sized_box: Callable[[str, float
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_centroids_lie_inside_and_in_front(name: str, box_part: Part) -> None:
+def test_centroids_lie_inside_and_in_front(name, box_part):
     for scene in scenes(PRESETS[name], [box_part], 60):
         if name == "ycb":
             assert 0.5 <= scene.objects[0].T_cam_obj[2, 3] <= 1.2
@@ -122,7 +118,7 @@ def test_centroids_lie_inside_and_in_front(name: str, box_part: Part) -> None:
             assert corners[:, 2].min() > 0.01
 
 
-def test_light_ranges(quickstart_scenes: list[Scene]) -> None:
+def test_light_ranges(quickstart_scenes):
     ranges = PRESETS["quickstart"].lighting
     for scene in quickstart_scenes:
         assert ranges.num_lights[0] <= len(scene.lights) <= ranges.num_lights[1]
@@ -134,7 +130,7 @@ def test_light_ranges(quickstart_scenes: list[Scene]) -> None:
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
-def test_resized_follows_the_resize_rule(preset: Preset) -> None:
+def test_resized_follows_the_resize_rule(preset):
     resized = preset.resized(416, 312)
     expected = resize_camera(preset.K, 416 / preset.width, 312 / preset.height)
     np.testing.assert_allclose(resized.K, expected)
@@ -144,7 +140,7 @@ def test_resized_follows_the_resize_rule(preset: Preset) -> None:
     assert resized.sensors.read_noise == preset.sensors.read_noise
 
 
-def test_resized_draws_the_same_poses(box_part: Part) -> None:
+def test_resized_draws_the_same_poses(box_part):
     preset = replace(PRESETS["ycb"], distractors=Distractors((0, 0)), min_visible_fraction=0.0)
     factories = [Factory([box_part], p, 3) for p in (preset, preset.resized(320, 240))]
     for index in range(5):
@@ -152,7 +148,7 @@ def test_resized_draws_the_same_poses(box_part: Part) -> None:
         np.testing.assert_allclose(large.T_cam_obj, small.T_cam_obj, atol=1e-9)
 
 
-def test_field_of_view_follows_the_width() -> None:
+def test_field_of_view_follows_the_width():
     wide = replace(PRESETS["paper"], width=320, height=240)
     assert wide.K[0, 0] == pytest.approx(160.0)
     np.testing.assert_allclose(wide.K[:2, 2], [159.5, 119.5])
@@ -167,9 +163,7 @@ def test_field_of_view_follows_the_width() -> None:
     height=st.integers(16, 800),
     focal=st.floats(0.3, 4.0),
 )
-def test_fill_placement_reaches_its_share(
-    seed: int, share: float, width: int, height: int, focal: float
-) -> None:
+def test_fill_placement_reaches_its_share(seed, share, width, height, focal):
     rng = np.random.default_rng(seed)
     hull = rng.uniform(-1, 1, (30, 3)) * rng.uniform(0.01, 0.5, 3) @ random_rotation(rng).T
     K = np.array([[focal * width, 0, width * 0.45], [0, focal * width, height * 0.6], [0, 0, 1]])
@@ -193,32 +187,32 @@ def test_fill_placement_reaches_its_share(
         ({"intrinsics_px": (300.0, 300.0, 900.0, 20.0)}, "principal point inside"),
     ],
 )
-def test_wrong_presets_are_refused(change: dict[str, Any], message: str) -> None:
+def test_wrong_presets_are_refused(change, message):
     with pytest.raises(UserError, match=message):
         replace(PRESETS["quickstart"], **change)
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_a_stated_visibility_holds(name: str, parts: list[Part]) -> None:
+def test_a_stated_visibility_holds(name, parts):
     preset = replace(PRESETS[name].resized(320, 240), distractors=Distractors((0, 8)))
     factory = Factory(parts, preset, seed=3)
     for scene in (factory.scene(0, index) for index in range(10)):
         assert visible_fractions(scene)[list(scene.targets)].min() >= preset.min_visible_fraction
 
 
-def test_zero_to_one_target_gives_both(parts: list[Part]) -> None:
+def test_zero_to_one_target_gives_both(parts):
     preset = replace(PRESETS["paper"].resized(80, 60), targets_per_image=(0, 1))
     factory = Factory(parts, preset, seed=0)
     counts = [len(factory.scene(0, index).targets) for index in range(40)]
     assert set(counts) == {0, 1}
 
 
-def test_a_part_that_cannot_be_shown_is_an_error(sized_box: Callable[[str, float], Part]) -> None:
+def test_a_part_that_cannot_be_shown_is_an_error(sized_box):
     with pytest.raises(UserError, match="part huge of diameter 4"):
         Factory([sized_box("huge", 40)], PRESETS["paper"], 0).scene(0, 0)
 
 
-def test_several_targets_do_not_pierce_each_other(parts: list[Part]) -> None:
+def test_several_targets_do_not_pierce_each_other(parts):
     preset = replace(
         PRESETS["paper"], targets_per_image=(2, 3), min_visible_fraction=0.2,
         placement=DistancePlacement(0.2, 0.5),
@@ -230,7 +224,7 @@ def test_several_targets_do_not_pierce_each_other(parts: list[Part]) -> None:
         assert visible_fractions(scene)[list(scene.targets)].min() >= 0.2
 
 
-def test_nested_fields_change_and_the_others_stay() -> None:
+def test_nested_fields_change_and_the_others_stay():
     changes = {
         "targets_per_image": [0, 2],
         "materials": {"metal_share": 1, "layer_pitch": [0.0001, 0.0002]},
@@ -250,7 +244,7 @@ def test_nested_fields_change_and_the_others_stay() -> None:
     assert customised_preset("table", {}) == original
 
 
-def test_groups_come_and_go() -> None:
+def test_groups_come_and_go():
     assert customised_preset("paper", {"table": {}}).table == Table()
     assert customised_preset("paper", {"table": {"roll_deg": 5}}).table == Table(roll_deg=5.0)
     assert customised_preset("bin", {"table": None}).table is None
@@ -287,13 +281,13 @@ def test_groups_come_and_go() -> None:
         ({"width": 10**9}, "width"),
     ],
 )
-def test_wrong_changes_are_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+def test_wrong_changes_are_refused_in_one_line(changes, message):
     with pytest.raises(UserError, match=message) as caught:
         customised_preset("paper", changes)
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_presets_are_refused() -> None:
+def test_unknown_presets_are_refused():
     with pytest.raises(
         UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"
     ):
@@ -313,7 +307,7 @@ PLAIN = st.recursive(
     ),
     value=PLAIN,
 )
-def test_any_plain_value_is_taken_or_refused(field: str, value: Any) -> None:
+def test_any_plain_value_is_taken_or_refused(field, value):
     try:
         preset = customised_preset("paper", {field: value})
     except UserError:

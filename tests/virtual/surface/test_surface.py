@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,12 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Mesh
-from dopepp.virtual import Surface, make_surface
+from dopepp.virtual import make_surface
 
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 FACE = np.array([(0, 1, 2)], np.int32)
 
 
-def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of: MakeSurface) -> None:
+def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of):
     surface = surface_of(trimesh.creation.box((0.1, 0.1, 0.1)))
     corners = surface.vertices[surface.faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -32,7 +30,7 @@ def test_cad_edges_stay_sharp_and_cylinders_are_smooth(surface_of: MakeSurface) 
     np.testing.assert_allclose(np.abs(surface.normals[~side][:, 2]), 1, atol=1e-6)
 
 
-def test_split_vertices_are_closed_and_smooth_again() -> None:
+def test_split_vertices_are_closed_and_smooth_again():
     # STL gives every triangle vertices of its own.
     ball = trimesh.creation.icosphere(2, 0.05)
     soup = np.asarray(ball.triangles).reshape(-1, 3)
@@ -43,7 +41,7 @@ def test_split_vertices_are_closed_and_smooth_again() -> None:
     np.testing.assert_allclose(surface.normals, outward, atol=0.03)
 
 
-def test_open_and_inside_out_meshes_are_not_closed(surface_of: MakeSurface) -> None:
+def test_open_and_inside_out_meshes_are_not_closed(surface_of):
     ball = trimesh.creation.icosphere(1, 0.05)
     assert surface_of(ball).closed
     ball.invert()
@@ -53,7 +51,7 @@ def test_open_and_inside_out_meshes_are_not_closed(surface_of: MakeSurface) -> N
     assert not surface_of(ball).closed
 
 
-def test_stretching_keeps_normals_upright(surface_of: MakeSurface) -> None:
+def test_stretching_keeps_normals_upright(surface_of):
     scale = np.array([0.1, 0.2, 0.05])
     stretched = surface_of(trimesh.creation.icosphere(3, 1.0)).scaled(scale)
     # The gradient of the ellipsoid's equation.
@@ -74,12 +72,12 @@ BAD_UV = np.array([(0, 0), (np.nan, 0), (0, 1)], np.float32)
         (Mesh(np.eye(3), FACE, BAD_UV, np.zeros((2, 2, 3), np.uint8)), "texture coordinate"),
     ],
 )
-def test_meshes_that_cannot_be_rendered_are_refused(mesh: Mesh, message: str) -> None:
+def test_meshes_that_cannot_be_rendered_are_refused(mesh, message):
     with pytest.raises(UserError, match=message):
         make_surface(mesh)
 
 
-def test_faces_without_area_change_nothing(sheet: Callable[..., Mesh]) -> None:
+def test_faces_without_area_change_nothing(sheet):
     mesh = sheet(0.2)
     faces = np.vstack([mesh.faces, [[0, 0, 1], [1, 1, 1]]]).astype(np.int32)
     with np.errstate(all="raise"):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,12 +11,10 @@ import pytest
 from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts.mesh.read import ycb_part
-from dopepp.parts.part import Mesh
 from dopepp.virtual import Ambient, Material, Scene, SceneObject, Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
 from dopepp.virtual.surface.texture import make_texture
 
-MakeScene = Callable[..., Scene]
 SIDE = 0.3
 DIM = Ambient(above=(0.4, 0.4, 0.4), below=(0.4, 0.4, 0.4))
 
@@ -56,9 +52,7 @@ def unfiltered(surface: Surface) -> Surface:
 
 
 @pytest.mark.parametrize(("angle", "distance"), [(0, 0.8), (55, 0.6), (75, 0.5), (82, 0.8)])
-def test_a_fine_checker_matches_supersampling(
-    scene_of: MakeScene, sheet: Callable[..., Mesh], angle: float, distance: float
-) -> None:
+def test_a_fine_checker_matches_supersampling(scene_of, sheet, angle, distance):
     tiles = np.indices((80, 80)).sum(axis=0) % 2
     texture = (np.kron(tiles, np.ones((3, 3)))[..., None].repeat(3, -1) * 200 + 30).astype(np.uint8)
     tilt = rotation_vector_to_matrix(np.array([np.radians(angle), 0, 0]))
@@ -80,7 +74,7 @@ def test_a_fine_checker_matches_supersampling(
 
 @pytest.mark.parametrize("name", ["003_cracker_box", "005_tomato_soup_can"])
 @pytest.mark.parametrize("distance", [0.6, 1.2])
-def test_ycb_models_match_supersampling(ycb_root: Path, name: str, distance: float) -> None:
+def test_ycb_models_match_supersampling(ycb_root, name, distance):
     part = ycb_part(ycb_root, name)
     assert part.mesh is not None
     surface = make_surface(part.mesh)
@@ -105,7 +99,7 @@ def test_ycb_models_match_supersampling(ycb_root: Path, name: str, distance: flo
     assert errors[0] < 0.6 * errors[1]
 
 
-def test_unused_texels_leave_no_seams(scene_of: MakeScene, sheet: Callable[..., Mesh]) -> None:
+def test_unused_texels_leave_no_seams(scene_of, sheet):
     # Only the left half of the texture is used; the rest is of a colour that nobody should see.
     texture = np.full((128, 128, 3), (120, 120, 120), np.uint8)
     texture[:, 64:] = (255, 0, 255)
@@ -122,7 +116,7 @@ def test_unused_texels_leave_no_seams(scene_of: MakeScene, sheet: Callable[..., 
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (37, 101), (1, 5), (1, 1)])
-def test_the_coarsest_level_is_the_mean_light(shape: tuple[int, int]) -> None:
+def test_the_coarsest_level_is_the_mean_light(shape):
     image = np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
     uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     texture = make_texture(image, uv, np.array([(0, 1, 2), (0, 2, 3)], np.int32))

@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 import pickle
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,7 +32,6 @@ from dopepp.virtual import (
 from dopepp.virtual.renderers import Renderer, find_renderer
 
 pytestmark = pytest.mark.render
-MakeScene = Callable[..., Scene]
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +61,7 @@ def assert_same_labels(found: Rendered, expected: Rendered) -> None:
 
 
 @pytest.mark.parametrize(("preset", "seed"), [("paper", 1), ("paper", 2), ("table", 3), ("bin", 5)])
-def test_labels_agree_with_the_rasteriser(photoreal: Renderer, preset: str, seed: int) -> None:
+def test_labels_agree_with_the_rasteriser(photoreal, preset, seed):
     parts = [make() for make in BUILTIN.values()]
     scene = Factory(parts, PRESETS[preset].resized(160, 120), seed).scene(0, seed)
     expected, found = render(scene), photoreal(scene)
@@ -87,9 +84,7 @@ def test_labels_agree_with_the_rasteriser(photoreal: Renderer, preset: str, seed
         Material(roughness=1.0, specular=0.0, colour=(0.0, 0.0, 0.0)),
     ],
 )
-def test_every_material_renders(
-    photoreal: Renderer, material: Material, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_every_material_renders(photoreal, material, box_part, scene_of):
     scene = scene_of(lying(box_part, 0.1, material=material))
     found = photoreal(scene)
     covered = found.instances == 0
@@ -100,9 +95,7 @@ def test_every_material_renders(
     assert_same_labels(found, render(scene))
 
 
-def test_a_textured_model_shows_its_texture(
-    photoreal: Renderer, ycb_root: Path, scene_of: MakeScene
-) -> None:
+def test_a_textured_model_shows_its_texture(photoreal, ycb_root, scene_of):
     mesh = read_mesh(ycb_root / "models" / "003_cracker_box" / "textured.obj", "m")
     T = np.eye(4)
     T[:3, :3], T[2, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], 0.5
@@ -115,9 +108,7 @@ def test_a_textured_model_shows_its_texture(
         assert np.corrcoef(one, other)[0, 1] > 0.9
 
 
-def test_no_light_at_all_is_black_and_finite(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_no_light_at_all_is_black_and_finite(photoreal, box_part, scene_of):
     dark = Ambient(above=(0.0, 0.0, 0.0), below=(0.0, 0.0, 0.0))
     scene = on_table(scene_of(lying(box_part, 0.01), lights=(), ambient=dark))
     found = photoreal(scene)
@@ -127,9 +118,7 @@ def test_no_light_at_all_is_black_and_finite(
     np.testing.assert_array_equal(found.image[:4], scene.background[:4])
 
 
-def test_the_table_is_darker_near_the_contact(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_the_table_is_darker_near_the_contact(photoreal, box_part, scene_of):
     scene = on_table(scene_of(lying(box_part, 0.01), lights=()))
     found = photoreal(scene)
     assert found.depth[0, 0] == pytest.approx(0.5, abs=1e-6)
@@ -140,9 +129,7 @@ def test_the_table_is_darker_near_the_contact(
     assert below[0] < below[6] < below[20] + 1.0
 
 
-def test_a_shadow_falls_away_from_its_lamp(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_a_shadow_falls_away_from_its_lamp(photoreal, box_part, scene_of):
     dim = Ambient(above=(0.02, 0.02, 0.02), below=(0.02, 0.02, 0.02))
     lamp = Light((-0.4, 0.0, 0.2))
     scene = on_table(scene_of(lying(box_part, 0.03), lights=(lamp,), ambient=dim))
@@ -154,9 +141,7 @@ def test_a_shadow_falls_away_from_its_lamp(
     assert right == pytest.approx(expected.image[row, columns[-1] + 4].mean(), abs=15)
 
 
-def test_a_red_neighbour_is_seen_in_a_mirror(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_a_red_neighbour_is_seen_in_a_mirror(photoreal, box_part, scene_of):
     mirror = Material(metallic=1.0, roughness=0.05, colour=(0.9, 0.9, 0.9))
     red = Material(colour=(0.9, 0.02, 0.02))
     plate = lying(box_part, 0.1, material=mirror)
@@ -176,9 +161,7 @@ def test_a_red_neighbour_is_seen_in_a_mirror(
     assert redness(both) > redness(alone) + 30
 
 
-def test_pixels_that_are_not_square(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_pixels_that_are_not_square(photoreal, box_part, scene_of):
     scene = scene_of(lying(box_part, 0.1))
     K = scene.K.copy()
     K[0, 0] *= 1.3
@@ -194,16 +177,14 @@ def test_pixels_that_are_not_square(
     assert not (changed & ~near).any()
 
 
-def test_a_scene_gives_the_same_bytes(
-    photoreal: Renderer, box_part: Part, scene_of: MakeScene
-) -> None:
+def test_a_scene_gives_the_same_bytes(photoreal, box_part, scene_of):
     scene = on_table(scene_of(lying(box_part, 0.02)))
     first, second = photoreal(scene), photoreal(pickle.loads(pickle.dumps(scene)))
     for field in ("image", "depth", "instances"):
         np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
 
 
-def test_an_empty_scene_is_its_background(photoreal: Renderer, scene_of: MakeScene) -> None:
+def test_an_empty_scene_is_its_background(photoreal, scene_of):
     scene = scene_of()
     for found in (photoreal(scene), photoreal(on_table(scene))):
         np.testing.assert_array_equal(found.image, scene.background)
@@ -211,7 +192,7 @@ def test_an_empty_scene_is_its_background(photoreal: Renderer, scene_of: MakeSce
 
 
 @pytest.mark.parametrize("package", ["mitsuba", "pyoidn"])
-def test_the_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+def test_the_missing_extra_is_named(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "dopepp.virtual.renderers.photoreal.renderer", raising=False)
     pattern = rf"without the package {package}.*pip install 'dopepp\[photoreal\]'"

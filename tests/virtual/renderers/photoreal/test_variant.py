@@ -63,16 +63,12 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> list[list[str]]:
 @pytest.mark.parametrize(
     "code", ["import os; os.abort()", "raise SystemExit(1)", "print('LLVM ERROR')"]
 )
-def test_a_library_that_ends_the_process_is_not_usable(
-    library: Path, monkeypatch: pytest.MonkeyPatch, code: str
-) -> None:
+def test_a_library_that_ends_the_process_is_not_usable(library, monkeypatch, code):
     stand_in(monkeypatch, code)
     assert not variant.is_usable(library)
 
 
-def test_the_outcome_is_remembered_until_the_library_changes(
-    library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_outcome_is_remembered_until_the_library_changes(library, monkeypatch):
     commands = stand_in(monkeypatch, "print('mean', 0.5)")
     assert [variant.is_usable(library) for _ in range(2)] == [True, True]
     assert len(commands) == 1
@@ -81,9 +77,7 @@ def test_the_outcome_is_remembered_until_the_library_changes(
     assert len(commands) == 2
 
 
-def test_a_damaged_memory_is_written_anew(
-    library: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_damaged_memory_is_written_anew(library, monkeypatch, tmp_path):
     commands = stand_in(monkeypatch, "print('mean', 0.5)")
     assert variant.is_usable(library)
     (memory,) = (tmp_path / "cache" / "dopepp").iterdir()
@@ -94,9 +88,7 @@ def test_a_damaged_memory_is_written_anew(
         assert memory.read_text() == "works"
 
 
-def test_a_trial_without_an_end_is_made_again_later(
-    library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_without_an_end_is_made_again_later(library, monkeypatch):
     def hang(command: list[str], timeout: float, **_: Any) -> None:
         raise subprocess.TimeoutExpired(command, timeout)
 
@@ -108,7 +100,7 @@ def test_a_trial_without_an_end_is_made_again_later(
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "many", ""])
-def test_a_wrong_number_of_threads(monkeypatch: pytest.MonkeyPatch, number: str) -> None:
+def test_a_wrong_number_of_threads(monkeypatch, number):
     monkeypatch.setenv(variant.THREADS_SETTING, "3")
     assert variant.num_threads() == 3
     monkeypatch.setenv(variant.THREADS_SETTING, number)
@@ -116,9 +108,7 @@ def test_a_wrong_number_of_threads(monkeypatch: pytest.MonkeyPatch, number: str)
         variant.num_threads()
 
 
-def test_the_newest_library_comes_first(
-    library: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_newest_library_comes_first(library, monkeypatch, tmp_path):
     assert variant.candidates() == [library]
     monkeypatch.delenv(variant.LIBRARY_SETTING)
     monkeypatch.setattr(variant, "PLACES", (f"{tmp_path}/libLLVM*.so.*",))
@@ -140,9 +130,7 @@ def test_the_newest_library_comes_first(
         ("cuda_ad_rgb", ["DOPEPP_MITSUBA_VARIANT='cuda_ad_rgb'", "llvm_ad_rgb, scalar_rgb"]),
     ],
 )
-def test_a_real_process_survives_a_library_that_is_none(
-    library: Path, setting: str | None, answers: list[str]
-) -> None:
+def test_a_real_process_survives_a_library_that_is_none(library, setting, answers):
     wish = {} if setting is None else {variant.VARIANT_SETTING: setting}
     done = subprocess.run(
         [sys.executable, "-c", _RENDER], capture_output=True, text=True, check=False, timeout=120,

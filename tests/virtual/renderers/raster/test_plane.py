@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,6 @@ from dopepp.virtual import (
     visible_fractions,
 )  # fmt: skip
 
-MakeScene = Callable[..., Scene]
 ANGLE = 0.7
 NORMAL = np.array([0.0, -np.sin(ANGLE), -np.cos(ANGLE)])
 """The camera looks down at an angle; the plane's middle is 0.5 m away along the optical axis."""
@@ -59,7 +57,7 @@ def brightness(rendered: Rendered, point: np.ndarray) -> float:
     return float(rendered.image[v, u, 1])
 
 
-def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of: MakeScene) -> None:
+def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of):
     # Looking nearly along the plane, the upper part of the image is above the horizon.
     normal = np.array([0.0, -np.cos(0.1), -np.sin(0.1)])
     scene = replace(scene_of(**IMAGE), plane=Plane(tuple(normal), -0.3))
@@ -75,7 +73,7 @@ def test_depth_is_the_closed_form_and_stops_at_the_horizon(scene_of: MakeScene) 
     assert (rendered.image == scene.background).all()
 
 
-def test_depth_is_right_around_objects(scene_of: MakeScene) -> None:
+def test_depth_is_right_around_objects(scene_of):
     item = box_at(0, 0, 0.0, (0.1, 0.1, 0.05))
     bare = drawn(scene_of(**IMAGE))
     rendered = drawn(scene_of(item, **IMAGE))
@@ -85,7 +83,7 @@ def test_depth_is_right_around_objects(scene_of: MakeScene) -> None:
     assert rendered.visible_fractions[0] == 1.0
 
 
-def test_what_is_below_is_hidden_and_counts(scene_of: MakeScene) -> None:
+def test_what_is_below_is_hidden_and_counts(scene_of):
     # A box sunk in by half of its height, one below the plane and a whole one.
     sunk = box_at(-0.1, 0, -0.05, (0.05, 0.05, 0.1))
     below = box_at(0.1, 0, -0.2, (0.05, 0.05, 0.1))
@@ -105,7 +103,7 @@ def test_what_is_below_is_hidden_and_counts(scene_of: MakeScene) -> None:
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_a_shadow_lies_where_the_light_is_blocked(scene_of: MakeScene, which: int) -> None:
+def test_a_shadow_lies_where_the_light_is_blocked(scene_of, which):
     item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
     lamp = on_plane(-0.4, 0.1, 0.5)
     weak = Light((0.0, 0.0, 0.0), (1e-4, 1e-4, 1e-4))
@@ -124,7 +122,7 @@ def test_a_shadow_lies_where_the_light_is_blocked(scene_of: MakeScene, which: in
         assert brightness(rendered, inner) < 15
 
 
-def test_a_lamp_adds_to_what_is_left(scene_of: MakeScene) -> None:
+def test_a_lamp_adds_to_what_is_left(scene_of):
     # Two equal lamps at equal distances, one blocked, no sky: half of the light is left.
     item = box_at(0, 0, 0.10, (0.06, 0.06, 0.01))
     lamps = [Light(tuple(on_plane(x, 0, 0.4)), (0.5, 0.5, 0.5), 0.5) for x in (-0.4, 0.4)]
@@ -138,7 +136,7 @@ def test_a_lamp_adds_to_what_is_left(scene_of: MakeScene) -> None:
     assert brightness(rendered, on_plane(shift, 0, 0)) == pytest.approx(expected, abs=2)
 
 
-def test_contact_darkens_the_sky_more_the_nearer(scene_of: MakeScene) -> None:
+def test_contact_darkens_the_sky_more_the_nearer(scene_of):
     # Beside a long wall of height h, at distance d, (1 + d/√(d² + h²))/2 of the sky is left.
     item = box_at(0, 0.05, 0, (0.3, 0.02, 0.05))
     sky = Ambient(tuple(NORMAL), (0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
@@ -152,7 +150,7 @@ def test_contact_darkens_the_sky_more_the_nearer(scene_of: MakeScene) -> None:
     assert light[0] < light[1] < light[2]
 
 
-def test_far_from_objects_the_picture_is_untouched(scene_of: MakeScene) -> None:
+def test_far_from_objects_the_picture_is_untouched(scene_of):
     item = box_at(0, 0, 0, (0.02, 0.02, 0.02))
     scene = scene_of(item, lights=(Light(tuple(on_plane(0, 0, 1.0))),), **IMAGE)
     rendered = drawn(scene)
@@ -161,7 +159,7 @@ def test_far_from_objects_the_picture_is_untouched(scene_of: MakeScene) -> None:
     assert rendered.image.min() < 85
 
 
-def test_odd_lights_and_places_do_no_harm(scene_of: MakeScene) -> None:
+def test_odd_lights_and_places_do_no_harm(scene_of):
     tall = box_at(0.1, 0, 0, (0.03, 0.03, 0.2))
     for position in (
         on_plane(0, 0, 0.1), on_plane(0, 0, -0.2), on_plane(0.3, 0, 0), on_plane(0.1, 0, 0.1),

@@ -18,7 +18,7 @@ from dopepp.geometry.camera import make_transform, project, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.parts import load_part
 from dopepp.parts.catalogue import pivconnector
-from dopepp.parts.part import Mesh, Part
+from dopepp.parts.part import Mesh
 from dopepp.virtual import (
     Ambient,
     Light,
@@ -63,7 +63,7 @@ def cast_rays(scene: Scene) -> np.ndarray:
     return depth.reshape(height, width)
 
 
-def test_empty_scene_is_its_background(scene_of: MakeScene) -> None:
+def test_empty_scene_is_its_background(scene_of):
     rendered = render(scene_of())
     assert (rendered.image == 90).all()
     assert (rendered.depth == 0).all()
@@ -71,7 +71,7 @@ def test_empty_scene_is_its_background(scene_of: MakeScene) -> None:
     assert rendered.visible_fractions.shape == (0,)
 
 
-def test_plane_has_its_closed_form_depth(scene_of: MakeScene, sheet: Callable[..., Mesh]) -> None:
+def test_plane_has_its_closed_form_depth(scene_of, sheet):
     plane = make_surface(sheet(2.0))
     rotation = rotation_vector_to_matrix(np.array([0.5, -0.3, 0.2]))
     offset = np.array([0.02, 0.01, 0.5])
@@ -87,7 +87,7 @@ def test_plane_has_its_closed_form_depth(scene_of: MakeScene, sheet: Callable[..
 @settings(deadline=None, max_examples=15)
 @example(1, pivconnector())
 @given(st.integers(0, 10_000), st.none())
-def test_box_and_part_agree_with_ray_casting(box_surface: Surface, seed: int, part: Part) -> None:
+def test_box_and_part_agree_with_ray_casting(box_surface, seed, part):
     rng = np.random.default_rng(seed)
     pose = make_transform(random_rotation(rng), np.array([*rng.uniform(-0.05, 0.05, 2), 0.15]))
     K = np.array([[90.0, 0, 47.3], [0, 91.0, 35.6], [0, 0, 1]])
@@ -102,7 +102,7 @@ def test_box_and_part_agree_with_ray_casting(box_surface: Surface, seed: int, pa
     assert is_same.mean() >= (0.99 if part else 1.0)
 
 
-def test_camera_inside_a_box_sees_its_walls(scene_of: MakeScene, surface_of: MakeSurface) -> None:
+def test_camera_inside_a_box_sees_its_walls(scene_of, surface_of):
     # Every wall crosses the camera plane; flipped faces are looked at from behind.
     box = trimesh.creation.box((0.4, 0.3, 1.0))
     box.invert()
@@ -114,8 +114,8 @@ def test_camera_inside_a_box_sees_its_walls(scene_of: MakeScene, surface_of: Mak
 
 
 def test_inconsistent_winding_renders_the_same_silhouette_and_shading(
-    scene_of: MakeScene, box_part: Part, box_surface: Surface
-) -> None:
+    scene_of, box_part, box_surface
+):
     assert box_part.mesh is not None
     faces = box_part.mesh.faces.copy()
     faces[::2] = faces[::2, ::-1]
@@ -129,7 +129,7 @@ def test_inconsistent_winding_renders_the_same_silhouette_and_shading(
     assert np.percentile(difference, 99) <= 2
 
 
-def test_nearer_object_wins_whatever_the_order(scene_of: MakeScene, box_surface: Surface) -> None:
+def test_nearer_object_wins_whatever_the_order(scene_of, box_surface):
     near, far = at(box_surface, 0, 0, 0.2), at(box_surface, 0.02, 0, 0.3)
     first, second = render(scene_of(near, far)), render(scene_of(far, near))
     np.testing.assert_array_equal(first.depth, second.depth)
@@ -139,7 +139,7 @@ def test_nearer_object_wins_whatever_the_order(scene_of: MakeScene, box_surface:
     assert first.instances[60, 80] == 0
 
 
-def test_vertices_bound_the_mask(scene_of: MakeScene, box_part: Part, box_surface: Surface) -> None:
+def test_vertices_bound_the_mask(scene_of, box_part, box_surface):
     pose = make_transform(
         rotation_vector_to_matrix(np.array([0.9, -0.4, 0.3])), np.array([0, 0, 0.25])
     )
@@ -156,9 +156,7 @@ def test_vertices_bound_the_mask(scene_of: MakeScene, box_part: Part, box_surfac
     assert np.max(inside) < 1.5
 
 
-def test_edges_are_anti_aliased_by_coverage(
-    scene_of: MakeScene, sheet: Callable[..., Mesh]
-) -> None:
+def test_edges_are_anti_aliased_by_coverage(scene_of, sheet):
     # A white sheet whose left border lies at u = 80.1: pixel 80 keeps its two right samples.
     K = scene_of().K
     place = np.array([(80.1 - K[0, 2]) / K[0, 0] + 2, 0, 1])
@@ -178,9 +176,7 @@ def middle_depth(path: Path, scene_of: MakeScene, turn: np.ndarray) -> float:
     return float(render(scene_of(SceneObject(make_surface(mesh), pose))).depth[60, 80])
 
 
-def test_an_open_mesh_shows_both_sides(
-    tmp_path: Path, scene_of: MakeScene, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_open_mesh_shows_both_sides(tmp_path, scene_of, caplog):
     box = trimesh.creation.box((100, 100, 60))
     box.update_faces(box.face_normals[:, 2] > -0.5)  # no bottom
     (tmp_path / "open.stl").write_bytes(export_stl(box))
@@ -193,9 +189,7 @@ def test_an_open_mesh_shows_both_sides(
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_bodies_through_each_other_show_their_outside(
-    tmp_path: Path, scene_of: MakeScene, inside_out: bool
-) -> None:
+def test_bodies_through_each_other_show_their_outside(tmp_path, scene_of, inside_out):
     slab, pin = trimesh.creation.box((100, 100, 20)), trimesh.creation.box((30, 30, 80))
     if inside_out:
         pin.invert()
@@ -209,14 +203,14 @@ def plate(surface_of: MakeSurface) -> Surface:
     return surface_of(trimesh.creation.box((0.10, 0.06, 1e-4)))
 
 
-def test_whole_object_is_fully_visible(scene_of: MakeScene, plate: Surface) -> None:
+def test_whole_object_is_fully_visible(scene_of, plate):
     assert render(scene_of(at(plate, 0, 0, 0.3), **LARGE)).visible_fractions[0] == 1.0
     pair = scene_of(at(plate, 0, -0.04, 0.3), at(plate, 0, 0.04, 0.3), **LARGE)
     np.testing.assert_array_equal(render(pair).visible_fractions, [1.0, 1.0])
 
 
 @pytest.mark.parametrize("share", [0.5, 0.25])
-def test_truncated_by_the_image_border(scene_of: MakeScene, plate: Surface, share: float) -> None:
+def test_truncated_by_the_image_border(scene_of, plate, share):
     # The image ends at u = −0.5: put the box so that the asked share of its width is beyond it.
     K = scene_of(**LARGE).K
     edge = (-0.5 - K[0, 2]) / K[0, 0] * 0.3
@@ -224,7 +218,7 @@ def test_truncated_by_the_image_border(scene_of: MakeScene, plate: Surface, shar
     assert render(scene).visible_fractions[0] == pytest.approx(share, abs=0.005)
 
 
-def test_half_occluded(scene_of: MakeScene, plate: Surface) -> None:
+def test_half_occluded(scene_of, plate):
     # Seen from the camera, the near box's left edge passes through the far box's centre.
     near = at(plate, 0.05, 0, 0.2)
     far = at(plate, 0, 0, 0.3)
@@ -232,7 +226,7 @@ def test_half_occluded(scene_of: MakeScene, plate: Surface) -> None:
     np.testing.assert_allclose(fractions, [1.0, 0.5], atol=0.005)
 
 
-def test_hidden_or_outside_is_zero(scene_of: MakeScene, plate: Surface) -> None:
+def test_hidden_or_outside_is_zero(scene_of, plate):
     scene = scene_of(
         at(plate, 0, 0, 0.2), at(plate, 0, 0, 0.4), at(plate, 5, 0, 0.4), at(plate, 0, 0, -1),
         **LARGE,
@@ -242,9 +236,7 @@ def test_hidden_or_outside_is_zero(scene_of: MakeScene, plate: Surface) -> None:
     np.testing.assert_array_equal(render(lone).visible_fractions, [0])
 
 
-def test_a_huge_silhouette_is_counted_at_a_reduced_scale(
-    scene_of: MakeScene, plate: Surface
-) -> None:
+def test_a_huge_silhouette_is_counted_at_a_reduced_scale(scene_of, plate):
     # At 2 cm the box is 3,000 × 1,800 px, of which the image shows 640 × 480.
     fraction = render(scene_of(at(plate, 0, 0, 0.02), **LARGE)).visible_fractions[0]
     near_face = 0.02 - 0.5e-4
@@ -263,9 +255,8 @@ def without_casters(*arguments: object) -> ShadowMap:
     "body", [trimesh.creation.icosphere(1, 0.05), trimesh.creation.cylinder(0.03, 0.1, sections=16)]
 )
 def test_a_smooth_body_of_few_triangles_has_no_shadow_on_it(
-    scene_of: MakeScene, surface_of: MakeSurface, monkeypatch: pytest.MonkeyPatch,
-    body: trimesh.Trimesh, inside_out: bool,
-) -> None:  # fmt: skip
+    scene_of, surface_of, monkeypatch, body, inside_out
+):
     body = body.copy()
     if inside_out:  # not closed, so its triangles are drawn from both sides
         body.invert()

@@ -18,7 +18,6 @@ from dopepp.virtual import (
     Grooves,
     Light,
     Material,
-    Scene,
     SceneObject,
     Surface,
     make_surface,
@@ -26,9 +25,7 @@ from dopepp.virtual import (
 )
 from dopepp.virtual.presets.placement import FACING
 
-MakeScene = Callable[..., Scene]
 MakeSheet = Callable[..., Mesh]
-MakeSurface = Callable[[trimesh.Trimesh], Surface]
 Tilted = Callable[..., SceneObject]
 
 
@@ -45,7 +42,7 @@ def facing(surface: Surface, place: tuple[float, float, float], *material: Mater
     return SceneObject(surface, make_transform(FACING, np.array(place)), *material)
 
 
-def test_texture_is_upright_and_rgb(scene_of: MakeScene, sheet: MakeSheet) -> None:
+def test_texture_is_upright_and_rgb(scene_of, sheet):
     # Top half red, bottom half blue; the lower left texel block is green.
     texture = np.zeros((64, 64, 3), np.uint8)
     texture[:32] = (200, 0, 0)
@@ -60,7 +57,7 @@ def test_texture_is_upright_and_rgb(scene_of: MakeScene, sheet: MakeSheet) -> No
     assert (image[40, 80, 1:] == 0).all()
 
 
-def test_texture_lookup_is_perspective_correct(scene_of: MakeScene, sheet: MakeSheet) -> None:
+def test_texture_lookup_is_perspective_correct(scene_of, sheet):
     # A tilted sheet with a v ramp: the image must show the ray's own v, not an affine blend.
     ramp = np.repeat(np.linspace(255, 0, 256)[:, None], 256, axis=1).astype(np.uint8)
     surface = make_surface(sheet(0.2, np.stack([ramp] * 3, axis=-1)))
@@ -77,7 +74,7 @@ def test_texture_lookup_is_perspective_correct(scene_of: MakeScene, sheet: MakeS
     np.testing.assert_allclose(srgb[v > 0.1], v[v > 0.1], atol=0.02)
 
 
-def test_lambert_closed_form(scene_of: MakeScene, sheet: MakeSheet) -> None:
+def test_lambert_closed_form(scene_of, sheet):
     # Light from the camera on a matt sheet at the light's reach: albedo times intensity.
     item = facing(make_surface(sheet(0.2)), (0, 0, 0.5), Material((0.5, 0.5, 0.5), 1.0, 0.0))
     scene = scene_of(item, lights=(Light((0, 0, 0), (0.6, 0.6, 0.6), 0.5),), ambient=even(0.0))
@@ -85,9 +82,7 @@ def test_lambert_closed_form(scene_of: MakeScene, sheet: MakeSheet) -> None:
     assert linear(render(scene).image[60, 79, 0]) == pytest.approx(0.30, abs=0.006)
 
 
-def test_a_shadow_falls_where_the_light_is_blocked(
-    scene_of: MakeScene, sheet: MakeSheet, surface_of: MakeSurface
-) -> None:
+def test_a_shadow_falls_where_the_light_is_blocked(scene_of, sheet, surface_of):
     floor = facing(make_surface(sheet(0.6)), (0, 0, 0.5))
     box = facing(surface_of(trimesh.creation.box((0.05, 0.05, 0.05))), (-0.05, 0, 0.4))
     light = Light((-0.25, 0, 0.2), (1, 1, 1), 0.4)
@@ -100,7 +95,7 @@ def test_a_shadow_falls_where_the_light_is_blocked(
     assert abs(shadowed.image[60, 120, 0] - lit[60, 120, 0]) <= 1
 
 
-def test_flat_faces_have_no_shadow_acne(scene_of: MakeScene, sheet: MakeSheet) -> None:
+def test_flat_faces_have_no_shadow_acne(scene_of, sheet):
     floor = facing(make_surface(sheet(0.6)), (0, 0, 0.5), Material(specular=0.0))
     for light in (Light((2.0, 1.0, 0.0)), Light((-0.5, 0.5, 0.2)), Light((3, 0, 0.1), reach=3)):
         rendered = render(scene_of(floor, lights=(light,)))
@@ -122,9 +117,7 @@ def tilted(sheet: MakeSheet) -> Tilted:
     return make
 
 
-def test_metal_has_no_diffuse_light_and_a_coloured_mirror(
-    scene_of: MakeScene, tilted: Tilted
-) -> None:
+def test_metal_has_no_diffuse_light_and_a_coloured_mirror(scene_of, tilted):
     gold = Material((0.9, 0.6, 0.2), roughness=0.3, metallic=1.0)
     beside = Light((1.0, 0.0, 0.0), (0.8, 0.8, 0.8), 1.0)
 
@@ -142,7 +135,7 @@ def test_metal_has_no_diffuse_light_and_a_coloured_mirror(
     np.testing.assert_allclose(glint / glint[0], np.array(gold.colour) / 0.9, atol=0.05)
 
 
-def test_ggx_peak_is_the_closed_form(scene_of: MakeScene, tilted: Tilted) -> None:
+def test_ggx_peak_is_the_closed_form(scene_of, tilted):
     # Light, normal and view coincide: D V = 1/(4 α²) without π, and F is the albedo.
     metal = Material((0.8, 0.8, 0.8), roughness=0.8, metallic=1.0)
     flash = Light((0, 0, 0), (0.25, 0.25, 0.25), 0.4)
@@ -150,7 +143,7 @@ def test_ggx_peak_is_the_closed_form(scene_of: MakeScene, tilted: Tilted) -> Non
     assert linear(code) == pytest.approx(0.25 * 0.8 / (4 * 0.64**2), rel=0.02)
 
 
-def test_a_smooth_metal_mirrors_the_horizon(scene_of: MakeScene, tilted: Tilted) -> None:
+def test_a_smooth_metal_mirrors_the_horizon(scene_of, tilted):
     sky = Ambient((0, -1, 0), (0.5, 0.5, 0.5), (0.1, 0.1, 0.1))
     steel = Material((0.9, 0.9, 0.9), roughness=0.1, metallic=1.0)
     up, down = (
@@ -161,9 +154,7 @@ def test_a_smooth_metal_mirrors_the_horizon(scene_of: MakeScene, tilted: Tilted)
 
 
 @pytest.mark.parametrize("irregularity", [0.0, 1.0])
-def test_grooves_show_at_their_pitch(
-    scene_of: MakeScene, tilted: Tilted, irregularity: float
-) -> None:
+def test_grooves_show_at_their_pitch(scene_of, tilted, irregularity):
     grooves = Grooves((1, 0, 0), 0.01, 0.3, irregularity)
     light = Light((0.5, 0, 0), (0.6, 0.6, 0.6), 0.6)
     scene = scene_of(tilted(Material(grooves=grooves)), lights=(light,), ambient=even(0.0))
@@ -176,7 +167,7 @@ def test_grooves_show_at_their_pitch(
         assert np.fft.rfftfreq(70)[power.argmax()] == pytest.approx(0.25, abs=0.015)
 
 
-def test_lines_only_cross_their_axis(scene_of: MakeScene, tilted: Tilted) -> None:
+def test_lines_only_cross_their_axis(scene_of, tilted):
     # Seen along the axis there is nothing to tilt: a print's top face shows no layer lines.
     lines = Material(grooves=Grooves((0, 0, 1), 0.004, 0.5))
     scene = scene_of(tilted(lines), lights=(Light((0.3, 0, 0)),))
@@ -187,9 +178,7 @@ def test_lines_only_cross_their_axis(scene_of: MakeScene, tilted: Tilted) -> Non
 
 @pytest.mark.parametrize("irregularity", [0.0, 1.0])
 @pytest.mark.parametrize("pitch", [0.0004, 0.0021, 0.0026])
-def test_fine_grooves_match_supersampling(
-    scene_of: MakeScene, tilted: Tilted, pitch: float, irregularity: float
-) -> None:
+def test_fine_grooves_match_supersampling(scene_of, tilted, pitch, irregularity):
     # At 0.4 m a pixel spans 2.5 mm, so 2.6 mm is the worst beat with the pixels.
     grooves = Grooves((1, 0, 0), pitch, 0.15, irregularity)
     item = tilted(Material((0.5, 0.5, 0.5), 0.7, grooves=grooves), tilt=0.4)
@@ -206,7 +195,7 @@ def test_fine_grooves_match_supersampling(
     assert np.sqrt((error**2).mean()) < (0.02 if irregularity == 0.0 else 0.06)
 
 
-def test_unresolved_grooves_widen_the_highlight(scene_of: MakeScene, tilted: Tilted) -> None:
+def test_unresolved_grooves_widen_the_highlight(scene_of, tilted):
     fine = Material((0.3, 0.3, 0.3), 0.25, 0.5, grooves=Grooves((1, 0, 0), 1e-5, 0.5))
     flash = Light((0, 0, 0), (0.02, 0.02, 0.02), 0.4)
     widths = []
