@@ -1,7 +1,5 @@
 """Curves and the numbers in them."""
 
-from __future__ import annotations
-
 import csv
 import math
 

@@ -1,7 +1,5 @@
 """Wireframes: pixels where they belong, in the asked colour, and nothing where nothing is."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

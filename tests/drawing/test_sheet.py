@@ -1,7 +1,5 @@
 """Contact sheets: every picture where it belongs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The paired bootstrap against scipy's, against closed forms, and against what it is for."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

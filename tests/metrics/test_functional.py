@@ -1,7 +1,5 @@
 """Distances of poses against brute force, scipy, OpenCV and closed forms."""
 
-from __future__ import annotations
-
 import math
 import re
 

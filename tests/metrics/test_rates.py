@@ -1,7 +1,5 @@
 """Rates, areas, matches and intervals against loops over their definitions, scipy and by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reference rows on parts whose chances have closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MSSD, MSPD, symmetric rotation error, ADD-S and the symmetry group against brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Shapes whose groups are known, however they lie and however they are cut into triangles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

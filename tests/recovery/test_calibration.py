@@ -1,7 +1,5 @@
 """The score's logistic model against scipy's, and its features against a simulation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

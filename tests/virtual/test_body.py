@@ -1,7 +1,5 @@
 """Stable faces: closed forms, trimesh, and shapes that can only lie one way."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """The factory: a pure function of (seed, epoch, index), in any process and order, without torch."""
 
-from __future__ import annotations
-
 import hashlib
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """Meshes and places that nobody should send: compiled code must neither crash nor take for ever."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

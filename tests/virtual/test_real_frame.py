@@ -1,7 +1,5 @@
 """Rendering YCB models at a real frame's ground truth reproduces that frame's masks and depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The sensor: each step against SciPy, Pillow or a closed form; all of it pure."""
 
-from __future__ import annotations
-
 import io
 
 import cv2

@@ -1,7 +1,5 @@
 """Released checkpoints: half precision, no local path, found by name."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

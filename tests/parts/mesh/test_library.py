@@ -1,7 +1,5 @@
 """STL, GLB and 3MF files through trimesh, and what it makes of files that are not left to it."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """OBJ files: dialects, damage, and the texture that their materials name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

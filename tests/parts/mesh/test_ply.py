@@ -1,7 +1,5 @@
 """PLY files: every dialect a program writes, and headers and lists that lie."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

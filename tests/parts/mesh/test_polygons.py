@@ -1,7 +1,5 @@
 """OFF files, and polygons cut into fans."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """What holds for every format: units, refusals, bounds, and what is done to a mesh once read."""
 
-from __future__ import annotations
-
 import logging
 import os
 import struct

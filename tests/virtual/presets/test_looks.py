@@ -1,7 +1,5 @@
 """Random light and materials: colours against physics, shares and ranges over many draws."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

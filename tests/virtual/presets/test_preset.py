@@ -1,7 +1,5 @@
 """Presets: ranges that hold over random scenes, cameras that follow the size, plain changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Baked ambient occlusion against brute-force ray casting and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """Meshes made ready: creases, closedness, and meshes that nobody can render."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Filtered textures against a heavily supersampled reference, near, far and at grazing angles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Path-traced pictures: labels as the rasteriser's, light that is plausible."""
 
-from __future__ import annotations
-
 import importlib
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """The choice of Mitsuba's variant: a libLLVM that kills its process must not kill the user's."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

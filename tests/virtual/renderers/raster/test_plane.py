@@ -1,7 +1,5 @@
 """The supporting plane: depth, what it hides, and the shadows on its picture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rasteriser against closed forms and an independent ray caster."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Colour: textures, normals, light and shadow, metal and grooves, against closed forms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
