@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,7 +12,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Folder with the real frames, meshes, parts and photos; skips where it is missing."""
     root = Path(os.environ.get("DOPEPP_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not root.is_dir():
@@ -23,12 +21,12 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def ycb_root(shared_data: Path) -> Path:
+def ycb_root(shared_data):
     return shared_data / "ycb_video_mini"
 
 
 @pytest.fixture
-def two_nodes() -> Iterator[Any]:
+def two_nodes():
     """A Ray cluster of two machines, both this one."""
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster

@@ -28,7 +28,7 @@ LINK: Final = re.compile(r"\]\(([^)\s]+)\)")
 OTHER_TOOLS: Final = {"--cfg"}
 """Options of Hydra's own that documents name alone."""
 
-COMMANDS: Final = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+COMMANDS: Final = typer.main.get_command(app).commands
 OPTIONS: Final = {
     name: {text for parameter in command.params for text in parameter.opts} | {"--help"}
     for name, command in COMMANDS.items()
@@ -102,7 +102,7 @@ def option_problem(override: str) -> str | None:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_links_lead_somewhere(path: Path) -> None:
+def test_links_lead_somewhere(path):
     bad = []
     for target in LINK.findall(FENCE.sub("", path.read_text())):
         if re.match(r"[a-z]+:", target):
@@ -116,7 +116,7 @@ def test_links_lead_somewhere(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_console_commands_and_their_options_exist(path: Path) -> None:
+def test_console_commands_and_their_options_exist(path):
     bad = []
     for words in commands(path.read_text()):
         if words[0] == "dopepp" and len(words) > 1:
@@ -144,7 +144,7 @@ GUIDES: Final = [path for path in DOCUMENTS if path.name != "CHANGELOG.md"]
 
 
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
-def test_options_of_training_and_evaluation_exist(path: Path) -> None:
+def test_options_of_training_and_evaluation_exist(path):
     groups = {key.split(".")[0] for key in KEYS if "." in key}
     text, bad = path.read_text(), []
     for words in commands(text):
@@ -166,7 +166,7 @@ def test_options_of_training_and_evaluation_exist(path: Path) -> None:
     assert not bad
 
 
-def test_it_finds_what_does_not_exist() -> None:
+def test_it_finds_what_does_not_exist():
     """The checks above would find nothing in an empty list, too."""
     assert option_problem("data=cbp") == "no conf/data/cbp.yaml"
     assert option_problem("data.preset=paper") == "no option data.preset"

@@ -9,7 +9,6 @@ import runpy
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,11 +53,8 @@ class Done:
         return line
 
 
-Runner = Callable[..., Done]
-
-
 @pytest.fixture(scope="session")
-def tiny() -> tuple[str, ...]:
+def tiny():
     return TINY
 
 
@@ -91,13 +87,13 @@ def in_process(script: str, *arguments: str, paper_size: tuple[int, int] = (64, 
 
 
 @pytest.fixture(scope="session")
-def call() -> Runner:
+def call():
     """Run ``train.py`` or ``evaluate.py`` in this process."""
     return in_process
 
 
 @pytest.fixture(scope="session")
-def start(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., subprocess.Popen[str]]:
+def start(tmp_path_factory):
     """Start ``train.py`` or ``evaluate.py`` as a process, in a folder that is not the project's."""
     folder = tmp_path_factory.mktemp("cwd")
 
@@ -115,7 +111,7 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., subprocess.
 
 
 @pytest.fixture(scope="session")
-def command(start: Callable[..., subprocess.Popen[str]]) -> Runner:
+def command(start):
     """Run ``train.py`` or ``evaluate.py`` as a process."""
 
     def run(script: str, *arguments: str) -> Done:
@@ -131,7 +127,7 @@ def command(start: Callable[..., subprocess.Popen[str]]) -> Runner:
 
 
 @pytest.fixture(scope="session")
-def find_run() -> Callable[[Path], Path]:
+def find_run():
     def find(output_dir: Path) -> Path:
         (versions,) = output_dir.glob("**/versions.json")
         return versions.parent
@@ -140,9 +136,7 @@ def find_run() -> Callable[[Path], Path]:
 
 
 @pytest.fixture(scope="session")
-def trained(
-    find_run: Callable[[Path], Path], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Done]:
+def trained(find_run, tmp_path_factory):
     """The folder and the output of one tiny training."""
     output_dir = tmp_path_factory.mktemp("outputs")
     done = in_process("train.py", *TINY, f"output_dir={output_dir}", paper_size=PAPER_INPUT_SIZE)
@@ -151,7 +145,7 @@ def trained(
 
 
 @pytest.fixture
-def run(trained: tuple[Path, Done], tmp_path: Path) -> Path:
+def run(trained, tmp_path):
     """A finished run of one epoch of two steps, moved into this test's own folder."""
     folder = trained[0]
     copy = tmp_path / "outputs" / folder.parent.name / folder.name
@@ -160,7 +154,7 @@ def run(trained: tuple[Path, Done], tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def frame_root(ycb_root: Path, tmp_path: Path) -> Path:
+def frame_root(ycb_root, tmp_path):
     """A YCB-Video folder with one real frame that can be damaged, and links to the rest."""
     root = tmp_path / "ycb"
     (root / "data" / "0050").mkdir(parents=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,9 @@ import trimesh
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 
-Runner = Callable[..., Any]
-
 
 @pytest.fixture
-def train(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> Runner:
+def train(call, tiny, tmp_path):
     """A tiny training with overrides; its mistake must be the only line, and nothing is begun."""
 
     def run(*overrides: str) -> str:
@@ -61,11 +58,11 @@ def train(call: Runner, tiny: tuple[str, ...], tmp_path: Path) -> Runner:
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )  # fmt: skip
-def test_a_mistake_in_the_overrides(overrides: list[str], expected: str, train: Runner) -> None:
+def test_a_mistake_in_the_overrides(overrides, expected, train):
     assert expected in train(*overrides)
 
 
-def test_roots_that_are_no_ycb_video(train: Runner, ycb_root: Path, tmp_path: Path) -> None:
+def test_roots_that_are_no_ycb_video(train, ycb_root, tmp_path):
     root = tmp_path / "not ycb"
     root.mkdir()
     override = f"data.root='{root}'"
@@ -76,7 +73,7 @@ def test_roots_that_are_no_ycb_video(train: Runner, ycb_root: Path, tmp_path: Pa
     assert "data.objects with '003_cracker'; allowed: 002_master_chef_can, 003_cracker_box" in line
 
 
-def test_meshes_that_cannot_be_parts(train: Runner, tmp_path: Path) -> None:
+def test_meshes_that_cannot_be_parts(train, tmp_path):
     path = tmp_path / "plate.stl"
     trimesh.creation.box((100.0, 60.0, 5.0)).export(path)  # millimetres
     line = train(f"data.parts=['{path}']", "data.unit=m")
@@ -109,19 +106,9 @@ def shrink_label(root: Path) -> None:
 
 @pytest.mark.parametrize(
     ("damage", "expected"),
-    [
-        (damage_meta, "000003-meta.mat"),
-        (damage_image, "000003-color.png"),
-        (shrink_label, "320"),
-    ],
+    [(damage_meta, "000003-meta.mat"), (damage_image, "000003-color.png"), (shrink_label, "320")],
 )
-def test_a_damaged_frame(
-    damage: Callable[[Path], None],
-    expected: str,
-    frame_root: Path,
-    call: Runner,
-    tmp_path: Path,
-) -> None:
+def test_a_damaged_frame(damage, expected, frame_root, call, tmp_path):
     damage(frame_root)
     output_dir = tmp_path / "outputs"
     done = call(
@@ -135,8 +122,8 @@ def test_a_damaged_frame(
 
 
 def test_a_frame_that_breaks_during_training_ends_it_in_one_line(
-    frame_root: Path, ycb_root: Path, call: Runner, tmp_path: Path
-) -> None:
+    frame_root, ycb_root, call, tmp_path
+):
     """The training data are read by worker processes; their mistake reaches the user as it is."""
     for name in ("color.png", "label.png", "meta.mat", "depth.png"):
         folder = frame_root / "data" / "0000"
@@ -206,15 +193,7 @@ def absent(path: Path, good: Path) -> None:
         (absent, "init_from", "which is no file"),
     ],
 )
-def test_a_file_that_is_no_checkpoint(
-    write: Callable[[Path, Path], None],
-    place: str,
-    expected: str,
-    trained: tuple[Path, Any],
-    call: Runner,
-    train: Runner,
-    tmp_path: Path,
-) -> None:
+def test_a_file_that_is_no_checkpoint(write, place, expected, trained, call, train, tmp_path):
     good, bad = trained[0] / "checkpoints" / "best.ckpt", tmp_path / "bad.ckpt"
     write(bad, good)
     if place == "init_from":
@@ -231,12 +210,12 @@ def test_a_file_that_is_no_checkpoint(
     assert not (tmp_path / "trace").exists()
 
 
-def test_evaluation_asks_for_its_checkpoint(call: Runner, tmp_path: Path) -> None:
+def test_evaluation_asks_for_its_checkpoint(call, tmp_path):
     done = call("evaluate.py", f"output_dir={tmp_path}")
     assert done.line.startswith("got no ckpt_path; allowed: ckpt_path=")
 
 
-def test_a_k_that_cannot_belong_to_the_image(trained: tuple[Path, Any]) -> None:
+def test_a_k_that_cannot_belong_to_the_image(trained):
     estimator = PoseEstimator.load(trained[0] / "checkpoints" / "best.ckpt")
     image = np.zeros((120, 160, 3), np.uint8)
     K = np.array([[1066.8, 0, 313.0], [0, 1067.5, 241.3], [0, 0, 1.0]])  # of 640×480
@@ -245,7 +224,7 @@ def test_a_k_that_cannot_belong_to_the_image(trained: tuple[Path, Any]) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_the_shell_sees_one_line_and_code_two(command: Runner, tmp_path: Path) -> None:
+def test_the_shell_sees_one_line_and_code_two(command, tmp_path):
     done = command("train.py", "data.objects=[003_cracker_box]", f"output_dir={tmp_path}")
     assert "data.objects=['003_cracker_box'] without data.root" in done.line
     assert done.err.count("\n") == 1

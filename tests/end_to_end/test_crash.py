@@ -1,7 +1,5 @@
 """Five kills at random moments; ``benchmarks/crash.py`` does fifty."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -13,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.timeout(600)
-def test_a_run_killed_five_times_ends_as_one_left_in_peace(tmp_path: Path) -> None:
+def test_a_run_killed_five_times_ends_as_one_left_in_peace(tmp_path):
     done = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks" / "crash.py"), "--kills=5", "--epochs=4"],
         cwd=tmp_path,

@@ -44,7 +44,7 @@ def steps(run: Path) -> list[int]:
         return [int(row["step"]) for row in csv.DictReader(stream) if row["train/loss"]]
 
 
-def test_two_processes_go_on_in_mid_epoch(tiny: tuple[str, ...], tmp_path: Path) -> None:
+def test_two_processes_go_on_in_mid_epoch(tiny, tmp_path):
     arguments = [
         *tiny, "trainer=ddp", "trainer.accelerator=cpu", "trainer.max_epochs=3",
         f"data.samples_per_epoch={2 * 4 * STEPS_PER_EPOCH}", "data/masking=random",

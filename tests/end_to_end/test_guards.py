@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +13,8 @@ import yaml
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.virtual.factory import Factory
 
-Runner = Callable[..., Any]
-FindRun = Callable[[Path], Path]
 
-
-def test_a_run_that_goes_on_tells_what_changed(run: Path, call: Runner) -> None:
+def test_a_run_that_goes_on_tells_what_changed(run, call):
     before = (run / ".hydra" / "overrides.yaml").read_text()
     refused = call("train.py", f"resume={run}", "seed=5", "trainer.max_epochs=2")
     assert "(seed: 0 → 5)" in refused.line
@@ -55,9 +50,7 @@ def test_a_run_that_goes_on_tells_what_changed(run: Path, call: Runner) -> None:
     assert hostile not in overrides
 
 
-def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(
-    run: Path, call: Runner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, monkeypatch):
     good = (run / "checkpoints" / "best.ckpt").read_bytes()
     compare = SpatialCrossEntropy.forward
 
@@ -88,12 +81,8 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(
 
 @pytest.mark.slow
 def test_an_evaluation_says_when_the_images_are_no_longer_those(
-    run: Path,
-    call: Runner,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    run, call, tmp_path, monkeypatch, caplog
+):
     def warnings(*overrides: str) -> list[str]:
         caplog.clear()
         done = call("evaluate.py", *measured, *overrides)

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +47,7 @@ def children(pid: int) -> list[int]:
 @pytest.mark.ddp
 @pytest.mark.skipif(sys.platform != "linux", reason="uses /proc and prctl")
 @pytest.mark.parametrize("killed", ["rank 0", "rank 1"])
-def test_the_others_end_when_a_process_is_killed(
-    killed: str, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_the_others_end_when_a_process_is_killed(killed, tiny, tmp_path):
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)  # a child of a dead child is ours
     with (tmp_path / "err").open("w") as err:
         first = subprocess.Popen(
@@ -81,9 +78,7 @@ def test_the_others_end_when_a_process_is_killed(
     load_network(saved[0])
 
 
-def test_a_run_goes_on_without_weights_and_biases(
-    tiny: tuple[str, ...], tmp_path: Path, find_run: Callable[[Path], Path]
-) -> None:
+def test_a_run_goes_on_without_weights_and_biases(tiny, tmp_path, find_run):
     """The real client, online, and a machine that takes no connection."""
     address = {"WANDB_BASE_URL": "http://127.0.0.1:9", "WANDB_API_KEY": "0" * 40}
     kept = {k: v for k, v in environment(tmp_path).items() if not k.startswith("WANDB_")}

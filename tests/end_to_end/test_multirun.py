@@ -2,13 +2,9 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-
-Runner = Callable[..., Any]
 
 
 def table(sweep: Path) -> list[dict[str, str]]:
@@ -22,9 +18,7 @@ def only_sweep(output_dir: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_failing_job_is_a_row_and_the_others_run(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_failing_job_is_a_row_and_the_others_run(call, tiny, tmp_path):
     jobs = ("optimizer.lr=-1,1e-3", "seed=1,2")
     done = call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}")
     assert done.code == 1
@@ -51,9 +45,7 @@ def test_a_failing_job_is_a_row_and_the_others_run(
     assert not (sweep / "0" / "metrics.json").exists()
 
 
-def test_a_program_error_is_a_row_too(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path, ycb_root: Path
-) -> None:
+def test_a_program_error_is_a_row_too(call, tiny, tmp_path, ycb_root):
     """What no check foresaw: here, a training that Lightning cannot begin."""
     broken = "trainer.gradient_clip_val=wrong"
     done = call("train.py", "-m", *tiny, broken, f"output_dir={tmp_path}")
@@ -63,9 +55,7 @@ def test_a_program_error_is_a_row_too(
     assert "\n" not in row["object"]
 
 
-def test_several_devices_are_refused_with_the_reason(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_several_devices_are_refused_with_the_reason(call, tiny, tmp_path):
     done = call("train.py", "-m", *tiny, "trainer.devices=2", f"output_dir={tmp_path}")
     assert done.code == 1
     (row,) = table(only_sweep(tmp_path))
@@ -73,9 +63,7 @@ def test_several_devices_are_refused_with_the_reason(
     assert "one process per job" in row["object"]
 
 
-def test_a_choice_that_does_not_exist_stops_the_sweep_before_it_begins(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_choice_that_does_not_exist_stops_the_sweep_before_it_begins(call, tiny, tmp_path):
     done = call("train.py", "-m", *tiny, "model=dopepp,dop", f"output_dir={tmp_path}")
     assert "model=dop; allowed: dope dopepp" in done.line
     assert not list(tmp_path.glob("**/metrics.json"))

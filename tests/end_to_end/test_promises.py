@@ -23,7 +23,7 @@ def train(tmp_path: Path, *overrides: str) -> dict[str, Any]:
     return record
 
 
-def test_the_quickstart_learns(tmp_path: Path) -> None:
+def test_the_quickstart_learns(tmp_path):
     record = train(tmp_path, "model=dopepp", "data=hybrid", "experiment=quickstart")
     row = record["objects"]["pivconnector"]
     assert row["num_instances"] == 300
@@ -34,6 +34,6 @@ def test_the_quickstart_learns(tmp_path: Path) -> None:
     assert row["add_01d"] > references["best constant pose"]["pivconnector"]["add_01d"]
 
 
-def test_one_real_frame_is_learned_by_heart(tmp_path: Path, ycb_root: Path) -> None:
+def test_one_real_frame_is_learned_by_heart(tmp_path, ycb_root):
     record = train(tmp_path, "debug=overfit", f"data.root={ycb_root}")
     assert record["objects"]["003_cracker_box"]["add_01d"] == 1.0

@@ -4,7 +4,6 @@ import csv
 import json
 import signal
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,6 @@ import torch
 from dopepp.experiment.runs.resume import read_overrides
 from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.system import PoseSystem
-
-Runner = Callable[..., Any]
-FindRun = Callable[[Path], Path]
 
 
 def rows(run: Path) -> list[dict[str, str]]:
@@ -33,7 +29,7 @@ def last(run: Path) -> dict[str, Any]:
     return content
 
 
-def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: FindRun) -> None:
+def test_resume_goes_on_in_the_same_folder(run, call, find_run):
     before = rows(run)
     assert steps(run) == [0, 1]
     done = call("train.py", f"resume={run}", "trainer.max_epochs=2")
@@ -55,12 +51,8 @@ def test_resume_goes_on_in_the_same_folder(run: Path, call: Runner, find_run: Fi
 
 
 def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
-    call: Runner,
-    find_run: FindRun,
-    tiny: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    call, find_run, tiny, tmp_path, monkeypatch
+):
     overrides = [*tiny, "trainer.max_epochs=2"]
     assert call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}").code == 0
     # The last epoch's, though nothing has become better since the first one's.
@@ -96,9 +88,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
     assert ends[0] == ends[1]
 
 
-def test_init_from_starts_a_new_run_with_the_weights(
-    run: Path, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_init_from_starts_a_new_run_with_the_weights(run, call, find_run, tiny, tmp_path):
     path = run / "checkpoints" / "best.ckpt"
     done = call(
         "train.py", *tiny, f"init_from={path}", "optimizer.lr=1e-12", "scheduler=constant",
@@ -114,9 +104,7 @@ def test_init_from_starts_a_new_run_with_the_weights(
             torch.testing.assert_close(value, trained[name], atol=1e-6, rtol=0)
 
 
-def test_mistakes_in_the_three_words(
-    run: Path, call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_mistakes_in_the_three_words(run, call, tiny, tmp_path):
     new = f"output_dir={tmp_path / 'new'}"
     checkpoint = run / "checkpoints" / "best.ckpt"
     for overrides, expected in (
@@ -157,9 +145,7 @@ def damage(path: Path, how: str) -> None:
         pytest.param("empty", marks=pytest.mark.slow),
     ],
 )
-def test_resume_takes_the_newest_whole_checkpoint(
-    how: str, run: Path, call: Runner, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
     whole = last(run)["state_dict"]
     folder = run / "checkpoints"
     (folder / "previous.ckpt").write_bytes((folder / "last.ckpt").read_bytes())
@@ -184,9 +170,7 @@ def test_resume_takes_the_newest_whole_checkpoint(
     assert expected in call("train.py", f"resume={run}").line
 
 
-def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(
-    run: Path, call: Runner, find_run: FindRun
-) -> None:
+def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(run, call, find_run):
     before = rows(run)
     for path in (run / "checkpoints").iterdir():
         path.unlink()
@@ -202,7 +186,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(
     assert find_run(run.parents[1]) == run
 
 
-def test_hydras_note_of_the_options_is_believed_as_a_whole_or_not_at_all(run: Path) -> None:
+def test_hydras_note_of_the_options_is_believed_as_a_whole_or_not_at_all(run):
     options = read_overrides(run)
     (run / ".hydra" / "resume.json").unlink()  # killed before it was written
     assert read_overrides(run) == options

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dopepp.experiment.runs import record
 
-Runner = Callable[..., Any]
 
-
-def test_the_same_command_twice_makes_two_folders(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_the_same_command_twice_makes_two_folders(call, tiny, tmp_path):
     command = ("job=cost", "cost.num_frames=1", "cost.batch_size=1", f"output_dir={tmp_path}")
     for count in (1, 2):
         assert call("train.py", *tiny, *command).code == 0
@@ -26,9 +20,7 @@ def test_the_same_command_twice_makes_two_folders(
 
 
 @pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
-def test_the_folder_of_a_run_is_refused_untouched(
-    script: str, call: Runner, tiny: tuple[str, ...], trained: tuple[Path, Any]
-) -> None:
+def test_the_folder_of_a_run_is_refused_untouched(script, call, tiny, trained):
     run, _ = trained
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     options = tiny if script == "train.py" else (f"ckpt_path={run / record.BEST_CHECKPOINT}",)
@@ -38,9 +30,7 @@ def test_the_folder_of_a_run_is_refused_untouched(
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_a_fast_dev_run_does_everything_and_keeps_no_weights(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_fast_dev_run_does_everything_and_keeps_no_weights(call, tiny, tmp_path):
     done = call(
         "train.py", *tiny, "debug=fdr", "data.num_test=1", "tune=true", "num_empty=1",
         f"output_dir={tmp_path}",
@@ -57,9 +47,7 @@ def test_a_fast_dev_run_does_everything_and_keeps_no_weights(
     assert "keep_checkpoints=false" in done.line
 
 
-def test_the_learning_rate_finder_trains_nothing_else(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_the_learning_rate_finder_trains_nothing_else(call, tiny, tmp_path):
     done = call(
         "train.py", *tiny, "job=lr_finder", "lr_finder.num_steps=20", f"output_dir={tmp_path}"
     )
@@ -81,9 +69,7 @@ def test_the_learning_rate_finder_trains_nothing_else(
     assert "lr_finder.max_lr=1e-07; allowed: above lr_finder.min_lr=1e-06" in done.line
 
 
-def test_a_run_that_ends_otherwise_says_how_to_go_on(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_ends_otherwise_says_how_to_go_on(call, tiny, tmp_path, monkeypatch):
     def interrupt(*_: Any, **__: Any) -> None:
         (run,) = tmp_path.glob("*/*")
         readme = (run / "README.md").read_text()

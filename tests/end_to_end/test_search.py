@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,9 +20,7 @@ SEARCH = (
 
 
 @pytest.mark.slow
-def test_a_killed_search_goes_on_and_prunes(
-    start: Callable[..., Any], call: Callable[..., Any], tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_killed_search_goes_on_and_prunes(start, call, tiny, tmp_path):
     optuna = pytest.importorskip("optuna")
     arguments = [*tiny, *SEARCH, f"output_dir={tmp_path}"]
     sweep = tmp_path / "search" / "s"
@@ -35,7 +31,7 @@ def test_a_killed_search_goes_on_and_prunes(
         process.kill()
 
     def trials() -> list[Any]:
-        return optuna.load_study(study_name="s", storage=f"sqlite:///{sweep / 'study.db'}").trials  # type: ignore[no-any-return]
+        return optuna.load_study(study_name="s", storage=f"sqlite:///{sweep / 'study.db'}").trials
 
     assert [trial.state.name for trial in trials()] == ["RUNNING"]
     done = call("train.py", *arguments)

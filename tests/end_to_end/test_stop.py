@@ -7,7 +7,7 @@ import logging
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,6 @@ import pytest
 import torch
 
 from dopepp.training.system import PoseSystem
-
-Runner = Callable[..., Any]
-FindRun = Callable[[Path], Path]
 
 
 def last_step(run: Path) -> int:
@@ -60,8 +57,8 @@ def send(*numbers: int) -> Callable[[], None]:
     ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_saves_the_step_and_names_the_checkpoint(
-    number: int, code: int, call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+    number, code, call, find_run, tiny, tmp_path
+):
     with pytest.MonkeyPatch.context() as patch:
         at_step(patch, 0, send(number))
         done = call("train.py", *tiny, f"output_dir={tmp_path}")
@@ -76,9 +73,7 @@ def test_a_signal_saves_the_step_and_names_the_checkpoint(
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
-    call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(call, find_run, tiny, tmp_path):
     save = torch.save
 
     def interrupted_save(content: dict[str, Any], stream: Any) -> None:
@@ -102,12 +97,8 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
 
 @pytest.mark.slow
 def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
-    call: Runner,
-    find_run: FindRun,
-    tiny: tuple[str, ...],
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    call, find_run, tiny, tmp_path, caplog
+):
     caplog.set_level(logging.INFO)
     scontrol = tmp_path / "bin" / "scontrol"
     scontrol.parent.mkdir()
@@ -131,9 +122,7 @@ def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
 
 
 @pytest.mark.slow
-def test_an_interrupted_sweep_keeps_what_is_finished(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_an_interrupted_sweep_keeps_what_is_finished(call, tiny, tmp_path):
     seeds: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
 
@@ -154,7 +143,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def small_disk(tmp_path):
     """A file system of twelve megabytes."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -178,13 +167,7 @@ def fill(disk: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_for_a_while_costs_nothing(
-    small_disk: Path,
-    call: Runner,
-    find_run: FindRun,
-    tiny: tuple[str, ...],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_disk_that_is_full_for_a_while_costs_nothing(small_disk, call, find_run, tiny, caplog):
     with pytest.MonkeyPatch.context() as patch:
         at_step(patch, 1, lambda: fill(small_disk))
         at_step(patch, 3, lambda: (small_disk / "filler").unlink())
@@ -198,8 +181,8 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(
 
 @pytest.mark.slow
 def test_a_disk_that_stays_full_fails_the_run_and_keeps_the_last_good_checkpoint(
-    small_disk: Path, call: Runner, find_run: FindRun, tiny: tuple[str, ...]
-) -> None:
+    small_disk, call, find_run, tiny
+):
     with pytest.MonkeyPatch.context() as patch:
         at_step(patch, 2, lambda: fill(small_disk))
         done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
@@ -217,9 +200,7 @@ def test_a_disk_that_stays_full_fails_the_run_and_keeps_the_last_good_checkpoint
     assert steps(run) == ["0", "1", "2", "3"]
 
 
-def test_a_disk_that_is_too_small_is_refused_before_training(
-    small_disk: Path, call: Runner, tiny: tuple[str, ...]
-) -> None:
+def test_a_disk_that_is_too_small_is_refused_before_training(small_disk, call, tiny):
     fill(small_disk)
     with (small_disk / "filler").open("r+b") as stream:
         stream.truncate((small_disk / "filler").stat().st_size - 2**20)
@@ -229,18 +210,14 @@ def test_a_disk_that_is_too_small_is_refused_before_training(
 
 
 @pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
-def test_a_folder_that_cannot_be_written_is_named_at_once(
-    script: str, call: Runner, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_written_is_named_at_once(script, call, tiny, tmp_path):
     (tmp_path / "file").write_text("")
     output = f"output_dir={tmp_path / 'file' / 'outputs'}"
     done = call(script, *(tiny if script == "train.py" else ()), output)
     assert f"output folder {tmp_path}/file" in done.line
 
 
-def test_a_read_only_folder_is_named_at_once(
-    small_disk: Path, call: Runner, tiny: tuple[str, ...]
-) -> None:
+def test_a_read_only_folder_is_named_at_once(small_disk, call, tiny):
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     done = call("train.py", *tiny, f"output_dir={small_disk}")
     assert f"output folder {small_disk}" in done.line

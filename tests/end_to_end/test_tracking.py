@@ -9,7 +9,7 @@ import struct
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ import cv2
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb.proto import wandb_internal_pb2
-
-Runner = Callable[..., Any]
 
 BLOCK = 32768
 """Bytes of a block of LevelDB's log format, which the files have behind seven bytes of their own;
@@ -40,7 +38,7 @@ def records(path: Path) -> Iterator[Any]:
         pieces += content[place + HEADER.size : place + HEADER.size + length]
         place += HEADER.size + length
         if kind in (1, 4):
-            record = wandb_internal_pb2.Record()  # type: ignore[attr-defined]
+            record = wandb_internal_pb2.Record()
             record.ParseFromString(pieces)
             pieces = b""
             yield record
@@ -99,7 +97,7 @@ def sweep_of(output_dir: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sweep(call: Runner, tiny: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sweep(call, tiny, tmp_path_factory):
     """The folder of a multirun of both models that both services follow."""
     folder = tmp_path_factory.mktemp("sweep")
     tensorboard = "+logger.tensorboard={_target_: lightning.pytorch.loggers.TensorBoardLogger, "
@@ -113,7 +111,7 @@ def sweep(call: Runner, tiny: tuple[str, ...], tmp_path_factory: pytest.TempPath
     return sweep_of(folder)
 
 
-def test_they_end_in_one_table_dope_first(sweep: Path) -> None:
+def test_they_end_in_one_table_dope_first(sweep):
     with (sweep / "compare.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["method"] for row in rows[:2]] == ["dope", "dopepp"]
@@ -144,7 +142,7 @@ def test_they_end_in_one_table_dope_first(sweep: Path) -> None:
     assert prints[0] == prints[1]
 
 
-def test_every_job_is_a_run_and_the_comparison_one_more(sweep: Path) -> None:
+def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
     for job, model in (("0", "dopepp"), ("1", "dope")):
         run = only(sweep / job)
         assert run.name.startswith(f"{model} virtual")
@@ -179,9 +177,7 @@ def test_every_job_is_a_run_and_the_comparison_one_more(sweep: Path) -> None:
     }  # fmt: skip
 
 
-def test_a_resumed_run_goes_on_in_the_same_run(
-    call: Runner, find_run: Callable[[Path], Path], tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_resumed_run_goes_on_in_the_same_run(call, find_run, tiny, tmp_path):
     assert call("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}").code == 0
     run = find_run(tmp_path)
     done = call("train.py", f"resume={run}", "trainer.max_epochs=2", "resume_anyway=true")
@@ -199,9 +195,7 @@ def test_a_resumed_run_goes_on_in_the_same_run(
     assert max(first) < min(second)
 
 
-def test_a_service_that_dies_in_the_middle_ends_nothing(
-    call: Runner, tiny: tuple[str, ...], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_service_that_dies_in_the_middle_ends_nothing(call, tiny, tmp_path, caplog):
     killed = []
 
     def kill_service() -> None:
@@ -227,7 +221,7 @@ def test_a_service_that_dies_in_the_middle_ends_nothing(
     assert only(sweep / "1").exit_code == 0
 
 
-def test_tensorboard_holds_the_same(sweep: Path) -> None:
+def test_tensorboard_holds_the_same(sweep):
     events = EventAccumulator(str(sweep / "0" / "tensorboard")).Reload()
     tags = events.Tags()
     assert {"train/loss", "test/pivconnector/add_01d"} <= set(tags["scalars"])

@@ -3,9 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,16 +20,13 @@ from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
 
-Runner = Callable[..., Any]
-FindRun = Callable[[Path], Path]
-
 
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))
 
 
-def test_a_run_folder_holds_everything(trained: tuple[Path, Any], tiny: tuple[str, ...]) -> None:
+def test_a_run_folder_holds_everything(trained, tiny):
     run, _ = trained
     for name in ("auc.png", "overlay.png", "val_auc.png", "val_overlay.png", "val_belief.png"):
         image = cv2.imread(str(run / name))
@@ -72,7 +67,7 @@ def test_a_run_folder_holds_everything(trained: tuple[Path, Any], tiny: tuple[st
     assert len(versions["data_fingerprint"]) == 64
 
 
-def test_a_run_shows_what_it_does(trained: tuple[Path, Any]) -> None:
+def test_a_run_shows_what_it_does(trained):
     _, done = trained
     for text in (
         "config", "model", "width: 0.0625",  # the config's tree
@@ -86,7 +81,7 @@ def test_a_run_shows_what_it_does(trained: tuple[Path, Any]) -> None:
     assert "Epoch 0" in done.out + done.err  # the progress bar
 
 
-def test_a_checkpoint_is_one_safe_file_that_predicts(trained: tuple[Path, Any]) -> None:
+def test_a_checkpoint_is_one_safe_file_that_predicts(trained):
     run, _ = trained
     path = run / "checkpoints" / "best.ckpt"
     assert "=" not in path.name  # which Hydra could not parse in ckpt_path=…
@@ -103,9 +98,7 @@ def test_a_checkpoint_is_one_safe_file_that_predicts(trained: tuple[Path, Any]) 
     assert "\n" not in str(error.value)
 
 
-def test_evaluation_needs_the_checkpoint_alone(
-    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
-) -> None:
+def test_evaluation_needs_the_checkpoint_alone(trained, call, find_run, tmp_path):
     run, _ = trained
     path = run / "checkpoints" / "best.ckpt"
     done = call("evaluate.py", f"ckpt_path={path}", f"output_dir={tmp_path}")
@@ -121,8 +114,8 @@ def test_evaluation_needs_the_checkpoint_alone(
 
 
 def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
-    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
-) -> None:
+    trained, call, find_run, tmp_path
+):
     run, _ = trained
     best, last = (run / "checkpoints" / name for name in ("best.ckpt", "last.ckpt"))
     done = call(
@@ -138,9 +131,7 @@ def test_a_baseline_stands_first_in_the_table_and_is_on_the_pictures(
 
 
 @pytest.mark.slow
-def test_shading_scale_and_bins_are_measured_of_both_networks(
-    trained: tuple[Path, Any], call: Runner, find_run: FindRun, tmp_path: Path
-) -> None:
+def test_shading_scale_and_bins_are_measured_of_both_networks(trained, call, find_run, tmp_path):
     run, _ = trained
     best, last = (run / "checkpoints" / name for name in ("best.ckpt", "last.ckpt"))
     done = call(
@@ -169,9 +160,7 @@ def test_shading_scale_and_bins_are_measured_of_both_networks(
         assert option.partition("=")[0] in done.line
 
 
-def test_other_data_must_show_the_checkpoints_objects(
-    trained: tuple[Path, Any], call: Runner, tmp_path: Path
-) -> None:
+def test_other_data_must_show_the_checkpoints_objects(trained, call, tmp_path):
     path = trained[0] / "checkpoints" / "best.ckpt"
     done = call(
         "evaluate.py", f"ckpt_path={path}", "data=virtual", "data.parts=[servoholder]",
@@ -188,8 +177,8 @@ def test_other_data_must_show_the_checkpoints_objects(
 
 @pytest.mark.slow
 def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
-    call: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+    call, find_run, tiny, tmp_path
+):
     done = call(
         "train.py", *tiny, "logger=tensorboard", "ema=0.5", "callbacks=early_stopping",
         "callbacks.early_stopping.patience=1", "callbacks.early_stopping.min_delta=1",
@@ -216,9 +205,7 @@ def test_tensorboard_gets_figures_and_pictures_and_all_else_may_be_on(
 
 @pytest.mark.slow
 @pytest.mark.ddp
-def test_two_processes_make_one_run_and_one_report(
-    command: Runner, find_run: FindRun, tiny: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_two_processes_make_one_run_and_one_report(command, find_run, tiny, tmp_path):
     done = command(
         "train.py", *tiny, "trainer=ddp", "trainer.accelerator=cpu", f"output_dir={tmp_path}"
     )

@@ -4,7 +4,6 @@ import contextlib
 import io
 import runpy
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,10 @@ TINY = (
     "model.width=0.0625",
     "trainer.max_epochs=1",
 )
-Composer = Callable[..., dict[str, Any]]
-Parser = Callable[..., RunConfig]
 
 
 @pytest.fixture
-def composed() -> Iterator[Composer]:
+def composed():
     """Compose ``conf/train.yaml`` (or another one) with overrides, as a plain dict."""
 
     def make(*overrides: str, config: str = "train") -> dict[str, Any]:
@@ -48,13 +45,13 @@ def composed() -> Iterator[Composer]:
 
 
 @pytest.fixture
-def parsed(composed: Composer) -> Parser:
+def parsed(composed):
     """The same as ``train.py`` parses it."""
     return lambda *overrides: RunConfig.of(composed(*overrides))
 
 
 @pytest.fixture
-def tiny(parsed: Parser) -> Parser:
+def tiny(parsed):
     """The same with a network and data that take no time."""
     return lambda *overrides: parsed(*TINY, *overrides)
 
@@ -116,7 +113,7 @@ if __name__ == "__main__":
 
 
 @pytest.fixture
-def fast_training(tmp_path: Path) -> Path:
+def fast_training(tmp_path):
     """An entry point like ``train.py`` whose jobs take no time; END_<job>=how ends one early."""
     path = tmp_path / "fast_training.py"
     path.write_text(FAST_TRAINING)
@@ -128,7 +125,7 @@ Called = tuple[int, str, str]
 
 
 @pytest.fixture
-def call_fast(fast_training: Path, tmp_path: Path) -> Callable[..., Called]:
+def call_fast(fast_training, tmp_path):
     """Run it inside this process; returns exit code, output and error output."""
 
     def call(*arguments: str) -> Called:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,15 +26,10 @@ from dopepp.experiment.train import do_job
 from dopepp.geometry.camera import transform
 from dopepp.maps.encode import MapGeometry
 
-Composer = Callable[..., dict[str, Any]]
-Parser = Callable[..., RunConfig]
-
 SMALL = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=4", "cost.batch_size=2")
 
 
-def test_counts_are_the_papers_and_times_are_written(
-    parsed: Parser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
     config = parsed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
     cost = measure_cost(config, tmp_path)
     assert cost.backbone_weights == 1_107_776
@@ -61,7 +53,7 @@ def test_counts_are_the_papers_and_times_are_written(
     assert read_rgb(tmp_path / "frame_rate.png").std() > 0
 
 
-def test_the_original_backbone(parsed: Parser, tmp_path: Path) -> None:
+def test_the_original_backbone(parsed, tmp_path):
     config = parsed(*SMALL, "model/backbone=vgg19_original", "model.width=1", "job=cost")
     assert measure_cost(config, tmp_path).backbone_weights == 9_696_960
 
@@ -74,13 +66,13 @@ def test_the_original_backbone(parsed: Parser, tmp_path: Path) -> None:
         ("recovery.max_peaks=0", "recovery option max_peaks=0"),
     ],
 )
-def test_impossible_jobs(composed: Composer, tmp_path: Path, override: str, message: str) -> None:
+def test_impossible_jobs(composed, tmp_path, override, message):
     with pytest.raises(UserError, match=message):
         do_job(composed(*SMALL, "job=cost", override), tmp_path)
     assert not any(tmp_path.iterdir())
 
 
-def test_the_time_does_not_depend_on_torchs_mode(parsed: Parser, tmp_path: Path) -> None:
+def test_the_time_does_not_depend_on_torchs_mode(parsed, tmp_path):
     measure_cost(parsed(*SMALL, "job=cost"), tmp_path)
     assert torch.is_grad_enabled()
 
@@ -92,7 +84,7 @@ def estimator_of(config: RunConfig) -> tuple[RehearsedEstimator, MapGeometry, De
     return RehearsedEstimator(network, description), geometry, build_test_source(config.data, parts)
 
 
-def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed: Parser) -> None:
+def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
     """So recovery has as much to do as behind a trained network."""
     estimator, geometry, source = estimator_of(
         parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
@@ -115,7 +107,7 @@ def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed: Parser) 
 
 
 @pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
-def test_the_exchanged_maps_have_the_networks_own_shape(parsed: Parser, size: str) -> None:
+def test_the_exchanged_maps_have_the_networks_own_shape(parsed, size):
     """Pictures are padded no further than the network needs, not to the whole input."""
     config = parsed(
         "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
@@ -130,7 +122,7 @@ def test_the_exchanged_maps_have_the_networks_own_shape(parsed: Parser, size: st
     assert [one.shape for one in estimator.answer] == [belief[0].shape, field[0].shape]
 
 
-def test_frames_of_earlier_versions_are_those_of_the_network(tmp_path: Path) -> None:
+def test_frames_of_earlier_versions_are_those_of_the_network(tmp_path):
     (tmp_path / "frames.csv").write_text("frame,seconds\n0,0.5\n1,0.25\n")
     frames = read_frames(tmp_path / "frames.csv")
     assert frames.network_seconds.tolist() == frames.seconds.tolist() == [0.5, 0.25]

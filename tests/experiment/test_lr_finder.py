@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 import torch
 
 from dopepp.core.errors import RunError
-from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.lr_finder import find_learning_rate, smooth, suggest
 from dopepp.models.losses import SpatialCrossEntropy
 
@@ -28,7 +25,7 @@ def losses(middle: float, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("middle", [1e-4, 1e-3])
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_the_rate_at_which_the_loss_falls_fastest(middle: float, noise: float) -> None:
+def test_the_rate_at_which_the_loss_falls_fastest(middle, noise):
     for seed in range(10):
         found = suggest(RATES, losses(middle, noise, seed))
         assert found is not None
@@ -36,14 +33,14 @@ def test_the_rate_at_which_the_loss_falls_fastest(middle: float, noise: float) -
         assert found.steepest < found.lowest < 300 * middle
 
 
-def test_a_loss_that_does_not_fall_suggests_nothing() -> None:
+def test_a_loss_that_does_not_fall_suggests_nothing():
     noise = 0.01 * np.random.default_rng(0).normal(size=200)
     assert suggest(RATES, 1 + noise) is None
     assert suggest(RATES, np.linspace(1, 3, 200)) is None
     assert suggest(RATES[:3], np.ones(3)) is None
 
 
-def test_smoothing_keeps_constants_and_lies_between_the_extremes() -> None:
+def test_smoothing_keeps_constants_and_lies_between_the_extremes():
     np.testing.assert_allclose(smooth(np.full(37, 2.5)), 2.5)
     values = np.random.default_rng(1).normal(size=100)
     smoothed = smooth(values)
@@ -51,9 +48,7 @@ def test_smoothing_keeps_constants_and_lies_between_the_extremes() -> None:
     assert values.min() < smoothed.min() < smoothed.max() < values.max()
 
 
-def test_a_sweep_ends_where_the_loss_is_not_finite(
-    tiny: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_ends_where_the_loss_is_not_finite(tiny, tmp_path, monkeypatch):
     number, forward = itertools.count(), SpatialCrossEntropy.forward
 
     def broken(self: SpatialCrossEntropy, *maps: Any) -> Any:
@@ -72,9 +67,7 @@ def test_a_sweep_ends_where_the_loss_is_not_finite(
     assert not list(tmp_path.glob("**/*.ckpt"))
 
 
-def test_a_loss_that_diverges_at_once_has_no_table(
-    tiny: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_diverges_at_once_has_no_table(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(
         SpatialCrossEntropy,
         "_summed",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -44,7 +43,7 @@ def scored(seed: int, count: int, right: bool = True) -> Scored:
     return Scored(features, rng.random(count), correct, image, count, count)
 
 
-def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
+def test_chosen_scores_are_calibrated_and_silent_on_other_images():
     options = choose(scored(0, 3000), scored(1, 1000, right=False))
     weights = np.array([options[f"score_{name}"] for name in FEATURES])
     shown, empty = scored(2, 3000), scored(3, 1000, right=False)
@@ -56,7 +55,7 @@ def test_chosen_scores_are_calibrated_and_silent_on_other_images() -> None:
     assert options["min_score"] < 1
 
 
-def test_the_threshold_lets_no_more_pass_than_it_may() -> None:
+def test_the_threshold_lets_no_more_pass_than_it_may():
     shown, empty = scored(4, 500), scored(5, 250, right=False)
     for rate in (0.0, 0.005, 0.1):
         options = choose(shown, empty, rate)
@@ -66,7 +65,7 @@ def test_the_threshold_lets_no_more_pass_than_it_may() -> None:
     assert choose(shown, empty, 1.0)["min_score"] == 0.0
 
 
-def test_silence_needs_no_threshold() -> None:
+def test_silence_needs_no_threshold():
     nothing = Scored(
         np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
     )
@@ -80,7 +79,7 @@ def test_silence_needs_no_threshold() -> None:
         ({"correct": np.ones(50, bool)}, "all of them right"),
     ],
 )
-def test_nothing_to_learn_from_is_said(change: dict[str, Any], message: str) -> None:
+def test_nothing_to_learn_from_is_said(change, message):
     nothing = Scored(
         np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 10, 0
     )
@@ -123,7 +122,7 @@ def estimator(*detections: Detection) -> Any:
     return SimpleNamespace(predict=lambda image, K: list(detections))
 
 
-def test_right_is_matched_once_and_within_a_tenth_of_the_diameter() -> None:
+def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
     part, T = load_part("pivconnector"), POSE
     detections = [found(part, T, 0.9, 0.05), found(part, T, 0.8, 0.05), found(part, T, 0.7, 0.2)]
     result = score_images(estimator(*detections), [part], Images(part, T))
@@ -134,7 +133,7 @@ def test_right_is_matched_once_and_within_a_tenth_of_the_diameter() -> None:
     assert not score_images(far, [part], Images(part, T)).correct.any()
 
 
-def test_what_finds_a_hidden_instance_is_not_judged() -> None:
+def test_what_finds_a_hidden_instance_is_not_judged():
     part = load_part("pivconnector")
     result = score_images(
         estimator(found(part, POSE, 0.9), found(part, POSE, 0.8)), [part], Images(part, POSE, 0.05)
@@ -146,7 +145,7 @@ def test_what_finds_a_hidden_instance_is_not_judged() -> None:
     assert result.num_instances == 0
 
 
-def test_poses_are_paired_with_the_instances_that_they_find() -> None:
+def test_poses_are_paired_with_the_instances_that_they_find():
     part = load_part("pivconnector")
     near, stray = found(part, POSE, 0.9, 0.05), found(part, POSE, 0.8, 3.0)
     estimated, true = matched_poses(estimator(near, stray), [part], Images(part, POSE))
@@ -156,7 +155,7 @@ def test_poses_are_paired_with_the_instances_that_they_find() -> None:
     assert [poses.shape for poses in hidden] == [(0, 4, 4)] * 2
 
 
-def test_a_symmetric_part_is_right_at_any_of_its_poses() -> None:
+def test_a_symmetric_part_is_right_at_any_of_its_poses():
     part = load_part("pivconnector")
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
     mirrored = replace(part, points=np.vstack([part.points, part.points @ flip[:3, :3]]))
@@ -175,7 +174,7 @@ SPEC = {
 }
 
 
-def test_the_tuned_checkpoint_stands_beside_the_old_one(tmp_path: Path) -> None:
+def test_the_tuned_checkpoint_stands_beside_the_old_one(tmp_path):
     weights = build_network(SPEC).state_dict()
     part = load_part("pivconnector")
     old = Checkpoint(SPEC, weights, [part], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,16 +26,15 @@ from dopepp.virtual.presets.preset import PRESETS
 
 INPUT_SIZE = (128, 128)
 NOISE_SIZE = 32
-SystemMaker = Callable[..., PoseSystem]
 
 
 @pytest.fixture(scope="session")
-def part() -> Part:
+def part():
     return pivconnector()
 
 
 @pytest.fixture(scope="session")
-def make_system(part: Part) -> SystemMaker:
+def make_system(part):
     """A tiny DOPE++ for one part, or two of the same shape."""
 
     def make(
@@ -69,7 +67,7 @@ def make_system(part: Part) -> SystemMaker:
 
 
 @pytest.fixture(scope="session")
-def make_datamodule(part: Part) -> Callable[[], PoseDataModule]:
+def make_datamodule(part):
     """Eight training and three validation renders in batches of two."""
 
     def source(num_items: int, split: Split) -> RenderedSource:
@@ -83,7 +81,7 @@ def make_datamodule(part: Part) -> Callable[[], PoseDataModule]:
 
 
 @pytest.fixture(scope="session")
-def batch(make_datamodule: Callable[[], PoseDataModule]) -> Batch:
+def batch(make_datamodule):
     """Two rendered images; not to be changed."""
     first: Batch = next(iter(make_datamodule().val_dataloader()))
     return first
@@ -114,7 +112,7 @@ class Noise:
 
 
 @pytest.fixture(scope="session")
-def make_noise(part: Part) -> Callable[[], PoseDataModule]:
+def make_noise(part):
     """Eight training and four validation pictures of noise in batches of two."""
 
     def make() -> PoseDataModule:
@@ -125,7 +123,7 @@ def make_noise(part: Part) -> Callable[[], PoseDataModule]:
 
 
 @pytest.fixture(scope="session")
-def read_csv() -> Callable[[Path], list[dict[str, str]]]:
+def read_csv():
     def read(path: Path) -> list[dict[str, str]]:
         with path.open(newline="") as stream:
             return list(csv.DictReader(stream))
@@ -134,7 +132,7 @@ def read_csv() -> Callable[[Path], list[dict[str, str]]]:
 
 
 @pytest.fixture(scope="session")
-def read_png() -> Callable[[Path], np.ndarray]:
+def read_png():
     def read(path: Path) -> np.ndarray:
         import cv2
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,8 @@ from lightning.pytorch.loggers import Logger
 
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 
-ReadCsv = Callable[[Path], list[dict[str, str]]]
 
-
-def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path: Path, read_csv: ReadCsv) -> None:
+def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path, read_csv):
     table = MetricsTable(tmp_path / "run" / "metrics.csv")
     table.save()
     assert not table.path.exists()
@@ -30,11 +27,8 @@ def test_columns_grow_and_a_steps_figures_share_a_row(tmp_path: Path, read_csv: 
 
 
 def test_a_failing_write_keeps_the_old_file_and_the_read_csv(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    read_csv: ReadCsv,
-) -> None:
+    tmp_path, monkeypatch, caplog, read_csv
+):
     table = MetricsTable(tmp_path / "metrics.csv")
     table.log_metrics({"loss": 2.0}, step=0)
     table.save()
@@ -59,7 +53,7 @@ def test_a_failing_write_keeps_the_old_file_and_the_read_csv(
     assert [row["step"] for row in read_csv(table.path)] == ["0", "1"]
 
 
-def test_an_existing_file_is_continued(tmp_path: Path, read_csv: ReadCsv) -> None:
+def test_an_existing_file_is_continued(tmp_path, read_csv):
     path = tmp_path / "metrics.csv"
     first = MetricsTable(path)
     for step in range(4):
@@ -123,9 +117,7 @@ def use(logger: GuardedLogger) -> None:
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_a_failing_logger_warns_once_and_is_off(
-    call: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failing_logger_warns_once_and_is_off(call, caplog):
     made: list[Broken] = []
 
     def make() -> Broken:
@@ -142,7 +134,7 @@ def test_a_failing_logger_warns_once_and_is_off(
         assert made[0].seen[-1] == call
 
 
-def test_a_working_logger_gets_everything(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_working_logger_gets_everything(caplog):
     logger = GuardedLogger(Broken)
     use(logger)
     assert isinstance(logger.inner, Broken)

@@ -26,7 +26,7 @@ def run(script: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def test_a_death_is_told_with_its_cause() -> None:
+def test_a_death_is_told_with_its_cause():
     quiet, killed = sleeper(), sleeper()
     failed, done = sleeper("raise SystemExit(3)"), sleeper("pass")
     try:
@@ -46,7 +46,7 @@ def test_a_death_is_told_with_its_cause() -> None:
             process.wait()
 
 
-def test_what_hangs_is_ended_from_outside() -> None:
+def test_what_hangs_is_ended_from_outside():
     """As in a collective on GPUs, where no exception reaches the main thread."""
     script = """
         import subprocess, sys, time
@@ -61,7 +61,7 @@ def test_what_hangs_is_ended_from_outside() -> None:
     assert ended.stderr.endswith("was killed by signal 9: the run ends\n")
 
 
-def test_a_stopped_watch_lets_processes_end() -> None:
+def test_a_stopped_watch_lets_processes_end():
     child = sleeper("raise SystemExit(3)")
     watch = Watch([child], None)
     watch.stop()
@@ -69,7 +69,7 @@ def test_a_stopped_watch_lets_processes_end() -> None:
     child.wait()
 
 
-def test_a_child_sees_that_its_parent_is_gone() -> None:
+def test_a_child_sees_that_its_parent_is_gone():
     script = """
         import os, subprocess, sys, time
         code = '''

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,10 +17,8 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.part import Part
 from dopepp.training.symmetry import FACING, SymmetryHandling, SymmetryOptions
-from dopepp.training.system import PoseSystem
 from dopepp.training.targets import draw_maps
 
-SystemMaker = Callable[..., PoseSystem]
 K = camera_matrix(110.0, 110.0, 63.5, 63.5)
 HALF_TURNS = np.stack(
     [np.diag(signs) for signs in ([1.0, -1, -1, 1], [-1.0, 1, -1, 1], [-1.0, -1, 1, 1])]
@@ -32,7 +30,7 @@ FLIP = make_transform(np.diag([1.0, -1, -1]), np.array([0.0, 0.04, 0.0]))
 def make_part(name: str, centre: tuple[float, float, float], **symmetries: object) -> Part:
     half = np.array([0.05, 0.03, 0.01])
     cuboid = cuboid_keypoints(np.array(centre) - half, np.array(centre) + half)
-    return Part(name, cuboid, 0.118, cuboid, **symmetries)  # type: ignore[arg-type]
+    return Part(name, cuboid, 0.118, cuboid, **symmetries)
 
 
 PLAIN = make_part("plain", (0, 0, 0))
@@ -80,7 +78,7 @@ def face_on(angles_deg: Sequence[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
-def test_poses_that_look_alike_get_the_same_keypoints(part: Part) -> None:
+def test_poses_that_look_alike_get_the_same_keypoints(part):
     handling = SymmetryHandling([part], SymmetryOptions())
     poses = random_poses(40, seed=5)
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous, 0.3)
@@ -92,7 +90,7 @@ def test_poses_that_look_alike_get_the_same_keypoints(part: Part) -> None:
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)
-def test_the_first_choice_is_the_best_of_the_whole_group(part: Part) -> None:
+def test_the_first_choice_is_the_best_of_the_whole_group(part):
     """Brute force over the group in steps of a degree, straight ahead, where no sight turns."""
     handling = SymmetryHandling([part], SymmetryOptions())
     poses = random_poses(20, seed=6)
@@ -109,7 +107,7 @@ def test_the_first_choice_is_the_best_of_the_whole_group(part: Part) -> None:
         assert np.abs(best - keypoints).max() < 0.6
 
 
-def test_choices_of_a_box_are_permutations_of_its_corners() -> None:
+def test_choices_of_a_box_are_permutations_of_its_corners():
     handling = SymmetryHandling([PLATE], SymmetryOptions(border_deg=360))
     batch = make_batch(random_poses(10, seed=7), PLATE)
     found = handling.equivalents(batch)
@@ -126,7 +124,7 @@ def test_choices_of_a_box_are_permutations_of_its_corners() -> None:
         assert all(sorted(order) == list(range(9)) and order[8] == 8 for order in orders)
 
 
-def test_parts_without_symmetries_and_padding_are_left_bit_by_bit() -> None:
+def test_parts_without_symmetries_and_padding_are_left_bit_by_bit():
     handling = SymmetryHandling([PLAIN, PLATE], SymmetryOptions(border_deg=360))
     batch = make_batch(random_poses(3, seed=8), PLAIN)
     found = handling.equivalents(batch)
@@ -139,7 +137,7 @@ def test_parts_without_symmetries_and_padding_are_left_bit_by_bit() -> None:
     assert not SymmetryHandling([PLATE], SymmetryOptions(False, 0.0)).active
 
 
-def test_the_border_is_as_wide_as_asked() -> None:
+def test_the_border_is_as_wide_as_asked():
     """Face on, a plate at θ in the image plane is |θ| and 180° − |θ| from the reference."""
     poses = face_on((0.0, 70.0, 80.0, 95.0, 120.0))
     handling = SymmetryHandling([PLATE], SymmetryOptions(border_deg=30.0))
@@ -149,14 +147,14 @@ def test_the_border_is_as_wide_as_asked() -> None:
 
 
 @pytest.fixture
-def plate_system(make_system: SystemMaker) -> PoseSystem:
+def plate_system(make_system):
     system = make_system()
     system.parts = (PLATE,)
     system.symmetry = SymmetryHandling([PLATE], SymmetryOptions(border_deg=30.0))
     return system
 
 
-def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system: PoseSystem) -> None:
+def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system):
     batch = make_batch(face_on((0.0, 85.0)), PLATE)
     found = plate_system.symmetry.equivalents(batch)
     geometry = plate_system.geometry
@@ -172,7 +170,7 @@ def test_targets_are_the_choice_that_the_maps_are_nearest_to(plate_system: PoseS
     assert torch.equal(plate_system.targets(batch)[0], first[0])
 
 
-def test_instances_on_one_image_choose_each_for_itself(plate_system: PoseSystem) -> None:
+def test_instances_on_one_image_choose_each_for_itself(plate_system):
     poses = face_on((85.0, -88.0))
     poses[:, :3, 3] = (-0.08, 0, 0.4), (0.08, 0, 0.4)
     alone = make_batch(poses, PLATE)
@@ -199,6 +197,6 @@ def test_instances_on_one_image_choose_each_for_itself(plate_system: PoseSystem)
         ({"canonical": False}, "border_deg=30.0 with symmetry.canonical=false"),
     ],
 )
-def test_options_are_checked(options: dict[str, object], message: str) -> None:
+def test_options_are_checked(options, message):
     with pytest.raises(UserError, match=message):
-        SymmetryOptions(**options)  # type: ignore[arg-type]
+        SymmetryOptions(**options)

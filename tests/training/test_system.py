@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -15,12 +14,9 @@ from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.parts.part import Part
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem, ValidationOutput
-
-SystemMaker = Callable[..., PoseSystem]
 
 
 def fit(
@@ -47,9 +43,7 @@ def fit(
     return trainer
 
 
-def test_a_checkpoint_describes_itself_and_predicts(
-    make_system: SystemMaker, make_noise: Callable[[], PoseDataModule], tmp_path: Path
-) -> None:
+def test_a_checkpoint_describes_itself_and_predicts(make_system, make_noise, tmp_path):
     system = make_system()
     fit(system, make_noise(), tmp_path)
     path = tmp_path / "checkpoints" / "best.ckpt"
@@ -72,11 +66,8 @@ def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> LRScheduler:
 
 @pytest.mark.parametrize("schedule", [one_cycle, cosine])
 def test_a_run_resumed_for_longer_follows_the_longer_schedule(
-    schedule: Callable[[torch.optim.Optimizer, int], LRScheduler],
-    make_system: SystemMaker,
-    make_noise: Callable[[], PoseDataModule],
-    tmp_path: Path,
-) -> None:
+    schedule, make_system, make_noise, tmp_path
+):
     """A schedule that had ended neither fails nor stays at a learning rate of zero."""
 
     class Watched(PoseSystem):
@@ -103,7 +94,7 @@ def test_a_run_resumed_for_longer_follows_the_longer_schedule(
     assert resumed[skipped:] == pytest.approx(whole[4 + skipped :], rel=1e-6)
 
 
-def test_recover_names_the_parts(make_system: SystemMaker, batch: Batch, part: Part) -> None:
+def test_recover_names_the_parts(make_system, batch, part):
     system = make_system()
     output = ValidationOutput(torch.tensor(0.0), *system.targets(batch))
     for detections, truth in zip(system.recover(output, batch), batch.T_cam_obj, strict=True):

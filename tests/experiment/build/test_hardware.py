@@ -1,8 +1,4 @@
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -12,13 +8,11 @@ from dopepp.experiment.build import hardware
 from dopepp.experiment.build.hardware import choose_precision, estimate_training_s
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system
-from dopepp.experiment.config.run import RunConfig, TrainerConfig
-
-Parser = Callable[..., RunConfig]
+from dopepp.experiment.config.run import TrainerConfig
 
 
 @pytest.mark.parametrize("accelerator", ["cpu", "cuda", "mps"])
-def test_what_is_asked_for_is_taken(accelerator: str) -> None:
+def test_what_is_asked_for_is_taken(accelerator):
     assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
 
 
@@ -26,9 +20,7 @@ def test_what_is_asked_for_is_taken(accelerator: str) -> None:
     ("flags", "expected"),
     [({"sse2", "avx512_bf16"}, "bf16-mixed"), ({"sse2", "avx2"}, "32-true"), (set(), "32-true")],
 )
-def test_a_cpu_takes_bf16_only_where_it_computes_in_it(
-    flags: set[str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cpu_takes_bf16_only_where_it_computes_in_it(flags, expected, monkeypatch):
     monkeypatch.setattr(hardware, "_cpu_flags", lambda: flags)
     precision, reason = choose_precision("auto", "cpu")
     assert precision == expected
@@ -36,16 +28,16 @@ def test_a_cpu_takes_bf16_only_where_it_computes_in_it(
 
 
 @pytest.mark.parametrize(("fast", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_a_gpu_is_asked(fast: bool, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_is_asked(fast, expected, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: fast)
     assert choose_precision("auto", "cuda")[0] == expected
 
 
-def test_other_accelerators_are_not_guessed_at() -> None:
+def test_other_accelerators_are_not_guessed_at():
     assert choose_precision("auto", "mps")[0] == "32-true"
 
 
-def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Parser) -> None:
+def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):
     config = tiny("model.backbone.batch_norm=true")
     parts = build_parts(config.data)
     module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
@@ -62,7 +54,7 @@ def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny: Pars
 
 
 @pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def alone(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
 
 
@@ -87,20 +79,18 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"devices": 2, "num_nodes": 3}, 6),
     ],
 )
-def test_how_many_processes_there_will_be(
-    options: dict[str, Any], count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_how_many_processes_there_will_be(options, count, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert TrainerConfig(max_epochs=1, **options).num_processes == count
 
 
-def test_processes_that_torchrun_has_started_count_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_that_torchrun_has_started_count_too(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert TrainerConfig(max_epochs=1, devices=1).num_processes == 2
 
 
 @pytest.mark.parametrize("devices", [0, [], "all", 1.5, True, None, -2], ids=repr)
-def test_a_number_that_means_nothing_is_refused(devices: object) -> None:
+def test_a_number_that_means_nothing_is_refused(devices):
     with pytest.raises(UserError, match=r"trainer\.devices="):
         _ = TrainerConfig(max_epochs=1, devices=devices).num_processes

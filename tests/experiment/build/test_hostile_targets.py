@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from dopepp.experiment.runs.tracking import tracked
 from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
-Parser = Callable[..., RunConfig]
 HOSTILE = (
     "os.system",
     "subprocess.Popen",
@@ -68,7 +66,7 @@ def build_all(config: RunConfig, run_dir: Path) -> None:
     ("place", "target"),
     [(place, HOSTILE[number % len(HOSTILE)]) for number, place in enumerate(PLACES)],
 )
-def test_a_hostile_target_is_refused(place: str, target: str, tiny: Parser, tmp_path: Path) -> None:
+def test_a_hostile_target_is_refused(place, target, tiny, tmp_path):
     config = tiny(f"++{place}._target_='{target}'")
     with pytest.raises(UserError, match="_target_") as error:
         build_all(config, tmp_path)
@@ -83,14 +81,14 @@ GATES: tuple[Registry[Any], ...] = (
 
 
 @pytest.mark.parametrize("target", HOSTILE)
-def test_no_gate_lets_a_hostile_target_through(target: str) -> None:
+def test_no_gate_lets_a_hostile_target_through(target):
     for gate in GATES:
         with pytest.raises(UserError, match="_target_"):
             gate.build({"_target_": target})
 
 
 @pytest.mark.parametrize("place", ["optimizer", "callbacks.checkpoint", "data.masking"])
-def test_nested_targets_are_refused(place: str, tiny: Parser, tmp_path: Path) -> None:
+def test_nested_targets_are_refused(place, tiny, tmp_path):
     argument = {"optimizer": "lr", "data.masking": "probability"}.get(place, "filename")
     override = f"++{place}.{argument}={{_target_: os.system, command: true}}"
     # Where the optimiser's rate is one, the schedule's copy of it is one too.
@@ -99,22 +97,22 @@ def test_nested_targets_are_refused(place: str, tiny: Parser, tmp_path: Path) ->
         build_all(config, tmp_path)
 
 
-def test_an_unknown_argument_is_named() -> None:
+def test_an_unknown_argument_is_named():
     with pytest.raises(UserError, match=r"argument 'speed' of torch\.optim\.Adam"):
         optimizer_factory({"_target_": "torch.optim.Adam", "speed": 1})
 
 
-def test_a_refused_value_shows_at_once() -> None:
+def test_a_refused_value_shows_at_once():
     with pytest.raises(UserError, match="learning rate"):
         optimizer_factory({"_target_": "torch.optim.Adam", "lr": -1.0})
 
 
-def test_a_constant_rate_has_no_schedule() -> None:
+def test_a_constant_rate_has_no_schedule():
     assert scheduler_factory({"_target_": None}) is None
 
 
 @pytest.mark.parametrize("num_steps", [0, 1, 2, 9, 10, 11, 20])
-def test_a_cycle_may_be_as_short_as_it_likes(num_steps: int) -> None:
+def test_a_cycle_may_be_as_short_as_it_likes(num_steps):
     node = {"_target_": "torch.optim.lr_scheduler.OneCycleLR", "max_lr": 0.1, "pct_start": 0.1}
     factory = scheduler_factory(node)
     assert factory is not None
@@ -127,12 +125,12 @@ def test_a_cycle_may_be_as_short_as_it_likes(num_steps: int) -> None:
 
 
 @pytest.mark.parametrize("gate", [OPTIMIZERS, SCHEDULERS, CALLBACKS, LOGGERS])
-def test_what_a_gate_lists_it_resolves(gate: Any) -> None:
+def test_what_a_gate_lists_it_resolves(gate):
     for target in gate.targets:
         assert issubclass(gate.resolve(target), gate.base)
 
 
-def test_every_scheduler_learns_the_number_of_steps() -> None:
+def test_every_scheduler_learns_the_number_of_steps():
     for target in SCHEDULERS.targets:
         node = {"_target_": target} | ({"max_lr": 0.1} if "OneCycle" in target else {})
         factory = scheduler_factory(node)

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +16,11 @@ from dopepp.experiment.build.sources import (
 )
 from dopepp.experiment.build.system import build_system
 from dopepp.experiment.config.data import DataConfig
-from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.evaluate import measure_and_record, parts_of
 from dopepp.experiment.runs.record import METRICS_FILE, read_json
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.row import shown_columns
 from dopepp.models.checkpoint.schema import load_network, write_atomic
-
-Parser = Callable[..., RunConfig]
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
@@ -34,9 +29,7 @@ def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
     return {(r.split, r.source): (r.num_images, r.num_per_epoch) for r in module.summary()}
 
 
-def test_without_a_root_all_is_rendered_and_that_is_said_once(
-    tiny: Parser, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):
     data = tiny("data=hybrid", "data.parts=[servoholder,pivconnector]").data
     with caplog.at_level(logging.WARNING):
         assert counts(data) == {
@@ -50,7 +43,7 @@ def test_without_a_root_all_is_rendered_and_that_is_said_once(
     assert "servoholder, pivconnector" in lines[0]
 
 
-def test_splits_share_no_image(tiny: Parser) -> None:
+def test_splits_share_no_image(tiny):
     data = tiny().data
     module = build_datamodule(data, build_parts(data), seed=0)
     images = [
@@ -61,7 +54,7 @@ def test_splits_share_no_image(tiny: Parser) -> None:
 
 
 @pytest.mark.slow
-def test_one_seed_decides_everything(tiny: Parser) -> None:
+def test_one_seed_decides_everything(tiny):
     data = tiny().data
     parts = build_parts(data)
     a, b, other = (build_datamodule(data, parts, seed) for seed in (1, 1, 2))
@@ -74,7 +67,7 @@ def test_one_seed_decides_everything(tiny: Parser) -> None:
     assert (a.train_item(2, 3).image != other.train_item(2, 3).image).any()
 
 
-def test_every_seed_is_measured_on_the_same_images(tiny: Parser) -> None:
+def test_every_seed_is_measured_on_the_same_images(tiny):
     data = tiny().data
     parts = build_parts(data)
     one, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
@@ -85,9 +78,7 @@ def test_every_seed_is_measured_on_the_same_images(tiny: Parser) -> None:
         assert not np.array_equal(images[0], images[2])
 
 
-def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(
-    parsed: Parser, ycb_root: Path
-) -> None:
+def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(parsed, ycb_root):
     data = parsed(
         "data=hybrid", f"data.root={ycb_root}", "data.samples_per_epoch=100", "data.num_workers=0"
     ).data
@@ -104,7 +95,7 @@ def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(
     }
 
 
-def test_real_frames_only(parsed: Parser, ycb_root: Path) -> None:
+def test_real_frames_only(parsed, ycb_root):
     config = parsed(
         "data=ycb_video", f"data.root={ycb_root}", "data.samples_per_epoch=32",
         "data.objects=[003_cracker_box]",
@@ -114,7 +105,7 @@ def test_real_frames_only(parsed: Parser, ycb_root: Path) -> None:
     assert not any("virtual" in source for _, source in table)
 
 
-def test_an_object_in_no_training_source_is_named(parsed: Parser, ycb_root: Path) -> None:
+def test_an_object_in_no_training_source_is_named(parsed, ycb_root):
     overrides = ("data=ycb_video", f"data.root={ycb_root}", "data.samples_per_epoch=32")
     data = parsed(*overrides, "data.objects=[003_cracker_box,019_pitcher_base]").data
     module = build_datamodule(data, build_parts(data), seed=0)
@@ -122,9 +113,7 @@ def test_an_object_in_no_training_source_is_named(parsed: Parser, ycb_root: Path
         module.check_objects()
 
 
-def test_an_object_without_ground_truth_in_the_test_set_is_not_available(
-    tiny: Parser, ycb_root: Path, tmp_path: Path
-) -> None:
+def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, ycb_root, tmp_path):
     objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
     config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
     data = replace(config.data, frames=("0050/000003",))
@@ -147,7 +136,7 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(
     assert report.mean.add_01d == report.rows["003_cracker_box"].add_01d
 
 
-def test_a_users_mesh_with_its_unit(tiny: Parser, tmp_path: Path) -> None:
+def test_a_users_mesh_with_its_unit(tiny, tmp_path):
     path = tmp_path / "bracket.stl"
     trimesh.creation.box((8.0, 5.0, 3.0)).export(path)
     data = tiny(f"data.parts=['{path}']", "data.unit=cm").data
@@ -179,19 +168,19 @@ def test_a_users_mesh_with_its_unit(tiny: Parser, tmp_path: Path) -> None:
         ("data.masking.probability=2", "probability"),
     ],
 )
-def test_a_mistake_in_the_data_is_one_line(override: str, got: str, tiny: Parser) -> None:
+def test_a_mistake_in_the_data_is_one_line(override, got, tiny):
     with pytest.raises(UserError) as error:
         counts(tiny(override).data)
     assert got in error.value.got
     assert "\n" not in str(error.value)
 
 
-def test_a_unit_matters_to_files_only(tiny: Parser) -> None:
+def test_a_unit_matters_to_files_only(tiny):
     (part,) = build_parts(tiny("data.unit=parsec").data)
     assert part.name == "pivconnector"
 
 
-def test_preset_changes_reach_the_renders(tiny: Parser) -> None:
+def test_preset_changes_reach_the_renders(tiny):
     plain, changed = tiny(), tiny("++virtual.scene.horizontal_fov_deg=20")
     fx = [
         build_test_source(config.data, build_parts(config.data)).sample(0, 0).K[0, 0]

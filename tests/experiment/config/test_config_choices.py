@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,6 @@ from dopepp.experiment.config.run import RunConfig
 from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
-Composer = Callable[..., dict[str, Any]]
-Parser = Callable[..., RunConfig]
 CONF = Path(__file__).parents[3] / "conf"
 GATES: dict[str, Registry[Any]] = {
     "model/backbone": BACKBONES,
@@ -61,13 +59,13 @@ def targets(node: object) -> Iterator[str]:
             yield from targets(value)
 
 
-def test_there_are_choices_to_check() -> None:
+def test_there_are_choices_to_check():
     assert len(CHOICES) > 25
     assert set(GATES) <= {group for group, _ in CHOICES}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(CONF)))
-def test_a_file_names_only_allowed_targets(path: Path) -> None:
+def test_a_file_names_only_allowed_targets(path):
     group = str(path.parent.relative_to(CONF))
     found = list(targets(yaml.safe_load(path.read_text()) or {}))
     if path.name == "train.yaml" and group == ".":
@@ -83,7 +81,7 @@ def test_a_file_names_only_allowed_targets(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("group", "name"), CHOICES, ids=lambda text: str(text))
-def test_every_choice_composes(group: str, name: str, composed: Composer) -> None:
+def test_every_choice_composes(group, name, composed):
     config = composed(f"{group}={name}")
     RunConfig.of(config)
     node: Any = config
@@ -97,7 +95,7 @@ def test_every_choice_composes(group: str, name: str, composed: Composer) -> Non
 
 
 @pytest.mark.parametrize("group", ["data", None])
-def test_evaluation_composes(group: str | None, composed: Composer) -> None:
+def test_evaluation_composes(group, composed):
     overrides = ["ckpt_path=x.ckpt", *([f"{group}=virtual"] if group else [])]
     config = composed(*overrides, config="evaluate")
     assert (config.get("data") is not None) == (group is not None)
@@ -111,7 +109,7 @@ MODEL_CHOICES = [
 
 
 @pytest.mark.parametrize("choice", MODEL_CHOICES)
-def test_every_model_choice_trains_one_step(choice: str, tiny: Parser) -> None:
+def test_every_model_choice_trains_one_step(choice, tiny):
     config = tiny(choice, "data.parts=[pivconnector,servoholder]")
     system = build_system(config, build_parts(config.data), "")
     stages = system(torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8))
@@ -126,9 +124,7 @@ def test_every_model_choice_trains_one_step(choice: str, tiny: Parser) -> None:
 
 @pytest.mark.parametrize("name", ["adam", "adamw", "sgd"])
 @pytest.mark.parametrize("schedule", ["constant", "cosine", "onecycle"])
-def test_every_optimizer_takes_every_schedule_to_its_end(
-    name: str, schedule: str, tiny: Parser
-) -> None:
+def test_every_optimizer_takes_every_schedule_to_its_end(name, schedule, tiny):
     config = tiny(f"optimizer={name}", f"scheduler={schedule}", "optimizer.lr=0.01")
     system = build_system(config, build_parts(config.data), "")
     optimizer = system.make_optimizer(system.network.parameters())
@@ -148,7 +144,7 @@ def test_every_optimizer_takes_every_schedule_to_its_end(
 
 
 @pytest.mark.parametrize("name", ["auto", "cpu", "ddp"])
-def test_trainers_are_built(name: str, tiny: Parser, tmp_path: Path) -> None:
+def test_trainers_are_built(name, tiny, tmp_path):
     config = tiny(f"trainer={name}", "trainer.accelerator=cpu", "trainer.precision=32-true")
     trainer = build_trainer(config, tmp_path)
     assert trainer.world_size == (2 if name == "ddp" else 1)

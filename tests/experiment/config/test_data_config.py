@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.build.splits import share_of
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run import EvaluationConfig, RunConfig
+from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.models.checkpoint.schema import read
 
-Composer = Callable[..., dict[str, Any]]
-Parser = Callable[..., RunConfig]
 PRETRAINED = sorted((Path(__file__).parents[3] / "dopepp" / "pretrained").glob("*.safetensors"))
 
 
 @pytest.fixture
-def trained(tiny: Parser) -> RunConfig:
+def trained(tiny):
     return tiny("data.num_test=300")
 
 
 @pytest.fixture
-def stored(trained: RunConfig) -> dict[str, Any]:
+def stored(trained):
     """What a checkpoint says of the data it was trained on."""
     return trained.stored_data()
 
 
 @pytest.fixture
-def evaluated(composed: Composer) -> Callable[..., DataConfig]:
+def evaluated(composed):
     """The data that ``evaluate.py`` with overrides chooses, given what a checkpoint says."""
 
     def choose(stored: object, *overrides: str) -> DataConfig:
@@ -42,18 +38,11 @@ def evaluated(composed: Composer) -> Callable[..., DataConfig]:
     return choose
 
 
-Evaluated = Callable[..., DataConfig]
-
-
-def test_the_checkpoints_own_data_by_default(
-    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
-) -> None:
+def test_the_checkpoints_own_data_by_default(evaluated, stored, trained):
     assert evaluated(stored) == trained.data
 
 
-def test_single_options_replace_the_stored_ones(
-    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
-) -> None:
+def test_single_options_replace_the_stored_ones(evaluated, stored, trained):
     data = evaluated(
         stored, "++data.num_test=7", "data/test=photoreal", "++data.image_sets.test=other",
         "++virtual.preset=table", "++virtual.scene.turning.tilt_deg=10",
@@ -65,9 +54,7 @@ def test_single_options_replace_the_stored_ones(
     assert stored["num_test"] == 300
 
 
-def test_a_whole_data_set_keeps_only_how_to_render(
-    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
-) -> None:
+def test_a_whole_data_set_keeps_only_how_to_render(evaluated, stored, trained):
     data = evaluated(stored, "data=virtual", "data.num_test=5")
     assert (data.name, data.num_test, data.samples_per_epoch) == ("virtual", 5, 10000)
     assert data.virtual == trained.data.virtual
@@ -87,9 +74,7 @@ def test_a_whole_data_set_keeps_only_how_to_render(
         ("++data.virtual.preset=bin", r"data\.virtual=.*fix: set virtual\.…"),
     ],
 )
-def test_what_does_not_exist_is_named(
-    override: str, message: str, evaluated: Evaluated, stored: dict[str, Any]
-) -> None:
+def test_what_does_not_exist_is_named(override, message, evaluated, stored):
     with pytest.raises(UserError, match=message):
         evaluated(stored, override)
 
@@ -101,15 +86,13 @@ def test_what_does_not_exist_is_named(
         ("data=virtual", r"best\.ckpt, which does not say how to render"),
     ],
 )
-def test_a_checkpoint_without_data_asks_for_them(
-    override: str, message: str, evaluated: Evaluated
-) -> None:
+def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):
     with pytest.raises(UserError, match=message):
         evaluated(None, override)
 
 
 @pytest.mark.parametrize("path", PRETRAINED, ids=lambda path: path.stem)
-def test_the_data_of_released_checkpoints_are_read(path: Path, evaluated: Evaluated) -> None:
+def test_the_data_of_released_checkpoints_are_read(path, evaluated):
     stored = trained_on(read(path).data)
     data = evaluated(stored)
     assert stored is not None
@@ -117,9 +100,7 @@ def test_the_data_of_released_checkpoints_are_read(path: Path, evaluated: Evalua
     assert (data.num_test, data.is_rendered("test")) == (300, True)
 
 
-def test_checkpoints_of_earlier_versions_lack_newer_options(
-    evaluated: Evaluated, stored: dict[str, Any], trained: RunConfig
-) -> None:
+def test_checkpoints_of_earlier_versions_lack_newer_options(evaluated, stored, trained):
     newer = ("symmetries", "test", "cache", "cache_dir", "masking", "augment", "eval_seed")
     older = {key: value for key, value in stored.items() if key not in newer}
     older["virtual"] = {"preset": "quickstart", "scene": {}, "renderer": "raster"}
@@ -131,7 +112,7 @@ def test_checkpoints_of_earlier_versions_lack_newer_options(
     assert trained_on({"seed": 7}) is None
 
 
-def test_a_folder_that_splits_share_is_divided() -> None:
+def test_a_folder_that_splits_share_is_divided():
     shared = {"train": "a", "val": "a", "test": "a"}
     ranges = [share_of(shared, split) for split in ("train", "val", "test")]
     assert ranges == [(0.0, 0.8), (0.8, pytest.approx(0.9)), (pytest.approx(0.9), 1.0)]

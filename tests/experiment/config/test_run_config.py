@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,6 @@ from dopepp.experiment.launch.remote import goes_on
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.resume import config_differences
 from dopepp.experiment.runs.sweep import CompareJobs
-
-Composer = Callable[..., dict[str, Any]]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,7 @@ Composer = Callable[..., dict[str, Any]]
         ("trainer.profiler=slow", "trainer.profiler='slow'"),
     ],
 )
-def test_a_mistake_is_told_by_its_options_name(override: str, got: str, composed: Composer) -> None:
+def test_a_mistake_is_told_by_its_options_name(override, got, composed):
     with pytest.raises(UserError) as error:
         RunConfig.of(composed(override))
     assert error.value.got == got
@@ -83,13 +80,13 @@ def test_a_mistake_is_told_by_its_options_name(override: str, got: str, composed
     [("bop_csv=1", "bop_csv=1"), ("num_pictures=-1", "num_pictures=-1"), ("+x=1", "x=1"),
      ("tune=1", "tune=1"), ("ckpt_path=[a]", "ckpt_path=['a']")],
 )  # fmt: skip
-def test_a_mistake_in_an_evaluation(override: str, got: str, composed: Composer) -> None:
+def test_a_mistake_in_an_evaluation(override, got, composed):
     with pytest.raises(UserError) as error:
         EvaluationConfig.of(composed(override, config="evaluate"))
     assert error.value.got == got
 
 
-def test_values_are_typed_and_the_plain_config_stays(composed: Composer) -> None:
+def test_values_are_typed_and_the_plain_config_stays(composed):
     plain = composed("data.root=photos", "+trainer.limit_val_batches=2", "ema=0.5", "shading=0.4")
     config = RunConfig.of(plain)
     assert config.plain == plain
@@ -103,7 +100,7 @@ def test_values_are_typed_and_the_plain_config_stays(composed: Composer) -> None
     assert (config.ema, config.logger, config.search) == (0.5, None, None)
 
 
-def test_a_class_goes_by_its_former_name(composed: Composer) -> None:
+def test_a_class_goes_by_its_former_name(composed):
     for former, present in FORMER_TARGETS.items():
         with pytest.raises(ModuleNotFoundError):
             importlib.import_module(former.rpartition(".")[0])
@@ -120,7 +117,7 @@ def test_a_class_goes_by_its_former_name(composed: Composer) -> None:
     assert RunConfig.of(composed(*overrides)) == RunConfig.of(composed())
 
 
-def test_an_older_runs_config_is_no_other_one(composed: Composer, tmp_path: Path) -> None:
+def test_an_older_runs_config_is_no_other_one(composed, tmp_path):
     plain = composed()
     former = {present: name for name, present in FORMER_TARGETS.items()}
     older = with_present_names(plain)

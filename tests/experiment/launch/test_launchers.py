@@ -6,9 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -26,7 +24,7 @@ Called = tuple[int, str, str]
 
 
 @pytest.fixture
-def sweep(fast_training: Path, tmp_path: Path) -> Callable[..., Called]:
+def sweep(fast_training, tmp_path):
     """Run a multirun of jobs that take no time as a process; END_<job>=how ends one early."""
 
     def run(*arguments: str, **ends: str) -> Called:
@@ -71,9 +69,7 @@ def check_two_done_and_one_failed(folder: Path, out: str, err: str) -> None:
                       "hydra.launcher.gpus_per_node=0"]),
     ],
 )  # fmt: skip
-def test_processes_of_this_machine(
-    package: str, options: list[str], sweep: Callable[..., Called], tmp_path: Path
-) -> None:
+def test_processes_of_this_machine(package, options, sweep, tmp_path):
     pytest.importorskip(package)
     code, out, err = sweep(*options, SWEPT, END_1="raise")
     assert code == 0, err
@@ -83,7 +79,7 @@ def test_processes_of_this_machine(
 
 
 @pytest.mark.slow
-def test_joblib_with_a_process_that_is_lost(sweep: Callable[..., Called], tmp_path: Path) -> None:
+def test_joblib_with_a_process_that_is_lost(sweep, tmp_path):
     pytest.importorskip("joblib")
     code, out, err = sweep("hydra/launcher=joblib", "seed=0,1,2,3,4", END_1="kill")
     assert code == 0, err
@@ -121,7 +117,7 @@ for task in 0 1 2; do echo "77_$task|RUNNING|here"; done
 
 
 @pytest.mark.slow
-def test_slurm_gets_an_array_with_the_options(sweep: Callable[..., Called], tmp_path: Path) -> None:
+def test_slurm_gets_an_array_with_the_options(sweep, tmp_path):
     """With stand-ins for SLURM's commands, that run the script they are given."""
     pytest.importorskip("submitit")
     for name, script in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", SACCT)):
@@ -147,9 +143,7 @@ def test_slurm_gets_an_array_with_the_options(sweep: Callable[..., Called], tmp_
 
 
 @pytest.mark.slow
-def test_ray_on_a_cluster_of_two_nodes(
-    sweep: Callable[..., Called], two_nodes: Any, tmp_path: Path
-) -> None:
+def test_ray_on_a_cluster_of_two_nodes(sweep, two_nodes, tmp_path):
     ray = ("hydra/launcher=ray", f"hydra.launcher.address={two_nodes.address}")
     code, out, err = sweep(*ray, "optimizer.lr=1e-4,-1,1e-2")
     assert code == 0, err
@@ -163,20 +157,18 @@ def test_ray_on_a_cluster_of_two_nodes(
 
 
 @pytest.mark.parametrize(("package", "extra"), [("joblib", "joblib"), ("submitit", "slurm")])
-def test_without_its_package_it_says_what_to_install(
-    package: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_its_package_it_says_what_to_install(package, extra, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{extra}\]"):
         on_joblib(2) if package == "joblib" else on_slurm("x", "slurm", 0, {})
 
 
-def test_joblib_wants_a_number_of_processes() -> None:
+def test_joblib_wants_a_number_of_processes():
     with pytest.raises(UserError, match=r"hydra\.launcher\.n_jobs=0"):
         on_joblib(0)
 
 
-def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path: Path) -> None:
+def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
     config = {"seed": 1, "model": {"width": 0.5}, "resume": None}
     assert not remote.goes_on(config, tmp_path)
     record.write_config(tmp_path, {**config, "resume": "outputs/x"})
@@ -188,7 +180,7 @@ def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path: Path) ->
     assert not remote.goes_on({**config, "resume": "outputs/y"}, tmp_path)
 
 
-def test_what_children_print_is_in_the_file_too(tmp_path: Path, capfd: Any) -> None:
+def test_what_children_print_is_in_the_file_too(tmp_path, capfd):
     with remote.own_output(tmp_path / "job" / "job.log"):
         os.write(1, b"by this process\n")
         subprocess.run(["bash", "-c", "echo by a child; echo as an error >&2"], check=True)

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 
@@ -9,14 +6,12 @@ from dopepp.experiment.launch import slurm
 
 
 @pytest.fixture(autouse=True)
-def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def job(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SLURM_JOB_ID", "12")
 
 
-def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(tmp_path, monkeypatch):
     slurm.remember_run(["seed=1"], tmp_path / "a")
     slurm.remember_run(["seed=2"], tmp_path / "b")
     assert slurm.begun_run(["seed=1"]) is None  # the first time: no restart
@@ -38,17 +33,13 @@ def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(
         ({"SLURM_JOB_ID": "--help"}, None),
     ],
 )
-def test_a_job_is_named(
-    variables: dict[str, str], named: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_is_named(variables, named, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert slurm.job_id() == named
 
 
-def test_a_refused_or_missing_scontrol_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refused_or_missing_scontrol_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert slurm.requeue().startswith("SLURM did not requeue job 12: ")
     script = tmp_path / "scontrol"

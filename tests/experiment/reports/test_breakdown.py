@@ -77,7 +77,7 @@ def fed(
 
 
 @pytest.fixture
-def measured() -> tuple[PoseMetrics, dict[str, list[Array]], dict[str, Array]]:
+def measured():
     rng = np.random.default_rng(3)
     truths = {"a": poses(30, 1), "b": poses(20, 2)}
     offsets = {
@@ -87,7 +87,7 @@ def measured() -> tuple[PoseMetrics, dict[str, list[Array]], dict[str, Array]]:
     return fed([part("a"), part("b", 3.0)], offsets, truths), truths, offsets
 
 
-def test_quantities_in_closed_form(measured: Any) -> None:
+def test_quantities_in_closed_form(measured):
     metrics, truths, _ = measured
     instances = metrics.instances("a")
     counted = truths["a"][2:]  # two of 30 are less than 10 % visible
@@ -106,7 +106,7 @@ def test_quantities_in_closed_form(measured: Any) -> None:
 @given(
     values=st.lists(st.integers(0, 12) | st.floats(0, 12), max_size=60), num_bins=st.integers(1, 8)
 )
-def test_bins_ascend_and_equal_values_share_one(values: list[float], num_bins: int) -> None:
+def test_bins_ascend_and_equal_values_share_one(values, num_bins):
     array = np.array(values, np.float64)
     bins = bin_numbers(array, num_bins)
     order = np.argsort(array, kind="stable")
@@ -120,14 +120,14 @@ def test_bins_ascend_and_equal_values_share_one(values: list[float], num_bins: i
         assert np.ptp(counts) <= 1
 
 
-def test_many_equal_values_draw_no_others_into_their_bin() -> None:
+def test_many_equal_values_draw_no_others_into_their_bin():
     values = np.array([0.3] + [1.0] * 30 + [0.5, 0.9])
     bins = bin_numbers(values, 5)
     assert len(set(bins[values == 1])) == 1
     assert not set(bins[values < 1]) & set(bins[values == 1])
 
 
-def test_rates_of_bins_are_those_of_their_instances(measured: Any, tmp_path: Path) -> None:
+def test_rates_of_bins_are_those_of_their_instances(measured, tmp_path):
     metrics, truths, offsets = measured
     record_breakdown(tmp_path, {"dopepp": metrics}, "distance", 4, RATES)
     rows = read_csv(tmp_path / "by_distance.csv")
@@ -163,9 +163,7 @@ def test_rates_of_bins_are_those_of_their_instances(measured: Any, tmp_path: Pat
     assert picture.std() > 0
 
 
-def test_methods_share_the_bins_and_keep_their_own_objects(
-    measured: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_methods_share_the_bins_and_keep_their_own_objects(measured, tmp_path, capsys):
     metrics, truths, _ = measured
     perfect = fed([part("a")], {"a": np.zeros(30)}, {"a": truths["a"]})
     both = {"dope": perfect, "dopepp": metrics}
@@ -173,7 +171,7 @@ def test_methods_share_the_bins_and_keep_their_own_objects(
     assert (bins, select(table, method="dopepp")) == break_down(
         {"dopepp": metrics}, "size", 3, RATES
     )
-    assert sum(one.value for one in select(table, method="dope", measure="num_instances")) == 28  # type: ignore[misc]
+    assert sum(one.value for one in select(table, method="dope", measure="num_instances")) == 28
     assert {one.value for one in select(table, method="dope", measure="add_01d")} <= {None, 1}
     record_breakdown(tmp_path, both, "size", 3, RATES)
     shown = capsys.readouterr().out
@@ -182,15 +180,13 @@ def test_methods_share_the_bins_and_keep_their_own_objects(
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric PoseMetrics was called")
-def test_without_instances_there_is_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_instances_there_is_a_warning(tmp_path, caplog):
     record_breakdown(tmp_path, {"dopepp": PoseMetrics([part("a")])}, "rotation", 5, RATES)
     assert "by=rotation: the test set has no instance that counts" in caplog.text
     assert not list(tmp_path.iterdir())
 
 
-def test_the_papers_rate_goes_with_the_data() -> None:
+def test_the_papers_rate_goes_with_the_data():
     data: Any = SimpleNamespace(format="ycb_video", root=Path("data"))
     parts = [part("a")]
     assert [one.field for one in reported_rates(data, parts)] == ["pass_10cm", "add_01d"]
@@ -198,7 +194,7 @@ def test_the_papers_rate_goes_with_the_data() -> None:
     assert [one.field for one in reported_rates(data, parts)] == ["pass_5cm", "add_01d"]
 
 
-def test_of_a_symmetric_part_its_symmetries_count(tmp_path: Path) -> None:
+def test_of_a_symmetric_part_its_symmetries_count(tmp_path):
     half_turn = np.diag([-1.0, -1, 1, 1])
     symmetric = replace(part("a"), symmetries_discrete=half_turn[None])
     data: Any = SimpleNamespace(format="bop", root=None)

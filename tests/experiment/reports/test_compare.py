@@ -82,7 +82,7 @@ def write_run(
 # The table
 
 
-def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path: Path) -> None:
+def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path):
     results = [entry("dopepp", report("dopepp", GOOD)), entry("dope", report("dope", BAD))]
     text = write_comparison(ordered(results), tmp_path)
     rows = read_csv(tmp_path / "compare.csv")
@@ -107,7 +107,7 @@ def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path: Path) ->
         assert stream.readline().strip() == "threshold_m,dope,dopepp"
 
 
-def test_differences_are_those_of_the_rows() -> None:
+def test_differences_are_those_of_the_rows():
     rng = np.random.default_rng(0)
     one, other = (report(name, rng.gamma(1, 0.02, 60)) for name in "ab")
     found = differences(entry("a", one), entry("b", other), "part0")
@@ -117,7 +117,7 @@ def test_differences_are_those_of_the_rows() -> None:
         assert difference.value == pytest.approx(expected, abs=1e-12)
 
 
-def test_seeds_become_mean_and_deviation() -> None:
+def test_seeds_become_mean_and_deviation():
     mine = entry("dopepp", report("dopepp", GOOD), report("dopepp", BAD), seeds=[2, 1])
     row = full(figures([mine]))[0]
     assert (row["seeds"], row["ADD-0.1d %"]) == ("1, 2", "62.5")
@@ -125,7 +125,7 @@ def test_seeds_become_mean_and_deviation() -> None:
     assert headline(figures([mine]))[0]["ADD-0.1d %"] == "62.5 ± 44.2"
 
 
-def test_seeds_are_paired_by_number_not_by_order() -> None:
+def test_seeds_are_paired_by_number_not_by_order():
     """Row by row one seed is better than the baseline's and the other as much worse."""
     shift = np.linspace(0, 0.001, 32)
     a, b = 0.02 + shift, 0.03 + shift
@@ -140,7 +140,7 @@ def test_seeds_are_paired_by_number_not_by_order() -> None:
     assert loose.within_noise
 
 
-def test_other_seeds_than_the_baselines_are_named(tmp_path: Path) -> None:
+def test_other_seeds_than_the_baselines_are_named(tmp_path):
     base = entry("dope", report("dope", BAD), report("dope", BAD), seeds=[1, 2])
     mine = entry("dopepp", report("dopepp", GOOD), seeds=[1])
     text = write_comparison([base, mine], tmp_path)
@@ -152,7 +152,7 @@ def test_other_seeds_than_the_baselines_are_named(tmp_path: Path) -> None:
     assert "Not of the same seeds" not in text
 
 
-def test_an_interval_of_shares_ends_at_one() -> None:
+def test_an_interval_of_shares_ends_at_one():
     low, high = report("x", [0.2] * 40), report("x", [0.001] * 40)
     base = entry("dope", low, low)
     difference = differences(entry("y", low, high), base, "part0")["add_01d"]
@@ -161,7 +161,7 @@ def test_an_interval_of_shares_ends_at_one() -> None:
 
 
 @pytest.mark.parametrize("known", ["images", ""])
-def test_other_images_are_not_set_off(known: str, tmp_path: Path) -> None:
+def test_other_images_are_not_set_off(known, tmp_path):
     base = entry("dope", report("dope", BAD, test_set=known))
     text = write_comparison([base, entry("x", report("x", GOOD, test_set="others"))], tmp_path)
     assert read_csv(tmp_path / "compare.csv")[1]["Δ ADD-0.1d %"] == ""
@@ -169,7 +169,7 @@ def test_other_images_are_not_set_off(known: str, tmp_path: Path) -> None:
     assert what in text
 
 
-def test_a_mean_over_other_objects_is_not_set_off() -> None:
+def test_a_mean_over_other_objects_is_not_set_off():
     base = entry("dope", report("dope", BAD, num_objects=2))
     mine = report("x", GOOD, num_objects=3)
     table = figures([base, entry("x", mine)])
@@ -179,13 +179,13 @@ def test_a_mean_over_other_objects_is_not_set_off() -> None:
     assert {one.object for one in table if one.method == "dope"} == {"part0", "part1", MEAN}
 
 
-def test_an_object_without_instances_has_no_difference() -> None:
+def test_an_object_without_instances_has_no_difference():
     empty = report("dope", BAD)
     empty.errors["part0"] = np.zeros(0)
     assert differences(entry("x", empty), entry("dope", empty), "part0") == {}
 
 
-def test_all_missed_is_no_angle() -> None:
+def test_all_missed_is_no_angle():
     base, mine = report("dope", BAD), report("x", [np.inf] * 32)
     row = full(figures([entry("dope", base), entry("x", mine)]))[1]
     assert (row["rotation °"], row["Δ rotation °"]) == ("n/a", "n/a")
@@ -194,15 +194,13 @@ def test_all_missed_is_no_angle() -> None:
     assert full(figures([seeds]))[0]["rotation °"] == "n/a"  # one seed's alone would flatter
 
 
-def test_a_baseline_that_is_asked_for_stands_before_dope(tmp_path: Path) -> None:
+def test_a_baseline_that_is_asked_for_stands_before_dope(tmp_path):
     compare_reports([report("dopepp", GOOD), report("dope", BAD)], tmp_path, "dopepp")
     assert [row["method"] for row in read_csv(tmp_path / "compare.csv")][:2] == ["dopepp", "dope"]
 
 
 @pytest.mark.parametrize("others", [[], [entry("dope", report("dope", BAD))]])
-def test_a_failed_job_is_a_row(
-    others: list[Entry], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failed_job_is_a_row(others, tmp_path, capsys):
     reason = "got data.input_size=[30, 30] | x; allowed: [width, height] [/nothing]; fix: [bold]"
     text = write_comparison([*others, Entry("dopepp", failure=reason)], tmp_path)
     rows = read_csv(tmp_path / "compare.csv")
@@ -219,7 +217,7 @@ def test_a_failed_job_is_a_row(
 # Run folders
 
 
-def test_runs_that_differ_in_the_seed_are_one_method(tmp_path: Path) -> None:
+def test_runs_that_differ_in_the_seed_are_one_method(tmp_path):
     number = 0
     for model in ("dope", "dopepp"):
         for seed in (1, 2):
@@ -235,7 +233,7 @@ def test_runs_that_differ_in_the_seed_are_one_method(tmp_path: Path) -> None:
     assert entries[2].failure == "out of memory"
 
 
-def test_whatever_else_differs_keeps_runs_apart(tmp_path: Path) -> None:
+def test_whatever_else_differs_keeps_runs_apart(tmp_path):
     write_run(tmp_path / "0", ["seed=1"], report("dopepp", GOOD), 1)
     write_run(tmp_path / "1", ["seed=2", "lr=3"], report("dopepp", GOOD), 2, lr=3)
     write_run(tmp_path / "2", ["seed=3"], report("dopepp", GOOD, test_set="others"), 3)
@@ -248,7 +246,7 @@ def test_whatever_else_differs_keeps_runs_apart(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
+def test_jobs_are_named_by_what_differs(tmp_path):
     common = ["data=virtual", "seed=1", "output_dir=x", "hydra.verbose=true"]
     write_run(tmp_path / "0", [*common, "model=dope", "+optimizer=adam"])
     write_run(tmp_path / "1", [*common, "model=dopepp", "optimizer=sgd"])
@@ -257,14 +255,14 @@ def test_jobs_are_named_by_what_differs(tmp_path: Path) -> None:
     assert names == ["dope optimizer=adam", "dopepp optimizer=sgd", f"dopepp {tmp_path.name}/10"]
 
 
-def test_no_two_methods_have_one_name(tmp_path: Path) -> None:
+def test_no_two_methods_have_one_name(tmp_path):
     folders = [write_run(tmp_path / place / "run", ["model=dope"], "gone") for place in "ab"]
     names = [one.name for one in group(find_runs(folders))]
     assert names == [f"dope run {folder}" for folder in folders]
     assert len(headline(figures(group(find_runs(folders))))) == 2
 
 
-def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path: Path) -> None:
+def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path):
     for seed in (1, 2):
         run = write_run(
             tmp_path / f"run{seed}", ["lr=2", f"seed={seed}"], report("dopepp", BAD), seed, lr=2
@@ -284,7 +282,7 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path: Path) -> 
     assert len(group(find_runs([*evaluations, tmp_path / "run1"]))) == 2
 
 
-def test_a_folder_given_twice_counts_once(tmp_path: Path) -> None:
+def test_a_folder_given_twice_counts_once(tmp_path):
     write_run(tmp_path / "0", [], report("dopepp", GOOD))
     assert len(find_runs([tmp_path, tmp_path / "0", tmp_path / "." / "0"])) == 1
 
@@ -293,9 +291,7 @@ def test_a_folder_given_twice_counts_once(tmp_path: Path) -> None:
     ("content", "reason"),
     [("{", "unreadable"), ("{}", "not of this version"), ('{"name": 1, "objects": []}', "version")],
 )
-def test_a_damaged_result_is_a_row_with_the_reason(
-    content: str, reason: str, tmp_path: Path
-) -> None:
+def test_a_damaged_result_is_a_row_with_the_reason(content, reason, tmp_path):
     run = write_run(tmp_path / "0")
     (run / record.METRICS_FILE).write_text(content)
     (run / record.CONFIG_FILE).write_text("a: [")
@@ -304,7 +300,7 @@ def test_a_damaged_result_is_a_row_with_the_reason(
     assert "\n" not in one.failure
 
 
-def test_a_job_that_measures_costs_has_nothing_else(tmp_path: Path) -> None:
+def test_a_job_that_measures_costs_has_nothing_else(tmp_path):
     stored = {"parameters": 1234, "gmacs": 2.5, "ms_per_frame": 12.0, "name": "dopepp"}
     record.write_json(write_run(tmp_path / "0") / COST_FILE, stored)
     (one,) = group(find_runs([tmp_path]))
@@ -318,7 +314,7 @@ def test_a_job_that_measures_costs_has_nothing_else(tmp_path: Path) -> None:
     assert "cost.json is not of this version" in read_run(tmp_path / "0").failure
 
 
-def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
+def test_an_unfinished_run_says_how_to_go_on(tmp_path):
     run = write_run(tmp_path / "0")
     assert read_run(run).failure == "unfinished: it left no metrics.json"
     (run / "checkpoints").mkdir()
@@ -326,13 +322,13 @@ def test_an_unfinished_run_says_how_to_go_on(tmp_path: Path) -> None:
     assert read_run(run).failure.endswith(f"go on with resume={run}")
 
 
-def test_a_folder_without_runs_is_a_users_mistake(tmp_path: Path) -> None:
+def test_a_folder_without_runs_is_a_users_mistake(tmp_path):
     for path in (tmp_path, tmp_path / "missing"):
         with pytest.raises(UserError, match="holds no run"):
             find_runs([path])
 
 
-def test_a_log_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_log_is_read_as_far_as_it_goes(tmp_path):
     path = tmp_path / "metrics.csv"
     assert logged(path, "train/loss") == {}
     path.write_text("step,train/loss\n0,1.5\n1,\n2,nan\nx,1\n3,0.5\n4")
@@ -343,9 +339,7 @@ def test_a_log_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
 # The whole
 
 
-def test_curves_of_unfinished_runs_are_drawn_and_checkpoints_that_are_none_told(
-    tmp_path: Path,
-) -> None:
+def test_curves_of_unfinished_runs_are_drawn_and_checkpoints_that_are_none_told(tmp_path):
     write_run(tmp_path / "0", ["model=dope"], report("dope", BAD))
     unfinished = write_run(tmp_path / "1", ["model=dopepp"])
     for folder in (tmp_path / "0", unfinished):
@@ -365,7 +359,7 @@ def test_curves_of_unfinished_runs_are_drawn_and_checkpoints_that_are_none_told(
     assert cv2.imread(str(out / "compare.png")).shape[2] == 3
 
 
-def test_a_comparison_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_comparison_is_never_overwritten(tmp_path, monkeypatch):
     run = write_run(tmp_path / "run", [], report("dopepp", GOOD))
     monkeypatch.chdir(tmp_path)
     first, second = compare_paths([run]), compare_paths([run])
@@ -381,7 +375,7 @@ def end_sweep(folder: Path) -> None:
     CompareJobs().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}}))
 
 
-def test_the_sweep_ends_with_a_table_and_fails_after_it(tmp_path: Path) -> None:
+def test_the_sweep_ends_with_a_table_and_fails_after_it(tmp_path):
     end_sweep(tmp_path)  # of no jobs: nothing to say
     write_run(tmp_path / "0", ["model=dopepp"], report("dopepp", GOOD))
     write_run(tmp_path / "1", ["model=dope"], report("dope", BAD))

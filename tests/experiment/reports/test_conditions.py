@@ -12,13 +12,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.build.sources import (
-    build_parts,
-    build_scaled_test_source,
-    build_test_source,
-)
+from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
 from dopepp.experiment.build.system import build_system
-from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.evaluate import measure_and_record
 from dopepp.experiment.reports.conditions import (
     SCALE,
@@ -38,7 +33,6 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.models.checkpoint.schema import load_network, write_atomic
 from dopepp.parts.part import Part
 
-Parser = Callable[..., RunConfig]
 RATES = (ADD_5CM, ADD_01D)
 NUM_IMAGES = 6
 SHARES = (0.2, 0.6, 0.8)
@@ -115,9 +109,7 @@ def check_pictures(folder: Path, condition: Condition, columns: int) -> None:
     assert cv2.imread(str(folder / f"{condition.name}.png")).std() > 0
 
 
-def test_every_method_is_measured_at_every_share(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_method_is_measured_at_every_share(tmp_path, capsys):
     run_shading(Discs(), tmp_path)
     rows = read_csv(tmp_path / "shading.csv")
     # At 80 % less than a tenth of the object is left, and it counts all the same.
@@ -142,9 +134,7 @@ def test_every_method_is_measured_at_every_share(
     check_pictures(tmp_path, SHADING, 4)
 
 
-def test_shares_that_are_not_reached_are_counted_and_said(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_shares_that_are_not_reached_are_counted_and_said(tmp_path, caplog):
     run_shading(Discs(contrast=False), tmp_path, 0)
     said = f"At 60 %, {NUM_IMAGES} of {NUM_IMAGES} instances are not within 2 points"
     assert said in caplog.text
@@ -152,7 +142,7 @@ def test_shares_that_are_not_reached_are_counted_and_said(
     assert not (tmp_path / "shading_examples.png").exists()
 
 
-def test_what_cannot_be_measured_is_refused_before_anything_is(tiny: Parser) -> None:
+def test_what_cannot_be_measured_is_refused_before_anything_is(tiny):
     check_masks(Discs())
     with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
         check_masks(Discs(masks=False))
@@ -167,9 +157,7 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(tiny: Parser) -> 
     assert "\n" not in str(error.value)
 
 
-def test_every_method_is_measured_at_every_scale(
-    tiny: Parser, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     data = tiny().data
     (part,) = build_parts(data)
     source = build_test_source(data, [part])
@@ -213,7 +201,7 @@ def test_every_method_is_measured_at_every_scale(
     check_pictures(tmp_path, SCALE, 3)
 
 
-def test_untrained_networks_end_to_end(tiny: Parser, tmp_path: Path) -> None:
+def test_untrained_networks_end_to_end(tiny, tmp_path):
     config = tiny("data.num_test=2")
     data, parts = config.data, build_parts(config.data)
     system = build_system(config, parts, "")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,13 +27,12 @@ from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
 
-Composer = Callable[..., dict[str, Any]]
 NUM_IMAGES = 4
 SPLITS = "data.image_sets={train: none, val: none, test: train_pbr}"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     """A BOP data set of two parts on every image."""
     folder = tmp_path_factory.mktemp("two-parts")
     parts = [servoholder(), pivconnector()]
@@ -65,9 +63,7 @@ def options(root: Path, *others: str) -> list[str]:
     return ["data=bop", f"data.root={root}", SPLITS, "num_pictures=1", *others]
 
 
-def test_a_file_goes_through_tables_and_curves_and_comes_back(
-    root: Path, composed: Composer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tmp_path, capsys):
     path = tmp_path / "posecnn_two-test.csv"
     write_results(path, results(root, 0.002))
     config = composed(*options(root, f"results={path}", "bop_csv=true"), config="evaluate")
@@ -100,8 +96,8 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(
 
 
 def test_what_a_file_brings_beside_the_test_set_is_left_out_and_said(
-    root: Path, composed: Composer, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    root, composed, tmp_path, caplog
+):
     poses = results(root)
     elsewhere = PoseResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
     path = tmp_path / "results.csv"
@@ -121,9 +117,7 @@ def test_what_a_file_brings_beside_the_test_set_is_left_out_and_said(
         ({"T_cam_obj": np.diag([2.0, 2, 2, 1])}, r"line 2: R '2\.0 0\.0"),
     ],
 )
-def test_a_file_that_does_not_fit_the_data(
-    change: dict[str, Any], message: str, root: Path, composed: Composer, tmp_path: Path
-) -> None:
+def test_a_file_that_does_not_fit_the_data(change, message, root, composed, tmp_path):
     path = tmp_path / "results.csv"
     one = vars(results(root)[0])
     write_results(path, [PoseResult(**{**one, **change})])
@@ -133,7 +127,7 @@ def test_a_file_that_does_not_fit_the_data(
     assert "results.csv" in str(error.value)
 
 
-def test_an_evaluation_needs_something_to_measure(composed: Composer, tmp_path: Path) -> None:
+def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
     with pytest.raises(UserError, match=r"got no ckpt_path; allowed: ckpt_path=… or results=…"):
         evaluate(composed(config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which names no data; .*data=…"):
@@ -154,14 +148,12 @@ def test_an_evaluation_needs_something_to_measure(composed: Composer, tmp_path: 
         ("webdataset/shards", "photo-7", (0, 5)),
     ],
 )
-def test_images_have_bops_numbers_or_their_place(
-    source: str, key: str, expected: tuple[int, int]
-) -> None:
+def test_images_have_bops_numbers_or_their_place(source, key, expected):
     sample = Sample(np.zeros((1, 1, 3), np.uint8), np.eye(3), source=source, key=key)
     assert image_id(sample, 5) == expected
 
 
-def test_objects_have_their_data_sets_numbers(root: Path, ycb_root: Path) -> None:
+def test_objects_have_their_data_sets_numbers(root, ycb_root):
     piv = pivconnector()
     bop: Any = SimpleNamespace(root=root, format="bop")
     assert object_numbers(bop, [piv]) == {"servoholder": 1, "pivconnector": 2}
@@ -174,11 +166,9 @@ def test_objects_have_their_data_sets_numbers(root: Path, ycb_root: Path) -> Non
 
 
 @pytest.mark.parametrize(("num", "everything"), [(1, False), (2, False), (1, True)])
-def test_symmetric_measures_are_shown_where_there_are_symmetries(
-    num: int, everything: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_symmetric_measures_are_shown_where_there_are_symmetries(num, everything, capsys):
     row = PoseRow("part", "x", 3, 0.5, add_s_01d=0.75, num_symmetries=num)
-    report = Report("x", {"part": row, "mean": row}, {}, {}, None, 3)  # type: ignore[arg-type]
+    report = Report("x", {"part": row, "mean": row}, {}, {}, None, 3)
     display.show_report(report, everything)
     shown = capsys.readouterr().out
     assert ("ADD-S-0.1d %" in shown) == ("rotation-S" in shown) == (num > 1 or everything)

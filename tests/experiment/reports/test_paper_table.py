@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,6 @@ from dopepp.experiment.runs.sweep import CompareJobs
 from dopepp.experiment.train import do_job
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import mean_row, summarise
-
-Composer = Callable[..., dict[str, Any]]
 
 FOLDER = Path(__file__).parents[3] / "conf" / "experiment"
 EXPERIMENTS = sorted(
@@ -73,7 +70,7 @@ def read_table(folder: Path) -> list[dict[str, str]]:
     return read_csv(folder / "table.csv")
 
 
-def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path: Path) -> None:
+def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path):
     job(tmp_path / "0", ["model=dope", "seed=1"], [0.04, 0.06], recipe="ours")
     job(tmp_path / "1", ["model=dope", "seed=2"], [0.04, 0.04], recipe="ours")
     job(tmp_path / "2", ["model=dopepp", "seed=1"], None)
@@ -108,7 +105,7 @@ def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path: Path) -
     assert "VGG19" not in text
 
 
-def test_one_network_a_part_is_one_method_with_a_mean(tmp_path: Path) -> None:
+def test_one_network_a_part_is_one_method_with_a_mean(tmp_path):
     errors = {"none": {"bolt": [0.06, 0.06], "nut": [0.004] * 8 + [0.06] * 2},
               "random": {"bolt": [0.004, 0.06], "nut": [0.004] * 9 + [0.06]}}  # fmt: skip
     number = 0
@@ -142,7 +139,7 @@ def test_one_network_a_part_is_one_method_with_a_mean(tmp_path: Path) -> None:
     assert {row["seeds"] for row in compared if row["method"].startswith("x ")} == {"1, 2"}
 
 
-def test_a_part_with_other_seeds_stands_alone(tmp_path: Path) -> None:
+def test_a_part_with_other_seeds_stands_alone(tmp_path):
     job(tmp_path / "0", ["a=1", "seed=1"], [0.004, 0.06], "bolt")
     job(tmp_path / "1", ["a=1", "seed=2"], [0.004, 0.06], "nut")
     end(tmp_path, {"title": "Table 2"})
@@ -151,7 +148,7 @@ def test_a_part_with_other_seeds_stands_alone(tmp_path: Path) -> None:
     assert {"bolt", "nut"} <= set(objects)
 
 
-def test_an_untrained_vgg19_is_named(tmp_path: Path) -> None:
+def test_an_untrained_vgg19_is_named(tmp_path):
     vgg = {"_target_": "dopepp.models.backbones.VGG19", "weights_path": None}
     job(tmp_path / "0", ["model=dope"], [0.06], model={"name": "dope", "backbone": vgg})
     end(tmp_path, {"title": "Table 7", "threshold": 0.1})
@@ -161,7 +158,7 @@ def test_an_untrained_vgg19_is_named(tmp_path: Path) -> None:
     assert read_table(tmp_path)[0]["ADD<10cm %"] == "100.0"
 
 
-def test_shading_is_averaged_over_seeds_and_drawn(tmp_path: Path) -> None:
+def test_shading_is_averaged_over_seeds_and_drawn(tmp_path):
     header = "method,object,share,num_instances,pass_5cm,add_01d\n"
     rates = {"dope": (0.9, 0.4), "dopepp": (0.8, 0.6)}
     for number, (model, seed) in enumerate(
@@ -190,7 +187,7 @@ def test_shading_is_averaged_over_seeds_and_drawn(tmp_path: Path) -> None:
     assert read_rgb(tmp_path / "table_shading.png").std() > 0
 
 
-def test_shading_of_one_network_a_part_has_a_mean(tmp_path: Path) -> None:
+def test_shading_of_one_network_a_part_has_a_mean(tmp_path):
     for number, (part, rate) in enumerate([("bolt", 0.2), ("nut", 0.6)]):
         folder = tmp_path / str(number)
         job(folder, ["model=dope", f"data.parts=[{part}]"], [0.04, 0.06], part)
@@ -202,7 +199,7 @@ def test_shading_of_one_network_a_part_has_a_mean(tmp_path: Path) -> None:
     assert rows["nut", "ADD-0.1d %"] == "60.0"
 
 
-def test_costs(composed: Composer, tmp_path: Path) -> None:
+def test_costs(composed, tmp_path):
     small = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=3", "cost.batch_size=2")
     for number, name in enumerate(("dope", "dopepp")):
         folder = tmp_path / str(number)
@@ -225,7 +222,7 @@ def test_costs(composed: Composer, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 @pytest.mark.parametrize("scale", ["paper", "laptop"])
-def test_every_experiment_composes(composed: Composer, experiment: str, scale: str) -> None:
+def test_every_experiment_composes(composed, experiment, scale):
     config = composed(f"experiment={experiment}", f"scale={scale}")
     table = PaperTable.of(config["table"])
     assert set(table.labels.values()) & set(table.paper) or not table.paper
@@ -236,9 +233,7 @@ TRAINED = [one for one in EXPERIMENTS if one.startswith("table") and one[5] in "
 
 
 @pytest.mark.parametrize("experiment", TRAINED)
-def test_tables_train_as_the_paper_does_at_its_scale_and_as_we_do_on_a_laptop(
-    composed: Composer, experiment: str
-) -> None:
+def test_tables_train_as_the_paper_does_at_its_scale_and_as_we_do_on_a_laptop(composed, experiment):
     paper = composed(f"experiment={experiment}")
     assert paper["recipe"] == "paper"
     assert paper["model"]["loss"] == {"_target_": "dopepp.models.losses.MapMSE"}
@@ -250,7 +245,7 @@ def test_tables_train_as_the_paper_does_at_its_scale_and_as_we_do_on_a_laptop(
     assert ours["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
 
 
-def test_recipes_are_ours_unless_the_papers_are_asked_for(composed: Composer) -> None:
+def test_recipes_are_ours_unless_the_papers_are_asked_for(composed):
     assert composed()["recipe"] == "ours"
     assert composed("experiment=paper")["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
     table = composed("experiment=table6_dope_vs_dopepp", "recipe=ours")
@@ -266,12 +261,12 @@ def test_recipes_are_ours_unless_the_papers_are_asked_for(composed: Composer) ->
         ({}, "table without a title"),
     ],
 )
-def test_impossible_tables(table: dict[str, Any], message: str) -> None:
+def test_impossible_tables(table, message):
     with pytest.raises(UserError, match=message):
         PaperTable.of(table)
 
 
-def test_finished_runs_in_another_tables_layout(tmp_path: Path) -> None:
+def test_finished_runs_in_another_tables_layout(tmp_path):
     job(tmp_path / "sweep" / "0", ["model=dope"], [0.04, 0.06])
     job(tmp_path / "sweep" / "1", ["model=dopepp"], [0.04, 0.04])
     out = compare_paths(
@@ -283,9 +278,7 @@ def test_finished_runs_in_another_tables_layout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["model: dope\n", "table: Table 6\n", "- table\n"])
-def test_an_experiment_without_a_table_is_refused_before_anything_is_written(
-    text: str, tmp_path: Path
-) -> None:
+def test_an_experiment_without_a_table_is_refused_before_anything_is_written(text, tmp_path):
     job(tmp_path / "0", ["model=dope"], [0.04, 0.06])
     path = tmp_path / "experiment.yaml"
     path.write_text(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -32,13 +31,13 @@ FACTORS = r"scale=.*; allowed: factors from 0\.05 to 20"
         ("num_bins", 0, "num_bins=0; allowed: an integer from 1"),
     ],
 )  # fmt: skip
-def test_wrong_options_are_told_in_one_line(option: str, given: object, message: str) -> None:
+def test_wrong_options_are_told_in_one_line(option, given, message):
     with pytest.raises(UserError, match=message) as error:
         Protocols.of({**OPTIONS, option: given})
     assert "\n" not in str(error.value)
 
 
-def test_options_are_put_in_order() -> None:
+def test_options_are_put_in_order():
     assert not Protocols.of(OPTIONS)
     given = Protocols.of({**OPTIONS, "shading": [0.8, 0, 0.2, 0.2, 1], "by": "size"})
     assert given == Protocols((0.2, 0.8, 1.0), by=("size",), num_bins=5)
@@ -47,9 +46,7 @@ def test_options_are_put_in_order() -> None:
     assert Protocols.of({**OPTIONS, "scale_factors": 2}).scales == (2.0,)
 
 
-def test_scale_is_short_for_an_option(
-    composed: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scale_is_short_for_an_option(composed, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "scale=[0.5,1,2]", "data.num_test=3"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     seen: list[str] = []

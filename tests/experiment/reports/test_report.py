@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ def make_report(name: str, add_01d: float | None = 0.5, num_objects: int = 1) ->
     share=st.none() | st.floats(0, 1),
     ms=st.none() | st.floats(0, 1e6),
 )
-def test_a_report_survives_json(errors: list[float], share: float | None, ms: float | None) -> None:
+def test_a_report_survives_json(errors, share, ms):
     report = make_report("dopepp", share, num_objects=2)
     report.errors["part0"] = np.array(errors, np.float64)
     report.rotation_deg = {"part0": np.array(errors, np.float64) * 10}
@@ -53,7 +52,7 @@ def test_a_report_survives_json(errors: list[float], share: float | None, ms: fl
     assert back.details == report.details
 
 
-def test_a_report_of_an_earlier_version_is_read() -> None:
+def test_a_report_of_an_earlier_version_is_read():
     stored = make_report("dopepp").to_record()
     for key in ("rotation_deg", "diameters", "test_set"):
         del stored[key]
@@ -61,7 +60,7 @@ def test_a_report_of_an_earlier_version_is_read() -> None:
     assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
 
 
-def test_the_config_is_written_as_it_was(tmp_path: Path) -> None:
+def test_the_config_is_written_as_it_was(tmp_path):
     config = {"b": {"x": [1, 2.5, None]}, "a": "größer"}
     record.write_config(tmp_path, config)
     path = tmp_path / record.CONFIG_FILE
@@ -69,7 +68,7 @@ def test_the_config_is_written_as_it_was(tmp_path: Path) -> None:
     assert list(yaml.safe_load(path.read_text())) == ["b", "a"]
 
 
-def test_json_that_nobody_else_could_read_is_not_written(tmp_path: Path) -> None:
+def test_json_that_nobody_else_could_read_is_not_written(tmp_path):
     path = tmp_path / "x.json"
     record.write_json(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):

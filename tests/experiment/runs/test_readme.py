@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,7 @@ CONFIG: Any = SimpleNamespace(
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     """A run's folder, with a blank in its name, that was resumed once."""
     folder = tmp_path / "a run"
     first = {"command": ["train.py", "data.parts=[a,b]"]}
@@ -27,7 +26,7 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def test_every_state_is_told_with_what_to_do(run: Path) -> None:
+def test_every_state_is_told_with_what_to_do(run):
     page = readme.RunReadme(CONFIG, run)
     page.end(readme.FAILED, "too early")
     assert not (run / readme.README_FILE).exists()  # it was never begun
@@ -50,22 +49,20 @@ def test_every_state_is_told_with_what_to_do(run: Path) -> None:
     assert "](auc.png)" not in text
 
 
-def test_paths_are_typed_as_from_here(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_typed_as_from_here(run, monkeypatch):
     assert readme.shown(run) == str(run)
     monkeypatch.chdir(run.parent)
     assert readme.shown(run / "x") == "a run/x"
 
 
-def test_a_readme_that_cannot_be_written_ends_no_run(
-    run: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_readme_that_cannot_be_written_ends_no_run(run, caplog):
     (run / readme.README_FILE).mkdir()
     with caplog.at_level(logging.WARNING):
         readme.RunReadme(CONFIG, run).begin()
     assert f"cannot write {run / readme.README_FILE}" in caplog.text
 
 
-def test_a_sweep_lists_its_jobs(tmp_path: Path) -> None:
+def test_a_sweep_lists_its_jobs(tmp_path):
     command = ["train.py", "-m", "seed=1,2"]
     readme.write_sweep_readme(tmp_path, command, {})
     assert (tmp_path / readme.README_FILE).read_text().startswith("# Multirun: running;")

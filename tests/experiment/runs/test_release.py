@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,7 +28,7 @@ SPEC: dict[str, Any] = {
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     """A run's folder: checkpoint and result."""
     config = {"virtual": {"preset": "wide"}, "masking": {"probability": 0.3}, "cache_dir": "/x/y"}
     checkpoint = Checkpoint(
@@ -44,7 +43,7 @@ def run(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_card_says_what_it_can_do(run: Path) -> None:
+def test_the_card_says_what_it_can_do(run):
     weights, card = release(run / "best.ckpt", run / "metrics.json", "bracket", run / "out")
     assert (weights.name, card.name) == ("bracket.safetensors", "bracket.md")
     assert read(weights).data["config"]["cache_dir"] is None
@@ -58,7 +57,7 @@ def test_the_card_says_what_it_can_do(run: Path) -> None:
     assert "| mean |" not in text
 
 
-def test_what_cannot_be_released(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_released(run, monkeypatch):
     out = run / "out"
     with pytest.raises(UserError, match=r"name '\.\./x'; allowed: letters"):
         release(run / "best.ckpt", run / "metrics.json", "../x", out)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.images import describe_images, differing_images
 from dopepp.experiment.runs.resume import (
@@ -24,8 +22,6 @@ from dopepp.experiment.runs.resume import (
     trusted_overrides,
 )
 from dopepp.models.checkpoint.schema import Checkpoint
-
-Parser = Callable[..., RunConfig]
 
 
 class Pictures:
@@ -52,7 +48,7 @@ class Pictures:
         return True
 
 
-def test_a_description_of_images_tells_what_is_another() -> None:
+def test_a_description_of_images_tells_what_is_another():
     first = describe_images(Pictures(files="ab" * 32, parts={"a": "1"}))
     # Through a file and back, and with another machine's rounding, it is the same.
     again = yaml.safe_load(yaml.safe_dump(first))
@@ -72,7 +68,7 @@ def test_a_description_of_images_tells_what_is_another() -> None:
 
 
 @pytest.fixture
-def resumed(tiny: Parser, tmp_path: Path) -> Callable[..., list[str]]:
+def resumed(tiny, tmp_path):
     """Resume a run with these overrides and say which differences are accepted."""
     (tmp_path / "run").mkdir()
     started = tiny()
@@ -104,13 +100,13 @@ ACCEPTED = {
 }
 
 
-def test_how_a_run_goes_on_may_change_and_is_told(resumed: Callable[..., list[str]]) -> None:
+def test_how_a_run_goes_on_may_change_and_is_told(resumed):
     accepted = resumed(*ACCEPTED)
     assert set(ACCEPTED.values()) <= set(accepted)
     assert len(accepted) < len(ACCEPTED) + 5  # what hangs on them: the other logger's options
 
 
-def test_nothing_is_told_where_nothing_changed(resumed: Callable[..., list[str]]) -> None:
+def test_nothing_is_told_where_nothing_changed(resumed):
     assert resumed() == []
     assert resumed("output_dir=/elsewhere", "resume=x", "resume_anyway=true") == []
     assert resumed(test=Pictures(50)) == []  # other test images change nothing that is learnt
@@ -133,9 +129,7 @@ LEARNT_FROM = {
 }
 
 
-def test_what_is_learnt_from_changes_only_when_that_is_said(
-    resumed: Callable[..., list[str]],
-) -> None:
+def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
     harmless = "trainer.max_epochs=9"
     with pytest.raises(UserError, match="with other data or another loss") as error:
         resumed(*LEARNT_FROM, harmless)
@@ -149,9 +143,7 @@ def test_what_is_learnt_from_changes_only_when_that_is_said(
 
 
 @pytest.mark.parametrize("split", ["train", "val"])
-def test_images_that_changed_behind_the_same_options_are_other_data(
-    split: str, resumed: Callable[..., list[str]]
-) -> None:
+def test_images_that_changed_behind_the_same_options_are_other_data(split, resumed):
     changed: dict[str, Any] = {split: Pictures(50)}
     with pytest.raises(UserError, match=rf"{split} images: as trained on → others \(pixels of"):
         resumed(**changed)
@@ -159,9 +151,7 @@ def test_images_that_changed_behind_the_same_options_are_other_data(
 
 
 @pytest.mark.parametrize("anyway", ["true", "false"])
-def test_another_network_or_optimiser_is_refused_whatever_is_said(
-    anyway: str, resumed: Callable[..., list[str]]
-) -> None:
+def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resumed):
     with pytest.raises(UserError, match=r"network differs.*model\.width: 0\.0625 → 0\.5") as error:
         resumed("model.width=0.5", f"resume_anyway={anyway}", spec="b")
     assert "init_from=" in error.value.fix
@@ -173,20 +163,18 @@ def test_another_network_or_optimiser_is_refused_whatever_is_said(
         resumed("optimizer=sgd", f"resume_anyway={anyway}")
 
 
-def test_a_run_that_wrote_no_config_is_compared_by_its_checkpoint(
-    resumed: Callable[..., list[str]], tmp_path: Path
-) -> None:
+def test_a_run_that_wrote_no_config_is_compared_by_its_checkpoint(resumed, tmp_path):
     (tmp_path / "run" / record.CONFIG_FILE).unlink()
     assert resumed("seed=1") == []
     with pytest.raises(UserError, match="network differs"):
         resumed(spec="b")
 
 
-def test_an_option_that_a_later_version_added_is_no_difference() -> None:
+def test_an_option_that_a_later_version_added_is_no_difference():
     assert config_differences({"data": {"a": 1}}, {"data": {"a": 1, "new": None}}) == []
 
 
-def test_a_runs_own_overrides_are_kept() -> None:
+def test_a_runs_own_overrides_are_kept():
     stored = [
         "model=dope", "data/augment=none", "data.parts=[pivconnector]", "+trainer.num_nodes=1",
         "++virtual.scene.turning={tilt_deg: 3}", "~callbacks.overlays", "output_dir=/a b/ö=1",
@@ -209,7 +197,7 @@ OF_HYDRA = (
 
 
 @pytest.mark.parametrize("text", OF_HYDRA)
-def test_nothing_of_hydras_own_comes_from_a_runs_folder(text: str) -> None:
+def test_nothing_of_hydras_own_comes_from_a_runs_folder(text):
     """Hostile files are in tests/security/test_hostile_runs.py."""
     kept = []
     with contextlib.suppress(UserError):
@@ -217,5 +205,5 @@ def test_nothing_of_hydras_own_comes_from_a_runs_folder(text: str) -> None:
     assert kept in ([], ["model=dope"])
 
 
-def test_a_folder_without_overrides_has_none(tmp_path: Path) -> None:
+def test_a_folder_without_overrides_has_none(tmp_path):
     assert read_overrides(tmp_path) is None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import subprocess
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -13,11 +11,9 @@ import dopepp
 from dopepp.experiment.runs import record
 from dopepp.virtual.factory import code_hash
 
-Git = Callable[..., None]
-
 
 @pytest.fixture
-def working_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Git]:
+def working_tree(tmp_path, monkeypatch):
     """A repository whose package stands for this one, and git in it."""
     tree = tmp_path / "tree"
     (tree / "dopepp").mkdir(parents=True)
@@ -32,7 +28,7 @@ def working_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path,
     return tree, git
 
 
-def test_the_state_of_the_working_tree(working_tree: tuple[Path, Git], tmp_path: Path) -> None:
+def test_the_state_of_the_working_tree(working_tree, tmp_path):
     tree, git = working_tree
     # Installed below somebody's own repository, the package is no part of it.
     record.write_environment(tmp_path / "installed", 7, "abc")
@@ -57,7 +53,7 @@ def test_the_state_of_the_working_tree(working_tree: tuple[Path, Git], tmp_path:
     assert (tree / "dopepp" / "__init__.py").read_text() == "one = 2\n"
 
 
-def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path: Path) -> None:
+def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path):
     for seed, changes in ((1, []), (2, ["seed: 1 → 2"]), (3, ["seed: 2 → 3", "a: b → c"])):
         record.write_environment(tmp_path, seed, f"data{seed}", changes)
     written = record.read_json(tmp_path / record.VERSIONS_FILE)
@@ -69,7 +65,7 @@ def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path: Path) -> None:
     assert all("earlier" not in one for one in written["earlier"])
 
 
-def test_packages_hardware_and_code() -> None:
+def test_packages_hardware_and_code():
     facts = record.environment(7, "abc")
     assert facts["rendering_code"] == code_hash()
     assert {"torch", "lightning", "numpy", "hydra-core"} <= set(facts["packages"])

@@ -29,7 +29,7 @@ def word(*samples: Sample) -> str:
     return fingerprint.word()
 
 
-def test_the_same_images_have_one_word() -> None:
+def test_the_same_images_have_one_word():
     again = sample()
     again.image += 1  # pixels may differ in a bit from machine to machine
     again.instances[0].T_cam_obj = again.instances[0].T_cam_obj + 1e-10
@@ -45,7 +45,7 @@ def moved(one: Sample) -> Sample:
 
 def changed(**fields: object) -> Callable[[Sample], Sample]:
     def change(one: Sample) -> Sample:
-        one.instances = [replace(one.instances[0], **fields)]  # type: ignore[arg-type]
+        one.instances = [replace(one.instances[0], **fields)]
         return one
 
     return change
@@ -65,11 +65,11 @@ def changed(**fields: object) -> Callable[[Sample], Sample]:
         lambda one: replace(one, instances=[]),
     ],
 )
-def test_other_images_have_another(change: Callable[[Sample], Sample]) -> None:
+def test_other_images_have_another(change):
     assert word(sample()) != word(change(sample()))
 
 
-def test_number_order_and_objects_count() -> None:
+def test_number_order_and_objects_count():
     a, b = sample("a"), sample("b")
     assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
     fingerprint = Fingerprint([pivconnector(), servoholder()])

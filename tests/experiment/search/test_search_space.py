@@ -1,26 +1,18 @@
 """Hydra's sweeps as Optuna's distributions."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("optuna")
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path
-from hydra.core.config_loader import ConfigLoader
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-)
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.search.study import chosen, examples, overrides, read_space
 
 
 @pytest.fixture(scope="module")
-def loader() -> ConfigLoader:
+def loader():
     return ConfigLoaderImpl(create_config_search_path(None))
 
 
@@ -40,13 +32,13 @@ def loader() -> ConfigLoader:
         ("a,b", CategoricalDistribution(["a", "b"])),
     ],
 )
-def test_every_form(text: str, expected: BaseDistribution, loader: ConfigLoader) -> None:
+def test_every_form(text, expected, loader):
     space = read_space(loader, [f"x.y={text}"], [])
     assert space.varied == {"x.y": expected}
     assert space.texts == {"x.y": text}
 
 
-def test_the_command_line_adds_replaces_and_fixes(loader: ConfigLoader) -> None:
+def test_the_command_line_adds_replaces_and_fixes(loader):
     listed = ["a=interval(0, 1)", "b=choice(1, 2)", "c=interval(0, 1)"]
     space = read_space(loader, listed, ["model=dope", "b=7", "c=interval(0, 9)", "+d=x,y"])
     assert list(space.varied) == ["a", "c", "+d"]
@@ -57,7 +49,7 @@ def test_the_command_line_adds_replaces_and_fixes(loader: ConfigLoader) -> None:
     ]  # fmt: skip
 
 
-def test_every_choice_is_tried_before_the_search(loader: ConfigLoader) -> None:
+def test_every_choice_is_tried_before_the_search(loader):
     space = read_space(loader, ["a=choice(1, 2)", "b=interval(0, 1)", "c=choice(x, y)"], [])
     assert examples(space) == [
         ["a=1", "b=0", "c=x"], ["a=2", "b=0", "c=x"], ["a=1", "b=0", "c=y"],
@@ -65,12 +57,12 @@ def test_every_choice_is_tried_before_the_search(loader: ConfigLoader) -> None:
 
 
 @pytest.mark.parametrize("bad", ["a=1", "a=", "a=interval(1,", "a=interval(2, 1)", "a"])
-def test_what_is_no_range_is_refused(bad: str, loader: ConfigLoader) -> None:
+def test_what_is_no_range_is_refused(bad, loader):
     with pytest.raises(UserError, match=r"search\.space with .*allowed: interval\(low, high\)"):
         read_space(loader, [bad], [])
 
 
-def test_numbers_are_written_as_they_are_run() -> None:
+def test_numbers_are_written_as_they_are_run():
     assert chosen({"lr": 1.23456e-4, "n": 123456, "m": "cbam"}) == [
         "lr=0.0001235", "n=123456", "m=cbam",
     ]  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import json
 import statistics
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,8 +13,6 @@ pytest.importorskip("optuna")
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-Called = tuple[int, str, str]
-Call = Callable[..., Called]
 SEARCH = ("search=optuna", "search.study=s", "search.space=[]")
 LR = "optimizer.lr=tag(log, interval(1e-6, 1.0))"
 FAST = (*SEARCH, LR, "search.prune=false")
@@ -31,9 +28,7 @@ def started(folder: Path) -> list[list[str]]:
     return [line.split() for line in lines]
 
 
-def test_the_same_command_goes_on_and_the_best_trial_is_named(
-    call_fast: Call, tmp_path: Path
-) -> None:
+def test_the_same_command_goes_on_and_the_best_trial_is_named(call_fast, tmp_path):
     assert call_fast(*FAST, "search.num_trials=2")[0] == 0
     for _ in range(2):  # the second time, nothing is missing
         code, out, err = call_fast(*FAST, "search.num_trials=4")
@@ -52,9 +47,7 @@ def test_the_same_command_goes_on_and_the_best_trial_is_named(
     assert "study s: 4 complete" in out
 
 
-def test_interrupted_trials_run_again_under_their_numbers(
-    call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, monkeypatch):
     for number in (0, 1):
         monkeypatch.setenv(f"END_{number}", "interrupt")
     assert call_fast(*FAST, "search.num_trials=3")[0] == 130
@@ -70,7 +63,7 @@ def test_interrupted_trials_run_again_under_their_numbers(
     assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
 
 
-def test_a_result_that_was_not_told_is_not_computed_again(call_fast: Call, tmp_path: Path) -> None:
+def test_a_result_that_was_not_told_is_not_computed_again(call_fast, tmp_path):
     """The command died after a job's end: here, one of two that run at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("END_1", "interrupt")
@@ -81,9 +74,7 @@ def test_a_result_that_was_not_told_is_not_computed_again(call_fast: Call, tmp_p
     assert [trial.state for trial in trials(tmp_path)] == [TrialState.COMPLETE] * 2
 
 
-def test_a_failing_trial_does_not_stop_the_study(
-    call_fast: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_trial_does_not_stop_the_study(call_fast, tmp_path, monkeypatch):
     monkeypatch.setenv("END_0", "raise")
     code, out, _ = call_fast(*FAST, "search.num_trials=2")
     assert code == 0
@@ -93,7 +84,7 @@ def test_a_failing_trial_does_not_stop_the_study(
     assert failed["reason"] == "as the test asked"
 
 
-def test_trials_below_the_median_are_pruned(call_fast: Call, tmp_path: Path) -> None:
+def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
     rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=6")
     assert call_fast(*SEARCH, LR, *rule)[0] == 0
     found = trials(tmp_path)
@@ -117,7 +108,7 @@ def test_trials_below_the_median_are_pruned(call_fast: Call, tmp_path: Path) -> 
     assert "worse than the other trials' median" in json.loads(record.read_text())["reason"]
 
 
-def test_a_study_is_not_mixed_with_another_configuration(call_fast: Call) -> None:
+def test_a_study_is_not_mixed_with_another_configuration(call_fast):
     assert call_fast(*FAST, "search.num_trials=1")[0] == 0
     code, _, err = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7")
     assert code == 2
@@ -127,7 +118,7 @@ def test_a_study_is_not_mixed_with_another_configuration(call_fast: Call) -> Non
     assert "choose another search.study=NAME" in err
 
 
-def test_a_folder_of_another_study_or_command_is_refused(call_fast: Call, tmp_path: Path) -> None:
+def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
     folder = tmp_path / "search" / "s"
     (folder / "0").mkdir(parents=True)
     code, _, err = call_fast(*FAST)
@@ -155,9 +146,7 @@ def test_a_folder_of_another_study_or_command_is_refused(call_fast: Call, tmp_pa
         (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
     ],
 )
-def test_mistakes_are_told_in_one_line(
-    arguments: list[str], message: str, call_fast: Call, tmp_path: Path
-) -> None:
+def test_mistakes_are_told_in_one_line(arguments, message, call_fast, tmp_path):
     code, _, err = call_fast("search=optuna", "search.study=s", *arguments)
     assert code == 2, err
     assert message in err.splitlines()[-1]
@@ -165,9 +154,7 @@ def test_mistakes_are_told_in_one_line(
     assert not (tmp_path / "search" / "s" / "started.txt").exists()
 
 
-def test_without_optuna_it_says_what_to_install(
-    call_fast: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_optuna_it_says_what_to_install(call_fast, monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     code, _, err = call_fast(*FAST)
     assert code == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from lightning.pytorch.loggers import Logger
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.metrics.pose import PoseMetrics
-from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.training.callbacks.pictures import AUCCurves, Overlays
 from dopepp.training.callbacks.pose_metrics import LOGGED, PoseMetricsCallback, batch_instances
@@ -25,13 +23,11 @@ from dopepp.training.callbacks.throughput import Throughput
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 from dopepp.training.system import PoseSystem, ValidationOutput
 
-SystemMaker = Callable[..., PoseSystem]
-
 
 class Displaced(PoseSystem):
     """Its maps are the targets; the first of every batch is two cells to the side."""
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:  # type: ignore[override]
+    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
         belief, field = self.targets(batch)
         belief[::2] = belief[::2].roll(2, dims=-1)
         field[::2] = field[::2].roll(2, dims=-1)
@@ -43,7 +39,7 @@ class Recorder(Callback):
         self.detections: list[list[Detection]] = []
         self.logged: dict[str, float] = {}
 
-    def on_validation_batch_end(  # type: ignore[override]
+    def on_validation_batch_end(
         self,
         trainer: Trainer,
         pl_module: PoseSystem,
@@ -67,7 +63,7 @@ class Offline(Logger):
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
         raise ConnectionError("no network")
 
-    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:  # type: ignore[override]
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         raise ConnectionError("no network")
 
 
@@ -93,13 +89,8 @@ class Run:
 
 
 def test_figures_pictures_and_throughput(
-    make_system: SystemMaker,
-    make_datamodule: Callable[[], PoseDataModule],
-    tmp_path: Path,
-    read_png: Callable[[Path], np.ndarray],
-    read_csv: Callable[[Path], list[dict[str, str]]],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    make_system, make_datamodule, tmp_path, read_png, read_csv, caplog
+):
     caplog.set_level(logging.INFO)
     run = Run(tmp_path, make_system(system_class=Displaced), make_datamodule())
     # The logged figures are PoseMetrics' on the same poses and the samples' own ground truth.
@@ -146,9 +137,7 @@ def test_figures_pictures_and_throughput(
     assert complaints[0].levelno == logging.WARNING
 
 
-def test_batches_give_back_the_samples_instances(
-    part: Part, batch: Batch, make_datamodule: Callable[[], PoseDataModule]
-) -> None:
+def test_batches_give_back_the_samples_instances(part, batch, make_datamodule):
     batch = replace(batch, object_index=torch.tensor([[0], [-1]]))
     first, second = batch_instances(batch, (part,))
     assert second == []
@@ -159,9 +148,7 @@ def test_batches_give_back_the_samples_instances(
     assert first[0].visible_fraction == pytest.approx(truth.visible_fraction)
 
 
-def test_no_counted_instance_still_gives_a_number_to_select_by(
-    make_system: SystemMaker, make_noise: Callable[[], PoseDataModule], tmp_path: Path
-) -> None:
+def test_no_counted_instance_still_gives_a_number_to_select_by(make_system, make_noise, tmp_path):
     class Blind(Displaced):
         def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:
             batch.object_index[:] = -1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +16,6 @@ from dopepp.data.batch import Batch
 from dopepp.training.callbacks.empty_maps import EmptyMaps
 from dopepp.training.system import PoseSystem, ValidationOutput
 
-SystemMaker = Callable[..., PoseSystem]
 CAUSES = ("too little training", "a learning rate", "labels or units")
 
 
@@ -43,7 +41,7 @@ class Validations:
 
 
 @pytest.fixture
-def validations(make_system: SystemMaker, batch: Batch) -> Validations:
+def validations(make_system, batch):
     """Two images of 128×128 pixels, an object of 60 pixels in the middle of each."""
     rng = np.random.default_rng(0)
     keypoints = torch.tensor(rng.uniform(34, 94, (2, 1, 9, 2)), dtype=torch.float32)
@@ -64,13 +62,11 @@ def first_cause(caplog: pytest.LogCaptureFixture) -> str:
 
 
 @pytest.fixture(autouse=True)
-def warnings(caplog: pytest.LogCaptureFixture) -> None:
+def warnings(caplog):
     caplog.set_level(logging.WARNING, "dopepp.training.callbacks.empty_maps")
 
 
-def test_a_falling_loss_needs_more_steps(
-    validations: Validations, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_falling_loss_needs_more_steps(validations, caplog):
     validations(0.001, 2.0)
     assert not caplog.messages
     validations(0.001, 1.0)
@@ -82,9 +78,7 @@ def test_a_falling_loss_needs_more_steps(
     assert not caplog.messages  # once is enough
 
 
-def test_a_flat_loss_is_the_learning_rates(
-    validations: Validations, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flat_loss_is_the_learning_rates(validations, caplog):
     validations(0.001, 2.0)
     validations(0.001, 2.0)
     assert "from 2 to 2, the rate is 0.5" in first_cause(caplog)
@@ -100,13 +94,8 @@ def test_a_flat_loss_is_the_learning_rates(
     ],
 )
 def test_labels_off_the_image_in_one_cell_or_absent_are_the_cause(
-    scale: float,
-    shift: float,
-    index: int,
-    said: str,
-    validations: Validations,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    scale, shift, index, said, validations, caplog
+):
     validations.batch = replace(
         validations.batch,
         keypoints=scale * validations.batch.keypoints + shift,
@@ -119,9 +108,7 @@ def test_labels_off_the_image_in_one_cell_or_absent_are_the_cause(
     assert said in cause
 
 
-def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(
-    validations: Validations, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(validations, caplog):
     validations(0.001, 2.0)
     state = validations.callback.state_dict()
     validations.callback.on_train_end(validations.trainer, validations.system)
@@ -132,20 +119,18 @@ def test_a_short_training_says_it_at_its_end_and_a_resumed_one_counts_on(
     assert "from 2 to 1" in caplog.messages[0]
 
 
-def test_corners_or_centroids_alone_give_no_pose_both_do(
-    validations: Validations, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_corners_or_centroids_alone_give_no_pose_both_do(validations, caplog):
     for channel in (0, 8):
         validations.callback = EmptyMaps(patience=1)
         validations(0.9, 2.0, channel)
         assert caplog.messages
         caplog.clear()
     validations.callback = EmptyMaps(patience=1)
-    validations(0.9, 2.0, slice(None))  # type: ignore[arg-type]
+    validations(0.9, 2.0, slice(None))
     validations.callback.on_train_end(validations.trainer, validations.system)
     assert not caplog.messages
 
 
-def test_patience_out_of_range() -> None:
+def test_patience_out_of_range():
     with pytest.raises(UserError, match="patience=0"):
         EmptyMaps(0)

@@ -6,7 +6,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -24,13 +24,11 @@ from torch.utils.data import DataLoader
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.data.batch import Batch
-from dopepp.data.datamodule import PoseDataModule
 from dopepp.training.callbacks.finite import FOLDER, FiniteSteps, check_state
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem
 
-SystemMaker = Callable[..., PoseSystem]
 ROOT = Path(__file__).parents[3]
 NUM_BATCHES = 4
 
@@ -68,9 +66,7 @@ class States(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._keep(trainer, pl_module)
 
-    def on_train_batch_end(  # type: ignore[override]
-        self, trainer: Trainer, pl_module: LightningModule, *_: object
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         self._keep(trainer, pl_module)
 
     def _keep(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -92,7 +88,7 @@ class States(Callback):
 
 
 @pytest.fixture(scope="module")
-def batches(make_noise: Callable[[], PoseDataModule]) -> list[Batch]:
+def batches(make_noise):
     """Four batches of two."""
     return list(make_noise().train_dataloader())
 
@@ -126,11 +122,8 @@ class Run:
         self.trainer.fit(system, DataLoader(batches, batch_size=None))
 
 
-Runner = Callable[..., Run]
-
-
 @pytest.fixture
-def run(make_system: SystemMaker, batches: list[Batch], tmp_path: Path) -> Runner:
+def run(make_system, batches, tmp_path):
     """Train with faults by pass; further options are the system's, then the run's."""
 
     def start(faults: Mapping[int, str], system: Mapping[str, Any] = {}, **options: Any) -> Run:
@@ -148,12 +141,8 @@ def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> OneCycleLR:
 
 @pytest.mark.parametrize("fault", ["loss", "gradient", "statistics"])
 def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(
-    fault: str,
-    run: Runner,
-    tmp_path: Path,
-    read_csv: Callable[[Path], list[dict[str, str]]],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    fault, run, tmp_path, read_csv, caplog
+):
     done = run({1: fault}, {"make_scheduler": one_cycle})
     assert done.states.changed() == [True, False, True, True]
     counts = [row["train/skipped_steps"] for row in read_csv(tmp_path / "metrics.csv")]
@@ -177,12 +166,12 @@ def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(
         partial(torch.optim.RMSprop, lr=1e-3, momentum=0.9, weight_decay=0.1),
     ],
 )
-def test_no_optimizer_moves_by_its_momentum_or_decay(make_optimizer: Any, run: Runner) -> None:
+def test_no_optimizer_moves_by_its_momentum_or_decay(make_optimizer, run):
     done = run({2: "loss"}, {"make_optimizer": make_optimizer}, gradient_clip_val=None)
     assert done.states.changed() == [True, True, False, True]
 
 
-def test_with_accumulation_the_whole_step_is_left_out(run: Runner) -> None:
+def test_with_accumulation_the_whole_step_is_left_out(run):
     done = run({0: "loss"}, accumulate_grad_batches=2)
     first, *_, last = done.states.states
     untouched = done.states.states[2]  # after the second pass the step would have been taken
@@ -195,9 +184,7 @@ def test_with_accumulation_the_whole_step_is_left_out(run: Runner) -> None:
     ("fault", "scale", "counted"),
     [("gradient", 2.0**10, 0), ("gradient", 0.5, 1), ("loss", 2.0**10, 1)],
 )
-def test_a_scalers_own_overflow_is_not_counted(
-    fault: str, scale: float, counted: int, run: Runner
-) -> None:
+def test_a_scalers_own_overflow_is_not_counted(fault, scale, counted, run):
     scaler = torch.amp.GradScaler("cpu", init_scale=scale)
     precision = MixedPrecision("16-mixed", "cpu", scaler)
     done = run({1: fault}, max_in_a_row=2, plugins=[precision])
@@ -213,9 +200,7 @@ def test_a_scalers_own_overflow_is_not_counted(
         assert not done.states.changed()[1]
 
 
-def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(
-    run: Runner, batches: list[Batch], tmp_path: Path, read_png: Callable[[Path], np.ndarray]
-) -> None:
+def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(run, batches, tmp_path, read_png):
     with pytest.raises(RunError) as error:
         run({1: "loss", 2: "loss"}, max_in_a_row=2)
     folder = tmp_path / FOLDER
@@ -236,16 +221,16 @@ def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(
     assert all(value.isfinite().all() for value in saved["state_dict"].values())
 
 
-def test_good_steps_between_bad_ones_keep_the_run_going(run: Runner) -> None:
+def test_good_steps_between_bad_ones_keep_the_run_going(run):
     assert run({0: "loss", 2: "gradient"}, max_in_a_row=2).guard.skipped == 2
 
 
-def test_weights_that_are_not_finite_end_the_run_at_once(run: Runner) -> None:
+def test_weights_that_are_not_finite_end_the_run_at_once(run):
     with pytest.raises(RunError, match=r"not finite in step 2 \(the weights are not finite\)"):
         run({1: "weights"}, save_every=100)
 
 
-def test_weights_that_are_not_finite_are_never_saved(run: Runner, tmp_path: Path) -> None:
+def test_weights_that_are_not_finite_are_never_saved(run, tmp_path):
     """The weights break in the second step, after which a checkpoint is due."""
     with pytest.raises(RunError, match=r"^the weights not finite after step 2: nothing was saved"):
         run({1: "weights"})
@@ -256,7 +241,7 @@ def test_weights_that_are_not_finite_are_never_saved(run: Runner, tmp_path: Path
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-def test_what_may_be_saved(value: float) -> None:
+def test_what_may_be_saved(value):
     good = {"w": torch.ones(3), "n": torch.tensor(4)}
     bad = {**good, "w": torch.tensor([1.0, value])}
     # A checkpoint's other entries may hold what they like: a best score of −∞, for one.
@@ -270,7 +255,7 @@ def test_what_may_be_saved(value: float) -> None:
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "ten"])
-def test_a_count_that_means_nothing_is_refused(count: Any) -> None:
+def test_a_count_that_means_nothing_is_refused(count):
     with pytest.raises(UserError, match="max_in_a_row"):
         FiniteSteps(count)
 
@@ -313,7 +298,7 @@ torch.save([guard.skipped, line.seen], Path(sys.argv[1]) / f"{trainer.global_ran
 
 @pytest.mark.slow
 @pytest.mark.ddp
-def test_all_processes_leave_a_step_out_together(tmp_path: Path) -> None:
+def test_all_processes_leave_a_step_out_together(tmp_path):
     script = tmp_path / "line.py"
     script.write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

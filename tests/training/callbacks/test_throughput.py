@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
 
@@ -12,7 +10,7 @@ from dopepp.training.callbacks import throughput
 from dopepp.training.callbacks.throughput import Operators, make_profiler, profile_rows
 
 
-def test_time_is_left_for_the_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_is_left_for_the_whole_run(monkeypatch):
     monkeypatch.setattr(TQDMProgressBar, "on_train_start", lambda *_: None)
     monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
     now = [100.0]
@@ -28,7 +26,7 @@ def test_time_is_left_for_the_whole_run(monkeypatch: pytest.MonkeyPatch) -> None
     assert bar.get_metrics(trainer, None)["left"] == "0:00:00"
 
 
-def test_the_simple_profiler_lists_what_took_longest(tmp_path: Path) -> None:
+def test_the_simple_profiler_lists_what_took_longest(tmp_path):
     profiler: Any = make_profiler("simple", tmp_path)
     profiler.recorded_durations = {"step": [0.25, 0.75], "save": [0.125], "rest": [0.0]}
     assert profile_rows(profiler, limit=2) == [
@@ -40,7 +38,7 @@ def test_the_simple_profiler_lists_what_took_longest(tmp_path: Path) -> None:
     assert "step" in report.read_text()
 
 
-def test_the_operators_of_training_and_validation(tmp_path: Path) -> None:
+def test_the_operators_of_training_and_validation(tmp_path):
     profiler = Operators(tmp_path / "profile")
     assert profile_rows(profiler) == []
     activities = [torch.profiler.ProfilerActivity.CPU]

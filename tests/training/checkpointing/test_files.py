@@ -3,7 +3,6 @@ from __future__ import annotations
 import errno
 import os
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,9 +18,7 @@ class Unwritable:
 
 
 @pytest.mark.parametrize("when", ["while writing", "at the rename"])
-def test_a_failing_write_keeps_the_old_file(
-    when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_write_keeps_the_old_file(when, tmp_path, monkeypatch):
     path = tmp_path / "deep" / "last.ckpt"
     io = AtomicCheckpointIO()
     io.save_checkpoint({"epoch": 1}, path)
@@ -41,7 +38,7 @@ def test_a_failing_write_keeps_the_old_file(
 
 
 @pytest.mark.parametrize("weights_only", [None, False, True])
-def test_loading_runs_no_code_whoever_asks(weights_only: bool | None, tmp_path: Path) -> None:
+def test_loading_runs_no_code_whoever_asks(weights_only, tmp_path):
     path, trace = tmp_path / "hostile.ckpt", tmp_path / "trace"
 
     class Hostile:
@@ -58,9 +55,7 @@ def full_disk(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_what_cannot_be_written_is_written_later_in_order(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_written_is_written_later_in_order(tmp_path, caplog):
     refuse = [True]
     io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
     weights = torch.zeros(2)
@@ -82,9 +77,7 @@ def test_what_cannot_be_written_is_written_later_in_order(
     assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
 
 
-def test_nothing_outside_of_the_run_is_removed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nothing_outside_of_the_run_is_removed(tmp_path, caplog):
     run, other = tmp_path / "run", tmp_path / "other.ckpt"
     io = AtomicCheckpointIO(folder=run)
     io.save_checkpoint({"step": 1}, run / "checkpoints" / "old.ckpt")
@@ -99,7 +92,7 @@ def test_nothing_outside_of_the_run_is_removed(
     assert list((run / "checkpoints").iterdir()) == []
 
 
-def test_a_moved_run_finds_its_own_files(tmp_path: Path) -> None:
+def test_a_moved_run_finds_its_own_files(tmp_path):
     old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
     best = {
         "dirpath": str(old), "monitor": "val/x", "best_model_path": str(old / "best.ckpt"),
@@ -122,7 +115,7 @@ def test_a_moved_run_finds_its_own_files(tmp_path: Path) -> None:
     )
 
 
-def test_the_previous_file_is_kept(tmp_path: Path) -> None:
+def test_the_previous_file_is_kept(tmp_path):
     io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
     for step in range(3):
         io.save_checkpoint({"step": step}, tmp_path / "last.ckpt", storage_options=options)
@@ -130,7 +123,7 @@ def test_the_previous_file_is_kept(tmp_path: Path) -> None:
     assert io.load_checkpoint(tmp_path / "previous.ckpt") == {"step": 1}
 
 
-def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path: Path) -> None:
+def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path):
     with subprocess.Popen(["true"]) as process:
         process.wait()
     (tmp_path / "checkpoints").mkdir()

@@ -6,7 +6,7 @@ import csv
 import logging
 import random
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ class Runs:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quiet() -> Iterator[None]:
+def quiet():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("lightning.pytorch", "lightning.fabric"):
             patch.setattr(logging.getLogger(name), "level", logging.WARNING)
@@ -108,7 +108,7 @@ def quiet() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def runs(make_system: SystemMaker, make_noise: Callable[[], PoseDataModule]) -> Runs:
+def runs(make_system, make_noise):
     return Runs(make_system, make_noise)
 
 
@@ -129,7 +129,7 @@ def assert_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) ->
 
 
 @pytest.fixture(scope="module")
-def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PoseSystem, int]:
+def whole(runs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     cut = Cut(None)
     return folder, runs(folder, cut), cut.calls
@@ -143,9 +143,7 @@ def assert_ends_as(folder: Path, system: PoseSystem, cut: Path, again: PoseSyste
 
 
 @pytest.mark.parametrize("every", [17, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(
-    every: int, runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
-) -> None:
+def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(every, runs, whole, tmp_path):
     folder, system, num_calls = whole
     for at in range(1, num_calls + 1, every):
         cut = tmp_path / str(at)
@@ -154,9 +152,7 @@ def test_a_run_cut_at_any_hook_ends_as_if_it_had_not_been(
         assert_ends_as(folder, system, cut, runs(cut, Cut(None)))
 
 
-def test_a_run_cut_again_and_again(
-    runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
-) -> None:
+def test_a_run_cut_again_and_again(runs, whole, tmp_path):
     folder, system, _ = whole
     for _ in range(40):
         try:  # every life gets a few hooks further
@@ -167,7 +163,7 @@ def test_a_run_cut_again_and_again(
     assert_ends_as(folder, system, tmp_path, again)
 
 
-def test_the_clock_and_the_share_of_time_decide(runs: Runs, tmp_path: Path) -> None:
+def test_the_clock_and_the_share_of_time_decide(runs, tmp_path):
     patient, thrifty = LastCheckpoint(every_s=3600), LastCheckpoint(every_s=0, max_share=1e-6)
     for name, last in (("patient", patient), ("thrifty", thrifty)):
         with pytest.raises(CutError):
@@ -177,7 +173,7 @@ def test_the_clock_and_the_share_of_time_decide(runs: Runs, tmp_path: Path) -> N
     assert saved["global_step"] == 1  # its duration is known from then on
 
 
-def test_accumulated_gradients_are_not_cut_in_two(runs: Runs, tmp_path: Path) -> None:
+def test_accumulated_gradients_are_not_cut_in_two(runs, tmp_path):
     whole = runs(tmp_path / "whole", Cut(None), accumulate_grad_batches=2)
     for at in (6, 9):
         with pytest.raises(CutError):
@@ -190,7 +186,7 @@ def validations(folder: Path) -> list[str]:
     return [row["epoch"] for row in rows(folder) if row["val/loss"]]
 
 
-def test_patience_outlives_a_cut(runs: Runs, tmp_path: Path) -> None:
+def test_patience_outlives_a_cut(runs, tmp_path):
     def run(name: str, cut: int | None, patience: int = 1) -> PoseSystem:
         # Nothing counts as an improvement: with a patience of 1 the second validation is the last.
         stop = EarlyStop("val/loss", min_delta=1e9, patience=patience)
@@ -240,16 +236,14 @@ def assert_average(folder: Path, states: Sequence[dict[str, torch.Tensor]]) -> N
 
 
 @pytest.fixture(scope="module")
-def averaged(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PoseSystem]:
+def averaged(runs, tmp_path_factory):
     folder, recorder = tmp_path_factory.mktemp("averaged"), Recorder()
     system = runs(folder, Cut(None), more=[AveragedWeights(0.3), recorder])
     assert_average(folder, recorder.states)
     return folder, system
 
 
-def test_the_trained_weights_stand_beside_the_average(
-    averaged: tuple[Path, PoseSystem], whole: tuple[Path, PoseSystem, int]
-) -> None:
+def test_the_trained_weights_stand_beside_the_average(averaged, whole):
     average, trained = (last_state(averaged[0], name) for name in ("state_dict", TRAINED))
     assert_same(trained, averaged[1].state_dict())  # training has gone on with them, to its end
     assert_same(trained, whole[1].state_dict())  # as it does without an average
@@ -257,13 +251,7 @@ def test_the_trained_weights_stand_beside_the_average(
 
 
 @pytest.mark.parametrize("at", [9, 16, 36])  # between two steps, in both validations
-def test_an_average_outlives_a_cut_and_may_end_with_it(
-    at: int,
-    averaged: tuple[Path, PoseSystem],
-    runs: Runs,
-    whole: tuple[Path, PoseSystem, int],
-    tmp_path: Path,
-) -> None:
+def test_an_average_outlives_a_cut_and_may_end_with_it(at, averaged, runs, whole, tmp_path):
     with pytest.raises(CutError):
         runs(tmp_path / "cut", Cut(at), more=[AveragedWeights(0.3)])
     shutil.copytree(tmp_path / "cut", tmp_path / "copy")
@@ -274,9 +262,7 @@ def test_an_average_outlives_a_cut_and_may_end_with_it(
     assert_same(without.state_dict(), whole[1].state_dict())
 
 
-def test_an_average_may_begin_with_a_resume(
-    runs: Runs, whole: tuple[Path, PoseSystem, int], tmp_path: Path
-) -> None:
+def test_an_average_may_begin_with_a_resume(runs, whole, tmp_path):
     with pytest.raises(CutError):
         runs(tmp_path, Cut(9))
     begun, recorder = last_state(tmp_path, "state_dict"), Recorder()
@@ -287,12 +273,12 @@ def test_an_average_may_begin_with_a_resume(
 
 
 @pytest.mark.parametrize("decay", [1, -0.1, True, "much"])
-def test_a_decay_out_of_its_range(decay: object) -> None:
+def test_a_decay_out_of_its_range(decay):
     with pytest.raises(UserError, match="ema="):
-        AveragedWeights(decay)  # type: ignore[arg-type]
+        AveragedWeights(decay)
 
 
 @pytest.mark.parametrize("options", [{"every_s": -1.0}, {"max_share": 0.0}, {"max_share": 1.5}])
-def test_arguments_out_of_range(options: dict[str, float]) -> None:
+def test_arguments_out_of_range(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}="):
         LastCheckpoint(**options)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import random
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,7 +9,7 @@ from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.checkpointing.resume_point import capture, restore
 
 
-def test_random_states_come_back_through_a_file(tmp_path: Path) -> None:
+def test_random_states_come_back_through_a_file(tmp_path):
     def draw() -> list[float]:
         return [random.gauss(0, 1), np.random.randn(), float(torch.randn(()))]  # noqa: NPY002
 
