@@ -1,20 +1,13 @@
 """A user's mistake ends in one line on stderr with got, allowed and fix, and exit code 2."""
 
-from __future__ import annotations
-
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 import torch
 import trimesh
-
-from dopepp import PoseEstimator
-from dopepp.core.errors import UserError
 
 
 @pytest.fixture
@@ -47,14 +40,8 @@ def train(call, tiny, tmp_path):
         (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),
         (["trainer.precision=17"], "which Lightning refuses"),
         (["trainer.accelerator=abacus"], "which Lightning refuses"),
-        (["seed=lucky"], "seed='lucky'; allowed: an integer"),
-        (["recovery.max_peaks=all"], "recovery.max_peaks='all'; allowed: a number"),
-        (["maps.sigma=0"], "maps.sigma=0; allowed: a number from 0.1"),
         (["model.width=thin"], "width='thin'; allowed: a number"),
         (["model.backbone._target_=os.system"], "backbone _target_ 'os.system'"),
-        (["data=ycb_video", "virtual.preset=null"], "data=ycb_video without data.root"),
-        (["data=hybrid", "data.root=/nowhere"], "data.root=/nowhere, which is no folder"),
-        (["data.parts=[gearwheel]"], "unknown part 'gearwheel'; allowed: servoholder, pivc"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )  # fmt: skip
@@ -62,33 +49,17 @@ def test_a_mistake_in_the_overrides(overrides, expected, train):
     assert expected in train(*overrides)
 
 
-def test_roots_that_are_no_ycb_video(train, ycb_root, tmp_path):
-    root = tmp_path / "not ycb"
-    root.mkdir()
-    override = f"data.root='{root}'"
-    assert f"data.root={root}, which has no data/" in train("data=hybrid", override)
-    (root / "data").mkdir()
-    assert "has no image_sets/classes.txt" in train("data=hybrid", override)
+def test_an_object_that_the_data_do_not_have(train, ycb_root):
     line = train("data=hybrid", f"data.root={ycb_root}", "data.objects=[003_cracker]")
     assert "data.objects with '003_cracker'; allowed: 002_master_chef_can, 003_cracker_box" in line
 
 
-def test_meshes_that_cannot_be_parts(train, tmp_path):
+def test_a_mesh_in_another_unit(train, tmp_path):
     path = tmp_path / "plate.stl"
     trimesh.creation.box((100.0, 60.0, 5.0)).export(path)  # millimetres
     line = train(f"data.parts=['{path}']", "data.unit=m")
     assert "diameter" in line
     assert "unit" in line
-    empty = tmp_path / "empty.stl"
-    empty.write_bytes(b"")
-    assert str(empty) in train(f"data.parts=['{empty}']")
-    assert "no such file" in train(f"data.parts=['{tmp_path / 'absent.stl'}']")
-    assert "unit='feet'" in train(f"data.parts=['{path}']", "data.unit=feet")
-
-
-def damage_meta(root: Path) -> None:
-    path = root / "data" / "0050" / "000003-meta.mat"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def damage_image(root: Path) -> None:
@@ -100,13 +71,11 @@ def damage_image(root: Path) -> None:
 def shrink_label(root: Path) -> None:
     path = root / "data" / "0050" / "000003-label.png"
     label = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert label is not None
     cv2.imwrite(str(path), label[::2, ::2])
 
 
 @pytest.mark.parametrize(
-    ("damage", "expected"),
-    [(damage_meta, "000003-meta.mat"), (damage_image, "000003-color.png"), (shrink_label, "320")],
+    ("damage", "expected"), [(damage_image, "000003-color.png"), (shrink_label, "320")]
 )
 def test_a_damaged_frame(damage, expected, frame_root, call, tmp_path):
     damage(frame_root)
@@ -121,9 +90,7 @@ def test_a_damaged_frame(damage, expected, frame_root, call, tmp_path):
     assert not list(output_dir.glob("*/*/*.json"))
 
 
-def test_a_frame_that_breaks_during_training_ends_it_in_one_line(
-    frame_root, ycb_root, call, tmp_path
-):
+def test_a_frame_that_breaks_in_training_ends_it(frame_root, ycb_root, call, tmp_path):
     """The training data are read by worker processes; their mistake reaches the user as it is."""
     for name in ("color.png", "label.png", "meta.mat", "depth.png"):
         folder = frame_root / "data" / "0000"
@@ -142,18 +109,9 @@ def test_a_frame_that_breaks_during_training_ends_it_in_one_line(
     assert not list(tmp_path.glob("outputs/**/metrics.json"))
 
 
-def write_text(path: Path, good: Path) -> None:
-    path.write_text("this is no checkpoint\n")
-
-
 def truncate(path: Path, good: Path) -> None:
     content = good.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-
-
-def other_zip(path: Path, good: Path) -> None:
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("data.pkl", b"nothing")
 
 
 def foreign(path: Path, good: Path) -> None:
@@ -181,9 +139,7 @@ def absent(path: Path, good: Path) -> None:
 @pytest.mark.parametrize(
     ("write", "place", "expected"),
     [
-        (write_text, "ckpt_path", "which is not a torch file or was cut short"),
         (truncate, "baseline", "which is not a torch file or was cut short"),
-        (other_zip, "init_from", "which torch refuses to load"),
         (foreign, "ckpt_path", "without 'dopepp' entry"),
         (hostile_spec, "baseline", "backbone _target_ 'os.system'"),
         (hostile_spec, "init_from", "backbone _target_ 'os.system'"),
@@ -208,20 +164,6 @@ def test_a_file_that_is_no_checkpoint(write, place, expected, trained, call, tra
     assert expected in line
     assert str(bad) in line
     assert not (tmp_path / "trace").exists()
-
-
-def test_evaluation_asks_for_its_checkpoint(call, tmp_path):
-    done = call("evaluate.py", f"output_dir={tmp_path}")
-    assert done.line.startswith("got no ckpt_path; allowed: ckpt_path=")
-
-
-def test_a_k_that_cannot_belong_to_the_image(trained):
-    estimator = PoseEstimator.load(trained[0] / "checkpoints" / "best.ckpt")
-    image = np.zeros((120, 160, 3), np.uint8)
-    K = np.array([[1066.8, 0, 313.0], [0, 1067.5, 241.3], [0, 0, 1.0]])  # of 640×480
-    with pytest.raises(UserError, match=r"K .*160") as error:
-        estimator.predict(image, K)
-    assert "\n" not in str(error.value)
 
 
 def test_the_shell_sees_one_line_and_code_two(command, tmp_path):

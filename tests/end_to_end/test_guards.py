@@ -1,7 +1,5 @@
 """Runs that go on changed, break, or are measured on images that have changed."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
@@ -62,7 +60,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
     again = ("trainer.max_epochs=4", "callbacks.finite.max_in_a_row=3")
     done = call("train.py", f"resume={run}", *again)
     assert done.code == 1
-    line = done.err.rstrip("\n").rpartition("\n")[2]
+    line = done.last_line
     assert "not finite in step 4 (3 steps in a row)" in line
     assert str(run / "nonfinite") in line
     assert line.endswith(f"resume={run}")
@@ -80,9 +78,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
 
 
 @pytest.mark.slow
-def test_an_evaluation_says_when_the_images_are_no_longer_those(
-    run, call, tmp_path, monkeypatch, caplog
-):
+def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypatch, caplog):
     def warnings(*overrides: str) -> list[str]:
         caplog.clear()
         done = call("evaluate.py", *measured, *overrides)

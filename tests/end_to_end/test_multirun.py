@@ -1,15 +1,9 @@
-from __future__ import annotations
-
-import csv
 import json
 from pathlib import Path
 
 import pytest
 
-
-def table(sweep: Path) -> list[dict[str, str]]:
-    with (sweep / "compare.csv").open(newline="") as stream:
-        return list(csv.DictReader(stream))
+from dopepp.experiment.reports.tables import read_csv
 
 
 def only_sweep(output_dir: Path) -> Path:
@@ -23,7 +17,7 @@ def test_a_failing_job_is_a_row_and_the_others_run(call, tiny, tmp_path):
     done = call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}")
     assert done.code == 1
     sweep = only_sweep(tmp_path)
-    rows = table(sweep)
+    rows = read_csv(sweep / "compare.csv")
     assert [row["method"] for row in rows[:3]] == [
         "dopepp optimizer.lr=-1 seed=1", "dopepp optimizer.lr=-1 seed=2",
         "dopepp optimizer.lr=0.001",
@@ -45,22 +39,17 @@ def test_a_failing_job_is_a_row_and_the_others_run(call, tiny, tmp_path):
     assert not (sweep / "0" / "metrics.json").exists()
 
 
-def test_a_program_error_is_a_row_too(call, tiny, tmp_path, ycb_root):
+def test_a_program_error_is_a_row_and_several_devices_are_refused(call, tiny, tmp_path):
     """What no check foresaw: here, a training that Lightning cannot begin."""
-    broken = "trainer.gradient_clip_val=wrong"
-    done = call("train.py", "-m", *tiny, broken, f"output_dir={tmp_path}")
-    assert done.code == 1
-    (row,) = table(only_sweep(tmp_path))
-    assert row["object"].startswith("failed: ")
-    assert "\n" not in row["object"]
-
-
-def test_several_devices_are_refused_with_the_reason(call, tiny, tmp_path):
-    done = call("train.py", "-m", *tiny, "trainer.devices=2", f"output_dir={tmp_path}")
-    assert done.code == 1
-    (row,) = table(only_sweep(tmp_path))
-    assert "trainer.devices=2 in a multirun" in row["object"]
-    assert "one process per job" in row["object"]
+    jobs = ("trainer.gradient_clip_val=wrong", "trainer.devices=1,2")
+    assert call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}").code == 1
+    program_error, refused = (
+        row["object"] for row in read_csv(only_sweep(tmp_path) / "compare.csv")
+    )
+    assert program_error.startswith("failed: ")
+    assert "\n" not in program_error
+    assert "trainer.devices=2 in a multirun" in refused
+    assert "one process per job" in refused
 
 
 def test_a_choice_that_does_not_exist_stops_the_sweep_before_it_begins(call, tiny, tmp_path):

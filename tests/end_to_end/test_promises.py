@@ -1,7 +1,5 @@
 """What the README promises of whole runs; minutes each, so only ``pytest -m slow`` runs them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

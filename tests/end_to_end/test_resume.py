@@ -1,8 +1,8 @@
-from __future__ import annotations
-
-import csv
 import json
+import os
 import signal
+import subprocess
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 import torch
 
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.experiment.runs.resume import read_overrides
 from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.system import PoseSystem
 
 
 def rows(run: Path) -> list[dict[str, str]]:
-    with (run / "metrics.csv").open(newline="") as stream:
-        return list(csv.DictReader(stream))
+    return read_csv(run / "metrics.csv")
 
 
 def steps(run: Path) -> list[int]:
@@ -25,8 +25,7 @@ def steps(run: Path) -> list[int]:
 
 
 def last(run: Path) -> dict[str, Any]:
-    content: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    return content
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
 
 
 def test_resume_goes_on_in_the_same_folder(run, call, find_run):
@@ -50,9 +49,7 @@ def test_resume_goes_on_in_the_same_folder(run, call, find_run):
     assert read_overrides(run) == options  # none is added to at every resume
 
 
-def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
-    call, find_run, tiny, tmp_path, monkeypatch
-):
+def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, monkeypatch):
     overrides = [*tiny, "trainer.max_epochs=2"]
     assert call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}").code == 0
     # The last epoch's, though nothing has become better since the first one's.
@@ -72,8 +69,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_happened(
     run = find_run(tmp_path / "cut")
     # After the first epoch there was a new best one, and a checkpoint to go on from.
     saved = "saved up to step 2 in checkpoints/last.ckpt"
-    line = done.err.rstrip("\n").rpartition("\n")[2]
-    assert line == f"interrupted; {saved}; go on with resume={run}"
+    assert done.last_line == f"interrupted; {saved}; go on with resume={run}"
     assert not (run / "metrics.json").exists()
 
     done = call("train.py", f"resume={run}")
@@ -150,9 +146,7 @@ def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
     folder = run / "checkpoints"
     (folder / "previous.ckpt").write_bytes((folder / "last.ckpt").read_bytes())
     damage(folder / "last.ckpt", how)
-    found = newest_checkpoint(run)
-    assert found is not None
-    assert found[0] == folder / "previous.ckpt"
+    assert newest_checkpoint(run)[0] == folder / "previous.ckpt"
     damage(folder / "previous.ckpt", how)
     done = call("train.py", f"resume={run}", "trainer.max_epochs=2")  # from best.ckpt
     assert done.code == 0, done.err
@@ -193,3 +187,40 @@ def test_hydras_note_of_the_options_is_believed_as_a_whole_or_not_at_all(run):
     note = run / ".hydra" / "overrides.yaml"
     note.write_text("".join(note.read_text().splitlines(keepends=True)[:3]))
     assert read_overrides(run) is None
+
+
+@pytest.mark.slow
+@pytest.mark.ddp
+@pytest.mark.timeout(900)
+def test_two_killed_processes_end_as_whole_ones(start, command, tiny, tmp_path):
+    per_epoch = 16
+    arguments = [
+        *tiny, "trainer=ddp", "trainer.accelerator=cpu", "trainer.max_epochs=3",
+        f"data.samples_per_epoch={2 * 4 * per_epoch}", "data/masking=random",
+        "callbacks.last.every_s=0.2", "callbacks.last.max_share=1",
+    ]  # fmt: skip
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    done = command("train.py", *arguments, f"hydra.run.dir={whole}", timeout=600)
+    assert done.code == 0, done.err[-4000:]
+    # Both together make one run and one report: of the config's tree, of the images, of the folder.
+    for text in ("num_test: 3", "3 test images", "run folder"):
+        assert done.out.count(text) == 1, text
+    assert json.loads((whole / "metrics.json").read_text())["num_images"] == 3
+    # The leader of a session, so that all its processes can be killed.
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = start(
+        "train.py", *arguments, f"hydra.run.dir={killed}", start_new_session=True, **quiet
+    )
+    deadline = time.monotonic() + 300
+    while not (found := steps(killed)) or found[-1] % per_epoch < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert last(killed)["global_step"] % per_epoch, "a checkpoint in the middle of an epoch"
+    done = command("train.py", f"resume={killed}", timeout=600)
+    assert done.code == 0, done.err[-4000:]
+    assert steps(killed) == steps(whole) == list(range(3 * per_epoch))
+    one, other = (last(run)["state_dict"] for run in (killed, whole))
+    assert all(torch.equal(one[name], value) for name, value in other.items())

@@ -1,13 +1,12 @@
 """A search with real trainings: killed, started again, pruned, compared."""
 
-from __future__ import annotations
-
-import csv
 import json
 import time
 from typing import Any
 
 import pytest
+
+from dopepp.experiment.reports.tables import read_csv
 
 SPACE = "optimizer.lr=tag(log, interval(1e-6, 1e-2))"
 SEARCH = (
@@ -48,11 +47,10 @@ def test_a_killed_search_goes_on_and_prunes(start, call, tiny, tmp_path):
         else:
             assert trial.value == min(trial.intermediate_values.values())
             assert json.loads((job / "metrics.json").read_text())["objective"] == trial.value
-    with (sweep / "compare.csv").open(newline="") as stream:
-        rows = [row["object"] for row in csv.DictReader(stream)]
+    rows = [row["object"] for row in read_csv(sweep / "compare.csv")]
     assert sum(text.startswith("pruned: after epoch") for text in rows) == states.count("PRUNED")
     assert not any(text.startswith("failed") for text in rows)
     # The killed trial went on from its checkpoint: each step stands once in its table.
-    with (sweep / "0" / "metrics.csv").open(newline="") as stream:
-        steps = [row["step"] for row in csv.DictReader(stream) if row.get("val/loss")]
+    table = read_csv(sweep / "0" / "metrics.csv")
+    steps = [row["step"] for row in table if row.get("val/loss")]
     assert len(steps) == len(set(steps))

@@ -1,8 +1,5 @@
 """Signals, full disks and folders that cannot be written, in runs inside this process."""
 
-from __future__ import annotations
-
-import csv
 import logging
 import os
 import signal
@@ -14,21 +11,16 @@ from typing import Any
 import pytest
 import torch
 
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.training.system import PoseSystem
 
 
 def last_step(run: Path) -> int:
-    content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    return int(content["global_step"])
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]
 
 
 def steps(run: Path) -> list[str]:
-    with (run / "metrics.csv").open(newline="") as stream:
-        return [row["step"] for row in csv.DictReader(stream)]
-
-
-def last_line(done: Any) -> str:
-    return str(done.err.rstrip("\n").rpartition("\n")[2])
+    return [row["step"] for row in read_csv(run / "metrics.csv")]
 
 
 def at_step(patch: pytest.MonkeyPatch, step: int, act: Callable[[], object]) -> None:
@@ -56,16 +48,14 @@ def send(*numbers: int) -> Callable[[], None]:
     [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
     ids=["SIGINT", "SIGTERM"],
 )
-def test_a_signal_saves_the_step_and_names_the_checkpoint(
-    number, code, call, find_run, tiny, tmp_path
-):
+def test_a_signal_saves_the_step(number, code, call, find_run, tiny, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         at_step(patch, 0, send(number))
         done = call("train.py", *tiny, f"output_dir={tmp_path}")
     assert done.code == code, done.err
     run = find_run(tmp_path)
-    assert "step 1" in last_line(done)
-    assert last_line(done).endswith(f"resume={run}")
+    assert "step 1" in done.last_line
+    assert done.last_line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
     assert last_step(run) == 1
     assert call("train.py", f"resume={run}").code == 0
@@ -90,15 +80,13 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(call, find_run, 
         done = call("train.py", *tiny, *each, f"output_dir={tmp_path}")
     assert done.code == 130, done.err
     run = find_run(tmp_path)
-    assert "saved up to step 1" in last_line(done)
+    assert "saved up to step 1" in done.last_line
     assert last_step(run) == 1
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["last.ckpt"]
 
 
 @pytest.mark.slow
-def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
-    call, find_run, tiny, tmp_path, caplog
-):
+def test_a_job_that_slurm_requeues_goes_on_in_its_folder(call, find_run, tiny, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     scontrol = tmp_path / "bin" / "scontrol"
     scontrol.parent.mkdir()
@@ -112,7 +100,7 @@ def test_under_slurm_the_job_is_requeued_and_goes_on_in_its_folder(
             at_step(once, 0, send(signal.SIGTERM, signal.SIGTERM))
             done = call(*command)
         assert done.code == 143, done.err
-        assert last_line(done).endswith("; SLURM requeues job 77")
+        assert done.last_line.endswith("; SLURM requeues job 77")
         assert (tmp_path / "asked").read_text() == "requeue 77\n"
         patch.setenv("SLURM_RESTART_COUNT", "1")
         done = call(*command)
@@ -135,8 +123,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(call, tiny, tmp_path):
         done = call("train.py", "-m", *tiny, "seed=1,2,3", f"output_dir={tmp_path}")
     assert done.code == 143, done.err
     (sweep,) = (tmp_path / "compare").iterdir()
-    with (sweep / "compare.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_csv(sweep / "compare.csv")
     assert rows[0]["instances"] == "3"
     assert rows[1]["object"].startswith("failed: unfinished")
     assert not (sweep / "2").exists()
@@ -180,17 +167,15 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(small_disk, call, find_ru
 
 
 @pytest.mark.slow
-def test_a_disk_that_stays_full_fails_the_run_and_keeps_the_last_good_checkpoint(
-    small_disk, call, find_run, tiny
-):
+def test_a_disk_that_stays_full_fails_the_run(small_disk, call, find_run, tiny):
     with pytest.MonkeyPatch.context() as patch:
         at_step(patch, 2, lambda: fill(small_disk))
         done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
     assert done.code == 1, done.err
     run = find_run(small_disk)
-    assert last_line(done).startswith("cannot save ")
-    assert "No space left on device" in last_line(done)
-    assert last_line(done).endswith(f"resume={run}")
+    assert done.last_line.startswith("cannot save ")
+    assert "No space left on device" in done.last_line
+    assert done.last_line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
     assert last_step(run) == 2
     (small_disk / "filler").unlink()

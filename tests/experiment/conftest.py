@@ -1,9 +1,4 @@
-from __future__ import annotations
-
-import contextlib
-import io
-import runpy
-import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +9,6 @@ from omegaconf import OmegaConf
 from dopepp.experiment.config.run import RunConfig
 
 CONF = Path(__file__).parents[2] / "conf"
-TINY = (
-    "data=virtual",
-    "data.parts=[pivconnector]",
-    "virtual.preset=quickstart",
-    "data.input_size=[64,64]",
-    "data.samples_per_epoch=8",
-    "data.batch_size=4",
-    "data.num_val=2",
-    "data.num_test=3",
-    "data.num_workers=0",
-    "model.width=0.0625",
-    "trainer.max_epochs=1",
-)
 
 
 @pytest.fixture
@@ -34,11 +16,9 @@ def composed():
     """Compose ``conf/train.yaml`` (or another one) with overrides, as a plain dict."""
 
     def make(*overrides: str, config: str = "train") -> dict[str, Any]:
-        node = OmegaConf.to_container(
+        return OmegaConf.to_container(
             compose(config, list(overrides)), resolve=True, throw_on_missing=True
         )
-        assert isinstance(node, dict)
-        return {str(key): value for key, value in node.items()}
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield make
@@ -51,9 +31,9 @@ def parsed(composed):
 
 
 @pytest.fixture
-def tiny(parsed):
+def tiny(parsed, tiny_options):
     """The same with a network and data that take no time."""
-    return lambda *overrides: parsed(*TINY, *overrides)
+    return partial(parsed, *tiny_options)
 
 
 FAST_TRAINING = '''
@@ -121,24 +101,7 @@ def fast_training(tmp_path):
     return path
 
 
-Called = tuple[int, str, str]
-
-
 @pytest.fixture
-def call_fast(fast_training, tmp_path):
+def call_fast(in_process, fast_training, tmp_path):
     """Run it inside this process; returns exit code, output and error output."""
-
-    def call(*arguments: str) -> Called:
-        out, err, code = io.StringIO(), io.StringIO(), 0
-        places = [f"output_dir={tmp_path}", "~hydra.callbacks.compare"]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", [str(fast_training), *places, *arguments])
-            patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                try:
-                    runpy.run_path(str(fast_training), run_name="__main__")
-                except SystemExit as end:
-                    code = int(end.code or 0)
-        return code, out.getvalue(), err.getvalue()
-
-    return call
+    return partial(in_process, fast_training, f"output_dir={tmp_path}", "~hydra.callbacks.compare")

@@ -1,6 +1,3 @@
-from __future__ import annotations
-
-import csv
 import itertools
 from typing import Any
 
@@ -10,6 +7,7 @@ import torch
 
 from dopepp.core.errors import RunError
 from dopepp.experiment.lr_finder import find_learning_rate, smooth, suggest
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.models.losses import SpatialCrossEntropy
 
 RATES = np.geomspace(1e-6, 1, 200)
@@ -19,8 +17,7 @@ def losses(middle: float, noise: float = 0.0, seed: int = 0) -> np.ndarray:
     """Fall from 2 to 1 around a rate, within a factor of about ten, and diverge 100 times above."""
     x = np.log10(RATES / middle)
     valley = 1 + 1 / (1 + np.exp(4 * x)) + np.exp(np.minimum(6 * (x - 2), 50))
-    result: np.ndarray = valley + noise * np.random.default_rng(seed).normal(size=len(x))
-    return result
+    return valley + noise * np.random.default_rng(seed).normal(size=len(x))
 
 
 @pytest.mark.parametrize("middle", [1e-4, 1e-3])
@@ -28,7 +25,6 @@ def losses(middle: float, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 def test_the_rate_at_which_the_loss_falls_fastest(middle, noise):
     for seed in range(10):
         found = suggest(RATES, losses(middle, noise, seed))
-        assert found is not None
         assert middle / 4 < found.steepest < 4 * middle
         assert found.steepest < found.lowest < 300 * middle
 
@@ -59,8 +55,7 @@ def test_a_sweep_ends_where_the_loss_is_not_finite(tiny, tmp_path, monkeypatch):
     config = tiny("lr_finder.num_steps=20", "lr_finder.min_lr=1e-7", "lr_finder.max_lr=1e-5")
     find_learning_rate(config, tmp_path)
     assert next(number) == 15  # none was made after the first that is not
-    with (tmp_path / "lr_finder.csv").open(newline="") as stream:
-        rates = [float(row["learning_rate"]) for row in csv.DictReader(stream)]
+    rates = [float(row["learning_rate"]) for row in read_csv(tmp_path / "lr_finder.csv")]
     # Lightning's first step is at the lowest rate, and the n-th n / 20 of the way to the highest.
     expected = [1e-7, *(1e-7 * 100 ** (n / 20) for n in range(2, 15))]
     assert rates == pytest.approx(expected)

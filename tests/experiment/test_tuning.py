@@ -1,7 +1,5 @@
 """Weights and threshold from detections; the tuned checkpoint beside the old one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -26,11 +24,13 @@ from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.spec import build_network
 from dopepp.parts import load_part
-from dopepp.parts.part import Part
 from dopepp.recovery.calibration import FEATURES, score
 from dopepp.recovery.detection import Detection
 
 K = camera_matrix(300, 300, 64, 64)
+NOTHING = Scored(
+    np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
+)
 
 
 def scored(seed: int, count: int, right: bool = True) -> Scored:
@@ -66,35 +66,23 @@ def test_the_threshold_lets_no_more_pass_than_it_may():
 
 
 def test_silence_needs_no_threshold():
-    nothing = Scored(
-        np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
-    )
-    assert choose(scored(6, 300), nothing)["min_score"] < 1e-300
+    assert choose(scored(6, 300), NOTHING)["min_score"] < 1e-300
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"correct": np.zeros(50, bool)}, "all of them wrong"),
-        ({"correct": np.ones(50, bool)}, "all of them right"),
-    ],
-)
-def test_nothing_to_learn_from_is_said(change, message):
-    nothing = Scored(
-        np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 10, 0
-    )
-    with pytest.raises(UserError, match=message):
-        choose(replace(scored(7, 50), **change), nothing)
+@pytest.mark.parametrize(("correct", "what"), [(False, "wrong"), (True, "right")])
+def test_nothing_to_learn_from_is_said(correct, what):
+    with pytest.raises(UserError, match=f"all of them {what}"):
+        choose(replace(scored(7, 50), correct=np.full(50, correct)), NOTHING)
     with pytest.raises(UserError, match="no detection on any"):
-        choose(nothing, nothing)
+        choose(NOTHING, NOTHING)
 
 
 class Images:
     """Two images of one part: at a place, and nowhere."""
 
-    def __init__(self, part: Any, T: np.ndarray, visible_fraction: float = 1.0) -> None:
-        keypoints = project_keypoints(part.cuboid, T, K)
-        instance = Instance(part.name, T, keypoints, visible_fraction)
+    def __init__(self, T: np.ndarray, visible_fraction: float = 1.0) -> None:
+        keypoints = project_keypoints(PART.cuboid, T, K)
+        instance = Instance(PART.name, T, keypoints, visible_fraction)
         blank = np.zeros((128, 128, 3), np.uint8)
         self.samples = [Sample(blank, K, [instance]), Sample(blank, K)]
 
@@ -105,16 +93,17 @@ class Images:
         return self.samples[index]
 
 
+PART = load_part("pivconnector")
 POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
 
 
-def found(part: Part, T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
+def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
     """A detection at a pose, shifted by a share of the part's diameter."""
     moved = T.copy()
-    moved[0, 3] += shift * part.diameter
-    keypoints = project_keypoints(part.cuboid, moved, K)
+    moved[0, 3] += shift * PART.diameter
+    keypoints = project_keypoints(PART.cuboid, moved, K)
     return Detection(
-        part.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
+        PART.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
     )
 
 
@@ -123,21 +112,17 @@ def estimator(*detections: Detection) -> Any:
 
 
 def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
-    part, T = load_part("pivconnector"), POSE
-    detections = [found(part, T, 0.9, 0.05), found(part, T, 0.8, 0.05), found(part, T, 0.7, 0.2)]
-    result = score_images(estimator(*detections), [part], Images(part, T))
+    detections = [found(POSE, 0.9, 0.05), found(POSE, 0.8, 0.05), found(POSE, 0.7, 0.2)]
+    result = score_images(estimator(*detections), [PART], Images(POSE))
     # A duplicate is wrong, and so is everything on the image without the part.
     assert result.correct.tolist() == [True, False, False, False, False, False]
     assert (result.num_images, result.num_instances) == (2, 1)
-    far = estimator(found(part, T, 0.9, 0.2))
-    assert not score_images(far, [part], Images(part, T)).correct.any()
+    far = estimator(found(POSE, 0.9, 0.2))
+    assert not score_images(far, [PART], Images(POSE)).correct.any()
 
 
 def test_what_finds_a_hidden_instance_is_not_judged():
-    part = load_part("pivconnector")
-    result = score_images(
-        estimator(found(part, POSE, 0.9), found(part, POSE, 0.8)), [part], Images(part, POSE, 0.05)
-    )
+    result = score_images(estimator(found(POSE, 0.9), found(POSE, 0.8)), [PART], Images(POSE, 0.05))
     # One explains itself by the instance that is hardly visible; its duplicate is wrong, and so
     # are both on the image without the part.
     assert result.correct.tolist() == [False, False, False]
@@ -146,38 +131,26 @@ def test_what_finds_a_hidden_instance_is_not_judged():
 
 
 def test_poses_are_paired_with_the_instances_that_they_find():
-    part = load_part("pivconnector")
-    near, stray = found(part, POSE, 0.9, 0.05), found(part, POSE, 0.8, 3.0)
-    estimated, true = matched_poses(estimator(near, stray), [part], Images(part, POSE))
+    near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
+    estimated, true = matched_poses(estimator(near, stray), [PART], Images(POSE))
     assert np.array_equal(estimated, near.T_cam_obj[None])
     assert np.array_equal(true, POSE[None])
-    hidden = matched_poses(estimator(near), [part], Images(part, POSE, 0.05))
+    hidden = matched_poses(estimator(near), [PART], Images(POSE, 0.05))
     assert [poses.shape for poses in hidden] == [(0, 4, 4)] * 2
 
 
 def test_a_symmetric_part_is_right_at_any_of_its_poses():
-    part = load_part("pivconnector")
     flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-    mirrored = replace(part, points=np.vstack([part.points, part.points @ flip[:3, :3]]))
-    turned = estimator(found(part, POSE @ flip, 0.9))
-    assert not score_images(turned, [mirrored], Images(part, POSE)).correct.any()
+    mirrored = replace(PART, points=np.vstack([PART.points, PART.points @ flip[:3, :3]]))
+    turned = estimator(found(POSE @ flip, 0.9))
+    assert not score_images(turned, [mirrored], Images(POSE)).correct.any()
     symmetric = replace(mirrored, symmetries_discrete=flip[None])
-    assert score_images(turned, [symmetric], Images(part, POSE)).correct.tolist() == [True, False]
+    assert score_images(turned, [symmetric], Images(POSE)).correct.tolist() == [True, False]
 
 
-SPEC = {
-    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.125},
-    "attention": {"_target_": "dopepp.models.attention.CBAM"},
-    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.125},
-    "activation": "exp",
-    "num_objects": 1,
-}
-
-
-def test_the_tuned_checkpoint_stands_beside_the_old_one(tmp_path):
-    weights = build_network(SPEC).state_dict()
-    part = load_part("pivconnector")
-    old = Checkpoint(SPEC, weights, [part], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
+def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path):
+    weights = build_network(tiny_spec).state_dict()
+    old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
     path = write_tuned(
         old, tmp_path / "best.ckpt", {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
     )

@@ -27,14 +27,13 @@ def test_a_cpu_takes_bf16_only_where_it_computes_in_it(flags, expected, monkeypa
     assert "bf16" in reason
 
 
-@pytest.mark.parametrize(("fast", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_a_gpu_is_asked(fast, expected, monkeypatch):
+@pytest.mark.parametrize(
+    ("accelerator", "fast", "expected"),
+    [("cuda", True, "bf16-mixed"), ("cuda", False, "32-true"), ("mps", True, "32-true")],
+)
+def test_a_gpu_is_asked_and_others_are_not_guessed_at(accelerator, fast, expected, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: fast)
-    assert choose_precision("auto", "cuda")[0] == expected
-
-
-def test_other_accelerators_are_not_guessed_at():
-    assert choose_precision("auto", "mps")[0] == "32-true"
+    assert choose_precision("auto", accelerator)[0] == expected
 
 
 def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 
@@ -14,13 +12,12 @@ from dopepp.experiment.build.sources import (
     build_parts,
     build_test_source,
 )
-from dopepp.experiment.build.system import build_system
+from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
 from dopepp.experiment.evaluate import measure_and_record, parts_of
 from dopepp.experiment.runs.record import METRICS_FILE, read_json
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.row import shown_columns
-from dopepp.models.checkpoint.schema import load_network, write_atomic
 
 
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
@@ -51,20 +48,6 @@ def test_splits_share_no_image(tiny):
         for source in (module.train_source, module.val_source, module.test_source)
     ]
     assert len(set(images)) == 3
-
-
-@pytest.mark.slow
-def test_one_seed_decides_everything(tiny):
-    data = tiny().data
-    parts = build_parts(data)
-    a, b, other = (build_datamodule(data, parts, seed) for seed in (1, 1, 2))
-    assert a.fingerprint() == b.fingerprint() != other.fingerprint()
-    assert not np.array_equal(
-        a.train_source.sample(0, 0).image, other.train_source.sample(0, 0).image
-    )
-
-    np.testing.assert_array_equal(a.train_item(2, 3).image, b.train_item(2, 3).image)
-    assert (a.train_item(2, 3).image != other.train_item(2, 3).image).any()
 
 
 def test_every_seed_is_measured_on_the_same_images(tiny):
@@ -117,12 +100,7 @@ def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, y
     objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
     config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
     data = replace(config.data, frames=("0050/000003",))
-    system = build_system(config, build_parts(data), "")
-    path = tmp_path / "untrained.ckpt"
-    weights = {f"network.{name}": value for name, value in system.network.state_dict().items()}
-    write_atomic({"state_dict": weights, "dopepp": system.payload}, path)
-    estimator = PoseEstimator(*load_network(path))
-
+    estimator = PoseEstimator(*build_untrained(config, build_parts(data)))
     (report,) = measure_and_record(
         {"dopepp": estimator}, parts_of([estimator], data), data, tmp_path, num_pictures=1
     )
@@ -145,7 +123,6 @@ def test_a_users_mesh_with_its_unit(tiny, tmp_path):
     assert part.diameter == pytest.approx(np.sqrt(0.08**2 + 0.05**2 + 0.03**2))
     sample = build_test_source(data, [part]).sample(0, 0)
     assert sample.instances[0].label == "bracket"
-    assert sample.instances[0].mask is not None
     assert sample.instances[0].mask.any()
 
 

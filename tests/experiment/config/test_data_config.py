@@ -1,7 +1,5 @@
 """Which data an evaluation uses: the checkpoint's, another set, or some options changed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,7 +93,6 @@ def test_a_checkpoint_without_data_asks_for_them(override, message, evaluated):
 def test_the_data_of_released_checkpoints_are_read(path, evaluated):
     stored = trained_on(read(path).data)
     data = evaluated(stored)
-    assert stored is not None
     assert data.virtual.preset == stored["virtual"]["preset"]
     assert (data.num_test, data.is_rendered("test")) == (300, True)
 

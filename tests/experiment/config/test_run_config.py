@@ -1,7 +1,5 @@
 """Options are read once: what one may not be is refused in a line; former names still count."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 from pathlib import Path
@@ -23,50 +21,37 @@ from dopepp.experiment.runs.sweep import CompareJobs
 @pytest.mark.parametrize(
     ("override", "got"),
     [
-        ("+speed=1", "speed=1"),
+        *((option, option.lstrip("+")) for option in (
+            "+speed=1", "seed=-1", "seed=1.5", "compile=1", "ema=nan", "num_empty=0",
+            "num_empty=2.5", "false_positive_rate=1.5", "maps.sigma=0", "data.eval_seed=-1",
+            "data.parts=pivconnector", "data.batch_size=0", "data.num_val=0",
+            "data.num_workers=-1", "data.real_fraction=1.5", "data.input_size=64", "data.root=1",
+            "lr_finder.num_steps=9", "trainer.max_epochs=0", "+trainer.num_nodes=0",
+            "trainer.ddp_timeout_s=0",
+        )),
         ("+data.colour=red", "data.colour='red'"),
         ("+virtual.colour=red", "virtual.colour='red'"),
         ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
         ("~data.batch_size", "no data.batch_size"),
         ("~trainer", "no trainer.max_epochs"),
         ("job=mow", "job='mow'"),
-        ("seed=-1", "seed=-1"),
-        ("seed=1.5", "seed=1.5"),
         ("seed=true", "seed=True"),
-        ("compile=1", "compile=1"),
         ("tune=maybe", "tune='maybe'"),
         ("ema=slow", "ema='slow'"),
-        ("ema=nan", "ema=nan"),
         ("resume=[a]", "resume=['a']"),
-        ("num_empty=0", "num_empty=0"),
-        ("num_empty=2.5", "num_empty=2.5"),
-        ("false_positive_rate=1.5", "false_positive_rate=1.5"),
-        ("maps.sigma=0", "maps.sigma=0"),
         ("recovery.max_peaks=all", "recovery.max_peaks='all'"),
-        ("data.eval_seed=-1", "data.eval_seed=-1"),
-        ("data.parts=pivconnector", "data.parts=pivconnector"),
         ("data.parts=[1]", "data.parts[0]=1"),
-        ("data.batch_size=0", "data.batch_size=0"),
         ("data.batch_size=many", "data.batch_size='many'"),
-        ("data.num_val=0", "data.num_val=0"),
-        ("data.num_workers=-1", "data.num_workers=-1"),
-        ("data.real_fraction=1.5", "data.real_fraction=1.5"),
         ("data.input_size=[100,64]", "data.input_size=[100, 64]"),
-        ("data.input_size=64", "data.input_size=64"),
         ("data.cache=tape", "data.cache='tape'"),
-        ("data.root=1", "data.root=1"),
         ("data.test.cache=tape", "data.test.cache='tape'"),
         ("data.masking=none", "data.masking='none'"),
         ("data.image_sets={train: 1}", "data.image_sets.train=1"),
         ("model.backbone=vgg", "model.backbone='vgg'"),
-        ("lr_finder.num_steps=9", "lr_finder.num_steps=9"),
         ("lr_finder.max_lr=1e-7", "lr_finder.max_lr=1e-07"),
-        ("trainer.max_epochs=0", "trainer.max_epochs=0"),
-        ("+trainer.num_nodes=0", "trainer.num_nodes=0"),
-        ("trainer.ddp_timeout_s=0", "trainer.ddp_timeout_s=0"),
         ("trainer.profiler=slow", "trainer.profiler='slow'"),
     ],
-)
+)  # fmt: skip
 def test_a_mistake_is_told_by_its_options_name(override, got, composed):
     with pytest.raises(UserError) as error:
         RunConfig.of(composed(override))

@@ -1,7 +1,5 @@
 """Multiruns in other processes: the same rows, whichever launcher runs the jobs."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -20,14 +18,13 @@ from dopepp.experiment.runs import record
 ROOT = Path(__file__).parents[3]
 RATES = ("1e-4", "1e-3", "1e-2")
 SWEPT = f"optimizer.lr={','.join(RATES)}"
-Called = tuple[int, str, str]
 
 
 @pytest.fixture
 def sweep(fast_training, tmp_path):
     """Run a multirun of jobs that take no time as a process; END_<job>=how ends one early."""
 
-    def run(*arguments: str, **ends: str) -> Called:
+    def run(*arguments: str, **ends: str) -> tuple[int, str, str]:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **ends}
         places = ["~hydra.callbacks.compare", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
         done = subprocess.run(

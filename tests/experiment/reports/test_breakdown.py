@@ -1,7 +1,5 @@
 """Rates per bin: quantities in closed form, bins and rates by brute force."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace

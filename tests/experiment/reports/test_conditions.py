@@ -1,7 +1,5 @@
 """Shading and scale with methods whose answers are known, and untrained networks end to end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
-from dopepp.experiment.build.system import build_system
+from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.evaluate import measure_and_record
 from dopepp.experiment.reports.conditions import (
     SCALE,
@@ -30,7 +28,6 @@ from dopepp.experiment.reports.report import measure
 from dopepp.experiment.reports.tables import ADD_01D, ADD_5CM, read_csv
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint.schema import load_network, write_atomic
 from dopepp.parts.part import Part
 
 RATES = (ADD_5CM, ADD_01D)
@@ -204,10 +201,7 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
 def test_untrained_networks_end_to_end(tiny, tmp_path):
     config = tiny("data.num_test=2")
     data, parts = config.data, build_parts(config.data)
-    system = build_system(config, parts, "")
-    weights = {f"network.{name}": value for name, value in system.network.state_dict().items()}
-    write_atomic({"state_dict": weights, "dopepp": system.payload}, tmp_path / "untrained.ckpt")
-    estimator = PoseEstimator(*load_network(tmp_path / "untrained.ckpt"))
+    estimator = PoseEstimator(*build_untrained(config, parts))
     both, protocols = {"dope": estimator, "dopepp": estimator}, Protocols(scales=(0.5,))
     reports = measure_and_record(both, parts, data, tmp_path, num_pictures=2, protocols=protocols)
     rows = read_csv(tmp_path / "scale.csv")

@@ -1,7 +1,5 @@
 """Another method's poses through the tables of an evaluation, and out of one again."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -95,9 +93,7 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
         assert next(csv.reader(stream))[1:] == ["servoholder", "pivconnector"]
 
 
-def test_what_a_file_brings_beside_the_test_set_is_left_out_and_said(
-    root, composed, tmp_path, caplog
-):
+def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog):
     poses = results(root)
     elsewhere = PoseResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
     path = tmp_path / "results.csv"

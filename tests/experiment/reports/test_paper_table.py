@@ -1,7 +1,5 @@
 """Sweeps in the paper's layout, with the paper's figures beside them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +30,9 @@ LABELS = {"model=dope": "DOPE", "model=dopepp": "DOPE++"}
 
 
 def job(
-    folder: Path,
-    overrides: list[str],
-    errors: list[float] | None,
-    part: str = "part",
+    folder: Path, overrides: list[str], errors: list[float] | None, part: str = "part",
     **config: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Write what a job of a sweep leaves; without errors, a failure."""
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))

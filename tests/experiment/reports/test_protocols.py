@@ -1,7 +1,5 @@
 """The options of an evaluation's protocols: read, put in order, and refused in one line."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from typing import Any

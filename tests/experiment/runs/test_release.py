@@ -1,9 +1,5 @@
 """A released checkpoint and its card."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 import torch
 
@@ -18,22 +14,14 @@ from dopepp.models.checkpoint.schema import Checkpoint, read, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts import load_part
 
-SPEC: dict[str, Any] = {
-    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
-    "attention": {"_target_": "dopepp.models.attention.Identity"},
-    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625},
-    "activation": "exp",
-    "num_objects": 1,
-}
-
 
 @pytest.fixture
-def run(tmp_path):
+def run(tiny_spec, tmp_path):
     """A run's folder: checkpoint and result."""
     config = {"virtual": {"preset": "wide"}, "masking": {"probability": 0.3}, "cache_dir": "/x/y"}
     checkpoint = Checkpoint(
-        SPEC, build_network(SPEC).state_dict(), [load_part("pivconnector")], (64, 64), 8, 1.0,
-        data={"name": "dopepp", "config": config},
+        tiny_spec, build_network(tiny_spec).state_dict(), [load_part("pivconnector")],
+        (64, 64), 8, 1.0, data={"name": "dopepp", "config": config},
     )  # fmt: skip
     write_atomic(checkpoint.to_file(), tmp_path / "best.ckpt")
     rows = {name: PoseRow(name, "dopepp", 300, 0.843) for name in ("pivconnector", "mean")}

@@ -1,7 +1,5 @@
 """What may change between the parts of one run, and what a run's folder may say."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 from pathlib import Path

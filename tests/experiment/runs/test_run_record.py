@@ -1,7 +1,5 @@
 """What a run writes down of what it is made with, and what it keeps of that."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 

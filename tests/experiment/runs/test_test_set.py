@@ -1,7 +1,5 @@
 """The fingerprint of a test set changes with what is measured, and with nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A search as a user runs it, with trainings that take no time."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import statistics
