@@ -1,7 +1,5 @@
 """The pages "adding a …", read and run: what they tell a reader to write works as it stands."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

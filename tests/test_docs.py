@@ -1,7 +1,5 @@
 """Documents name only what exists: linked files and headings, commands and options, config keys."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

@@ -1,6 +1,4 @@
-from __future__ import annotations
-
-import csv
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -8,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch import Callback, Trainer
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
@@ -20,6 +19,8 @@ from dopepp.models.spec import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
 from dopepp.recovery.recover import RecoveryOptions
+from dopepp.training.checkpointing.files import AtomicCheckpointIO
+from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
@@ -34,7 +35,7 @@ def part():
 
 
 @pytest.fixture(scope="session")
-def make_system(part):
+def make_system(part, tiny_spec):
     """A tiny DOPE++ for one part, or two of the same shape."""
 
     def make(
@@ -43,13 +44,7 @@ def make_system(part):
         torch.manual_seed(0)
         parts = [part, Part("other", part.cuboid, part.diameter, part.points)][:num_objects]
         loss = SpatialCrossEntropy(sigma=1.0, count_weight=1.0, field_weight=0.2)
-        spec = {
-            "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
-            "attention": {"_target_": "dopepp.models.attention.Identity"},
-            "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625},
-            "activation": loss.activation,
-            "num_objects": num_objects,
-        }
+        spec = {**tiny_spec, "activation": loss.activation, "num_objects": num_objects}
         network = build_network(spec)
         described = Checkpoint(spec, {}, parts, INPUT_SIZE, network.stride, 1.0)
         return system_class(
@@ -123,21 +118,17 @@ def make_noise(part):
 
 
 @pytest.fixture(scope="session")
-def read_csv():
-    def read(path: Path) -> list[dict[str, str]]:
-        with path.open(newline="") as stream:
-            return list(csv.DictReader(stream))
+def make_trainer():
+    """A trainer of one epoch that logs every step into its folder's table and prints nothing."""
 
-    return read
+    def make(folder: Path, callbacks: Sequence[Callback], **options: Any) -> Trainer:
+        table = MetricsTable(folder / "metrics.csv")
+        usual = {
+            "accelerator": "cpu", "max_epochs": 1, "num_sanity_val_steps": 0, "logger": table,
+            "log_every_n_steps": 1, "use_distributed_sampler": False,
+            "plugins": [AtomicCheckpointIO(prepare=table.write)],
+            "enable_progress_bar": False, "enable_model_summary": False,
+        }  # fmt: skip
+        return Trainer(default_root_dir=folder, callbacks=[*callbacks], **usual | options)
 
-
-@pytest.fixture(scope="session")
-def read_png():
-    def read(path: Path) -> np.ndarray:
-        import cv2
-
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        assert image is not None, f"{path} cannot be read"
-        return np.asarray(image)
-
-    return read
+    return make

@@ -1,7 +1,5 @@
 """What a process does when another one of its run is gone."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -16,14 +14,6 @@ ROOT = Path(__file__).parents[2]
 
 def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", code])
-
-
-def run(script: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        capture_output=True, text=True, timeout=100, check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
 
 
 def test_a_death_is_told_with_its_cause():
@@ -56,7 +46,9 @@ def test_what_hangs_is_ended_from_outside():
         processes.Watch([child], None).start()
         time.sleep(120)
     """
-    ended = run(script)
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
     assert ended.returncode == 1
     assert ended.stderr.endswith("was killed by signal 9: the run ends\n")
 
@@ -67,21 +59,3 @@ def test_a_stopped_watch_lets_processes_end():
     watch.stop()
     watch.run()  # returns at once, and this process is still here
     child.wait()
-
-
-def test_a_child_sees_that_its_parent_is_gone():
-    script = """
-        import os, subprocess, sys, time
-        code = '''
-        import os
-        from dopepp.training.processes import Watch
-        print(Watch([], int(os.environ["STARTED_BY"])).death(60), flush=True)
-        '''
-        import textwrap
-        environment = {**os.environ, "STARTED_BY": str(os.getpid())}
-        subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], env=environment)
-        time.sleep(1)
-        os.kill(os.getpid(), 9)
-    """
-    ended = run(script)
-    assert "(rank 0 on this machine) has died" in ended.stdout

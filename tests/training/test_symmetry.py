@@ -1,7 +1,5 @@
 """Equal pictures get equal maps, and at a sector's border the network may choose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The diagnosis, on validations whose maps, labels and losses are made up."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
@@ -93,9 +91,7 @@ def test_a_flat_loss_is_the_learning_rates(validations, caplog):
         (1.0, 0.0, -1, "no object in the validation images"),
     ],
 )
-def test_labels_off_the_image_in_one_cell_or_absent_are_the_cause(
-    scale, shift, index, said, validations, caplog
-):
+def test_labels_off_the_image_are_the_cause(scale, shift, index, said, validations, caplog):
     validations.batch = replace(
         validations.batch,
         keypoints=scale * validations.batch.keypoints + shift,

@@ -1,16 +1,14 @@
 """Steps that are not finite: what they leave as it was, how they count, how they end a run."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,9 +22,10 @@ from torch.utils.data import DataLoader
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.data.batch import Batch
+from dopepp.drawing.pictures import read_rgb
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.training.callbacks.finite import FOLDER, FiniteSteps, check_state
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
-from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem
 
 ROOT = Path(__file__).parents[3]
@@ -63,13 +62,7 @@ class States(Callback):
     def __init__(self) -> None:
         self.states: list[list[Tensor]] = []
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._keep(trainer, pl_module)
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
-        self._keep(trainer, pl_module)
-
-    def _keep(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
         moments = [
             value
             for state in trainer.optimizers[0].state.values()
@@ -78,6 +71,8 @@ class States(Callback):
         ]
         present = [*pl_module.state_dict().values(), *moments]
         self.states.append([tensor.detach().clone() for tensor in present])
+
+    on_train_batch_end = on_train_start
 
     def changed(self) -> list[bool]:
         pairs = zip(self.states, self.states[1:], strict=False)
@@ -93,44 +88,35 @@ def batches(make_noise):
     return list(make_noise().train_dataloader())
 
 
-class Run:
+class Run(NamedTuple):
     """One epoch of four batches, by a system with faults."""
 
-    def __init__(
-        self, system: Faulty, batches: list[Batch], folder: Path,
-        max_in_a_row: int = 10, save_every: int = 1, **options: Any,
-    ) -> None:  # fmt: skip
-        self.states, self.guard, self.system = States(), FiniteSteps(max_in_a_row), system
-        last = ModelCheckpoint(
-            folder, filename="last", every_n_train_steps=save_every, enable_version_counter=False
-        )
-        self.trainer = Trainer(
-            accelerator="cpu",
-            max_epochs=1,
-            default_root_dir=folder,
-            logger=MetricsTable(folder / "metrics.csv"),
-            callbacks=[self.guard, self.states, last],
-            plugins=[AtomicCheckpointIO(), *options.pop("plugins", [])],
-            use_distributed_sampler=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            limit_val_batches=0,
-            log_every_n_steps=1,
-            **{"gradient_clip_val": 1.0, **options},
-        )
-        self.trainer.fit(system, DataLoader(batches, batch_size=None))
+    system: Faulty
+    trainer: Trainer
+    guard: FiniteSteps
+    states: States
 
 
 @pytest.fixture
-def run(make_system, batches, tmp_path):
-    """Train with faults by pass; further options are the system's, then the run's."""
+def run(make_system, make_trainer, batches, tmp_path):
+    """Train with faults by pass; further options are the system's, then the trainer's."""
 
-    def start(faults: Mapping[int, str], system: Mapping[str, Any] = {}, **options: Any) -> Run:
+    def start(
+        faults: Mapping[int, str], system: Mapping[str, Any] = {},
+        max_in_a_row: int = 10, save_every: int = 1, plugins: Sequence[Any] = (), **options: Any,
+    ) -> Run:  # fmt: skip
         faulty = make_system(system_class=Faulty, **system)
-        assert isinstance(faulty, Faulty)
         faulty.faults = faults
-        return Run(faulty, batches, tmp_path, **options)
+        guard, states = FiniteSteps(max_in_a_row), States()
+        last = ModelCheckpoint(
+            tmp_path, filename="last", every_n_train_steps=save_every, enable_version_counter=False
+        )
+        options = {"gradient_clip_val": 1.0, "limit_val_batches": 0} | options
+        trainer = make_trainer(
+            tmp_path, [guard, states, last], plugins=[AtomicCheckpointIO(), *plugins], **options
+        )
+        trainer.fit(faulty, DataLoader(batches, batch_size=None))
+        return Run(faulty, trainer, guard, states)
 
     return start
 
@@ -140,9 +126,7 @@ def one_cycle(optimizer: torch.optim.Optimizer, num_steps: int) -> OneCycleLR:
 
 
 @pytest.mark.parametrize("fault", ["loss", "gradient", "statistics"])
-def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(
-    fault, run, tmp_path, read_csv, caplog
-):
+def test_a_bad_step_changes_nothing_and_the_schedule_goes_on(fault, run, tmp_path, caplog):
     done = run({1: fault}, {"make_scheduler": one_cycle})
     assert done.states.changed() == [True, False, True, True]
     counts = [row["train/skipped_steps"] for row in read_csv(tmp_path / "metrics.csv")]
@@ -200,7 +184,7 @@ def test_a_scalers_own_overflow_is_not_counted(fault, scale, counted, run):
         assert not done.states.changed()[1]
 
 
-def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(run, batches, tmp_path, read_png):
+def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(run, batches, tmp_path):
     with pytest.raises(RunError) as error:
         run({1: "loss", 2: "loss"}, max_in_a_row=2)
     folder = tmp_path / FOLDER
@@ -213,8 +197,8 @@ def test_after_n_in_a_row_the_run_ends_with_the_batch_on_disk(run, batches, tmp_
         stored, third = dumped[entry.name], getattr(batches[2], entry.name)
         same = torch.equal(stored, third) if isinstance(third, Tensor) else stored == third
         assert same, entry.name
-    sheet = read_png(folder / "step_2_rank_0.png").astype(int)
-    blue, green, red = sheet[..., 0], sheet[..., 1], sheet[..., 2]
+    sheet = read_rgb(folder / "step_2_rank_0.png").astype(int)
+    red, green, blue = np.moveaxis(sheet, -1, 0)
     assert ((green > 150) & (red < 100) & (blue < 100)).any()  # the true wireframe
     # What was saved after the good step is what there is.
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)

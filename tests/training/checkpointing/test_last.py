@@ -1,12 +1,9 @@
 """A run cut at any hook and resumed ends as if it had not been; "cut" is here an exception."""
 
-from __future__ import annotations
-
-import csv
 import logging
 import random
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +15,14 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
-from dopepp.data.datamodule import PoseDataModule
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.training.callbacks.averaging import TRAINED, AveragedWeights
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import Throughput
-from dopepp.training.checkpointing.files import AtomicCheckpointIO, newest_checkpoint
+from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.checkpointing.last import LastCheckpoint
-from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem
 
-SystemMaker = Callable[..., PoseSystem]
 TIMES = ("throughput/images_per_s", "throughput/loader_wait")
 
 
@@ -36,12 +31,15 @@ class CutError(Exception):
 
 
 class Noisy(PoseSystem):
-    """Draws from every global generator in each step, so that one in another state shows."""
+    """Draws from every global generator in each step, so that one in another state shows.
+
+    Of two normal numbers that Python and NumPy make at a time they keep one for the next call.
+    """
 
     def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
-        numbers = [random.random(), np.random.rand(), float(torch.rand(()))]  # noqa: NPY002
+        numbers = [random.gauss(0, 1), np.random.randn(), float(torch.randn(()))]  # noqa: NPY002
         self.log("train/noise", sum(numbers))
-        return super().training_step(batch, batch_idx) * (1 + numbers[0] + numbers[1] + numbers[2])
+        return super().training_step(batch, batch_idx) * (1 + sum(map(abs, numbers)))
 
 
 class Cut(Callback):
@@ -66,39 +64,6 @@ def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> Any:
     return torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
 
 
-class Runs:
-    """Trains in a folder, from its newest checkpoint if there is one."""
-
-    def __init__(self, make_system: SystemMaker, make_noise: Callable[[], PoseDataModule]) -> None:
-        self.make_system, self.make_noise = make_system, make_noise
-
-    def __call__(
-        self,
-        folder: Path,
-        cut: Cut,
-        last: LastCheckpoint | None = None,
-        more: Sequence[Callback] = (),
-        **options: Any,
-    ) -> PoseSystem:
-        system = self.make_system(system_class=Noisy, make_scheduler=cosine)
-        for seed in (random.seed, np.random.seed, torch.manual_seed):
-            seed(4)
-        table = MetricsTable(folder / "metrics.csv")
-        last = last or LastCheckpoint(every_s=0, max_share=1)
-        best = ModelCheckpoint(filename="best", monitor="val/loss", enable_version_counter=False)
-        trainer = Trainer(
-            accelerator="cpu", log_every_n_steps=1, default_root_dir=folder, logger=[table],
-            callbacks=[*more, Throughput(), LearningRateMonitor("step"), cut, best, last],
-            plugins=[AtomicCheckpointIO(prepare=table.write)], enable_model_summary=False,
-            num_sanity_val_steps=0, use_distributed_sampler=False, enable_progress_bar=False,
-            **{"max_epochs": 2, **options},
-        )  # fmt: skip
-        found = newest_checkpoint(folder)
-        path = found and found[0]
-        trainer.fit(system, datamodule=self.make_noise(), ckpt_path=path, weights_only=True)
-        return system
-
-
 @pytest.fixture(scope="module", autouse=True)
 def quiet():
     with pytest.MonkeyPatch.context() as patch:
@@ -108,13 +73,30 @@ def quiet():
 
 
 @pytest.fixture(scope="module")
-def runs(make_system, make_noise):
-    return Runs(make_system, make_noise)
+def runs(make_system, make_noise, make_trainer):
+    """Train in a folder, from its newest checkpoint if there is one."""
+
+    def train(
+        folder: Path, cut: Cut, last: LastCheckpoint | None = None,
+        more: Sequence[Callback] = (), **options: Any,
+    ) -> PoseSystem:  # fmt: skip
+        system = make_system(system_class=Noisy, make_scheduler=cosine)
+        for seed in (random.seed, np.random.seed, torch.manual_seed):
+            seed(4)
+        best = ModelCheckpoint(filename="best", monitor="val/loss", enable_version_counter=False)
+        last = last or LastCheckpoint(every_s=0, max_share=1)
+        callbacks = [*more, Throughput(), LearningRateMonitor("step"), cut, best, last]
+        trainer = make_trainer(folder, callbacks, **{"max_epochs": 2, **options})
+        found = newest_checkpoint(folder)
+        path = found and found[0]
+        trainer.fit(system, datamodule=make_noise(), ckpt_path=path, weights_only=True)
+        return system
+
+    return train
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "metrics.csv").open(newline="") as stream:
-        table = list(csv.DictReader(stream))
+    table = read_csv(folder / "metrics.csv")
     return [{k: v if k not in TIMES else str(bool(v)) for k, v in row.items()} for row in table]
 
 
@@ -209,11 +191,10 @@ class Recorder(Callback):
     def __init__(self) -> None:
         self.states: list[dict[str, torch.Tensor]] = []
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.on_train_batch_end(trainer, pl_module)
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         self.states.append({k: v.clone() for k, v in pl_module.state_dict().items()})
+
+    on_train_batch_end = on_train_start
 
 
 def last_state(folder: Path, name: str) -> dict[str, torch.Tensor]:
