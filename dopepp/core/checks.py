@@ -15,13 +15,7 @@ def check_number(
 ) -> float:
     """Return a finite real number of a closed range.
 
-    Args:
-        name: The option, for the message, as are the next two.
-        value: What it holds.
-        lowest: Smallest allowed value.
-        highest: Largest allowed value.
-        unit: What the number counts.
-        of: The group that the option belongs to, named by its ``name`` or its class.
+    ``name``, ``unit`` (what it counts) and ``of`` (the group of options) are for the message.
 
     Raises:
         UserError: It is a bool, not a number, not finite, or outside of the range.

@@ -40,11 +40,7 @@ class RunError(RuntimeError):
 
 
 def require(package: str, choice: str, extra: str) -> None:
-    """Check that what a choice needs is installed.
-
-    Raises:
-        UserError: It is not.
-    """
+    """Check that what a choice needs is installed, or raise a :class:`UserError`."""
     if find_spec(package) is None:
         raise UserError(
             f"{choice} without the package {package}",

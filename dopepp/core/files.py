@@ -61,9 +61,7 @@ def partial_path(path: Path) -> Path:
 def is_abandoned(path: Path, now: float) -> bool:
     """Tell whether a partial file's process is gone, so that nobody will complete it.
 
-    Args:
-        path: A file that is named like a partial file.
-        now: The present by the clock of the file system, seconds.
+    ``now`` is the present by the clock of the file system, seconds.
     """
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):

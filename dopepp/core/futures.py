@@ -24,11 +24,8 @@ def completed(
 ) -> Iterator[tuple[Item, Future[Result]]]:
     """Submit items and yield each with its future as soon as that is done.
 
-    Args:
-        submit: Hands an item to somebody.
-        items: Read only as far as there is room, and after what is done was yielded, because that
-            may decide what comes next.
-        room: Returns how many may be handed out at a time.
+    ``items`` are read only as far as ``room()`` allows, and after what is done was yielded, because
+    that may decide what comes next.
     """
     waiting, flying = iter(items), dict[Future[Result], Item]()
     while True:
@@ -93,10 +90,7 @@ def spread(
 ) -> Callable[..., Future[Result]]:
     """Return a function that does the same as a task of the cluster.
 
-    Args:
-        ray: From :func:`connect`.
-        function: What is to be done.
-        **options: What a task occupies: ``num_cpus``, ``num_gpus``, and how often it is repeated.
+    ``options`` are what a task occupies (``num_cpus``, ``num_gpus``), and how often it is repeated.
     """
     # Without SPREAD, Ray fills one machine before it uses the next.
     remote = ray.remote(scheduling_strategy="SPREAD", **options)(function)

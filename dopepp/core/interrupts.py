@@ -31,16 +31,7 @@ def stopped(error: OSError, root: Path) -> StoppedError:
 
 
 class Interruption(KeyboardInterrupt):
-    """Ctrl-C, or a scheduler's SIGTERM.
-
-    Args:
-        number: The signal.
-        advice: What to do next.
-
-    Attributes:
-        number: The signal.
-        exit_code: 128 plus its number, as shells count.
-    """
+    """Ctrl-C, or a scheduler's SIGTERM."""
 
     def __init__(self, number: int, advice: str = _RESUME) -> None:
         super().__init__(f"interrupted; {advice}")

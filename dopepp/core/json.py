@@ -38,9 +38,7 @@ _NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DO
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
     """Read a JSON file.
 
-    Args:
-        path: The file.
-        max_bytes: A larger file is refused before it is read.
+    A file of more than ``max_bytes`` is refused before it is read.
 
     Returns:
         Dicts, lists, strings, finite numbers, booleans and None.

@@ -52,7 +52,6 @@ class Limits:
     """What an archive may unpack to.
 
     Attributes:
-        num_members: Files and folders.
         total_bytes: Bytes of all files together.
         ratio: Bytes unpacked per byte of the archive, where they are over ten megabytes: text
             compresses by 50 at most, pictures by far less, a bomb by a thousand.
@@ -70,13 +69,7 @@ class Limits:
 def safe_extract(archive: Path | str, folder: Path | str, limits: Limits | None = None) -> Path:
     """Unpack an archive into a new folder.
 
-    Args:
-        archive: A tar or zip file; its content tells which.
-        folder: Where to; it must not exist, or be empty.
-        limits: How much may be unpacked.
-
-    Returns:
-        The folder.
+    The content of ``archive`` tells its format; ``folder`` must not exist, or be empty.
 
     Raises:
         UserError: The archive is missing, damaged, or of another format; a member's path leads out
@@ -189,11 +182,8 @@ class Member:
     """A file or folder in an archive.
 
     Attributes:
-        name: Its path as written.
-        is_folder: Whether it is a folder.
         kind: What else it is, such as a link; empty for a file or folder.
         size: Bytes it claims to have.
-        open: Returns its content.
     """
 
     name: str
@@ -207,10 +197,6 @@ class Bounded(io.RawIOBase):
     """A seekable stream that ends where its limit is, and refuses to be read in one huge piece.
 
     The tar format lets a header claim a name of any length, which :mod:`tarfile` reads at once.
-
-    Args:
-        stream: What is read.
-        most: Bytes after which it ends.
     """
 
     def __init__(self, stream: IO[bytes], most: int = sys.maxsize) -> None:
@@ -241,9 +227,7 @@ class Bounded(io.RawIOBase):
 def archive_members(archive: Path, most_bytes: int) -> Iterator[Iterator[Member]]:
     """Open an archive, and turn every way in which it can be damaged into one error.
 
-    Args:
-        archive: The file.
-        most_bytes: Where a tar file ends at the latest when it is unpacked.
+    A tar file ends after ``most_bytes`` at the latest when it is unpacked.
 
     Raises:
         UserError: The archive is damaged, of another format, or longer.

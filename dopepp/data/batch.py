@@ -25,15 +25,11 @@ class Batch:
     """Images of one size with their instances.
 
     Attributes:
-        images: RGB, uint8, in channels-last memory.
-        K: Camera matrices in pixels of these images.
         T_cam_obj: Rigid transforms, metres; the identity in padding.
         keypoints: Projected cuboids in pixels; NaN behind the camera and in padding.
         object_index: Position of the instance's object in the list of objects, −1 in padding.
         visible_fraction: Visible share of the silhouette, 0 in padding.
         masked_fraction: Share of the visible pixels covered by the random mask, 0 in padding.
-        keys: Each image's key within its source.
-        sources: Each image's source.
     """
 
     images: UInt8[Tensor, "batch 3 height width"]

@@ -64,9 +64,6 @@ LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], N
 def check_dataset(root: Path) -> CheckReport:
     """Check a data set of any known layout; what is found is reported, never raised.
 
-    Args:
-        root: Its folder.
-
     Raises:
         UserError: The folder is missing or holds no known layout.
     """

@@ -25,9 +25,6 @@ class SourceRow:
     """A line of the start-up print.
 
     Attributes:
-        split: ``train``, ``val`` or ``test``.
-        source: The source's name.
-        num_images: Images it holds.
         num_per_epoch: Images it gives to an epoch.
         num_instances: Instances per object; empty where counting is not cheap.
     """
@@ -46,16 +43,9 @@ class PoseDataModule(LightningDataModule):
     test items come at their native resolution, as :class:`Sample`.
 
     Args:
-        train: Training data.
         val: Validation data (model selection, thresholds); its epoch is always 0.
         test: Test data; its epoch is always 0.
-        object_names: The objects in the network's order.
-        input_size: The network's input (width, height), pixels.
-        batch_size: Images per batch and process.
         num_workers: Loader processes; 0 loads in the training process.
-        seed: Seed of order, masking and augmentation.
-        masking: Random mask local processing, or None.
-        augment: Photometric augmentation, or None.
         backgrounds: Other pictures that masking may need; required with ``masking``.
 
     Raises:

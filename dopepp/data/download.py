@@ -39,7 +39,6 @@ class DownloadSource:
     """An archive on the network.
 
     Attributes:
-        url: Its address; http and https only.
         num_bytes: Its exact size.
         sha256: Its checksum, hex.
         photos: The folder in it that serves as ``virtual.backgrounds``.
@@ -74,11 +73,6 @@ SOURCES: Final = {
 
 def download(name: str, folder: Path | str, progress: Progress | None = None) -> Path:
     """Download and unpack a data set into ``folder/NAME``; one that is there is left as it is.
-
-    Args:
-        name: Key of :data:`SOURCES`.
-        folder: Where to.
-        progress: Told after every piece.
 
     Returns:
         The folder of its photos.

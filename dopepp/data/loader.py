@@ -30,7 +30,6 @@ class SampleDataset(Dataset[Sample | UserError]):
 
     Args:
         item: Makes an item, a pure function of (epoch, index).
-        num_items: Items of an epoch.
     """
 
     def __init__(self, item: Item, num_items: int) -> None:
@@ -54,12 +53,8 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
     It is a ``DistributedSampler`` so that Lightning leaves it in its place; it calls ``set_epoch``.
 
     Args:
-        dataset: Gives the number of items.
-        seed: Seed of the order.
         shuffle: Training: a new order every epoch, and every rank gets equally many items. Without
             it the items come in order, epoch 0 always, and every item exactly once over all ranks.
-        rank: This process.
-        world_size: Number of processes.
     """
 
     def __init__(
@@ -97,10 +92,8 @@ class PoseLoader(DataLoader[Any]):
     is owed the one line. So it travels as a value and is raised here.
 
     Args:
-        dataset: The items.
         sampler: Hands out (epoch, index).
         object_names: The objects in the network's order.
-        options: Everything else for ``DataLoader``.
     """
 
     def __init__(

@@ -51,9 +51,7 @@ def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     """Return a part with the symmetries of its mesh, and say in the log what they are.
 
-    Args:
-        part: A part with a mesh.
-        tolerance: Largest distance of a moved surface point from the surface, in diameters.
+    ``tolerance`` is the largest distance of a moved surface point from the surface, in diameters.
 
     Raises:
         UserError: The part has no mesh, or the tolerance is out of range.

@@ -20,7 +20,6 @@ class Instance:
     """One object on an image.
 
     Attributes:
-        label: The part's name.
         T_cam_obj: Rigid transform from object to camera frame, (4, 4), metres, float64.
         keypoints: Projected cuboid corners and centroid, pixels, NaN behind the camera.
         visible_fraction: Visible share of the object's full silhouette, occlusion and truncation
@@ -43,7 +42,6 @@ class Sample:
     """One image and its ground truth.
 
     Attributes:
-        image: RGB, uint8.
         K: Camera matrix in pixels of this image, float64.
         instances: The objects of interest on it, possibly none.
         depth: Metres along z, float32, 0 where unknown; None where the source has none.
@@ -81,7 +79,6 @@ class SourceInfo:
     """What a source holds, for the start-up print and the data fingerprint.
 
     Attributes:
-        name: Name of the source.
         num_images: Images it holds (for renders: distinct items of an epoch).
         identity: Everything that decides the items (file list, seed, preset, part hashes, …), as
             plain values that JSON can write.

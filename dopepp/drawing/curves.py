@@ -52,11 +52,8 @@ def accuracy_figure(
 ) -> Figure:
     """Draw accuracy-threshold curves of several methods, their exact AUC in the legend.
 
-    Args:
-        curves: Errors in metres by name; a miss is infinite.
-        max_threshold: End of the curves, metres.
-        title: Title of the figure.
-        colours: Matplotlib's names of colours by method; its own order by default.
+    ``curves`` are errors in metres by name, a miss is infinite; they end at ``max_threshold``
+    metres. ``colours`` are Matplotlib's names by method; its own order by default.
     """
     figure, axes = figure_with_axes("error threshold (m)", "share of instances below (%)", title)
     for name, errors in curves.items():
@@ -127,10 +124,7 @@ class RateCurve:
     """One line: rates in [0, 1] at ascending values of a quantity.
 
     Attributes:
-        x: The quantity.
-        rate: The rate there.
         low: Lower end of its confidence interval.
-        high: Upper end.
     """
 
     x: Float[np.ndarray, "points"]
@@ -156,9 +150,6 @@ def rates_figure(
         edges: Where bins end, marked on the axis; None for none.
         ratio: Whether the quantity is a ratio: its axis is logarithmic, marked where it was
             measured.
-
-    Raises:
-        ValueError: There is no panel or no column.
     """
     if not panels or columns < 1:
         raise ValueError(f"rates need panels and columns, got {len(panels)} and {columns}")

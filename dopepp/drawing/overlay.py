@@ -57,7 +57,6 @@ class Wireframe:
 
     Attributes:
         keypoints: Its eight corners and centroid, pixels; NaN where there is none.
-        colour: Colour of its lines, RGB.
         label: Its entry in the legend; empty for none.
     """
 
@@ -94,11 +93,8 @@ def draw_wireframe(
 
     Edges with a keypoint that is not finite are left out; those that leave the image are cut.
 
-    Args:
-        image: RGB.
-        keypoints: Eight corners in NDDS order and the centroid, pixels.
-        colour: RGB.
-        thickness: Thickness of the back edges, pixels; those of the +z face get one more.
+    ``keypoints`` are eight corners in NDDS order and the centroid, pixels. ``thickness`` is that of
+    the back edges, pixels; those of the +z face get one more.
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
@@ -177,12 +173,8 @@ def draw_text(
 ) -> None:
     """Write one line IN PLACE on a darkened box; what leaves the image is cut off.
 
-    Args:
-        image: RGB.
-        text: The line.
-        position: Column and row of its top left corner, pixels, not negative.
-        size_px: Height of the line, pixels.
-        colour: RGB.
+    ``position`` is (column, row) of its top left corner, pixels, not negative; ``size_px`` its
+    height.
     """
     column, row = position
     place = image[row : row + size_px, column:]

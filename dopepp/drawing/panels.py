@@ -53,9 +53,7 @@ class PlotLine:
 
     Attributes:
         name: Its entry in the legend.
-        x: Progress, ascending.
         values: Of each run; NaN where there is none.
-        colour: Matplotlib's name of a colour.
         dashed: Whether it is what another line is compared with.
     """
 
@@ -71,11 +69,7 @@ def lines_figure(
 ) -> Figure:
     """Draw lines; of several runs their mean, in a band from the lowest to the highest.
 
-    Args:
-        lines: The methods.
-        x_label: What counts the progress.
-        y_label: What is drawn, with its unit.
-        log_y: Logarithmic values, where all are positive.
+    ``y_label`` has its unit; ``log_y`` makes values logarithmic, where all are positive.
     """
     figure, axes = figure_with_axes(x_label, y_label)
     for line in lines:
@@ -181,11 +175,8 @@ def depth_panel(
 def draw_axes(image: Picture, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
     """Draw the object frame's axes IN PLACE.
 
-    Args:
-        image: RGB.
-        ends: Where the origin and the tips of x, y and z are seen, pixels; a line whose end is not
-            finite or far outside is left out.
-        thickness: Pixels.
+    ``ends`` is where the origin and the tips of x, y and z are seen, pixels; a line whose end is
+    not finite or far outside is left out.
     """
     # A tip that far outside of the image belongs to an object beside the camera.
     bound = 10 * max(image.shape)

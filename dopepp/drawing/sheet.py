@@ -24,7 +24,6 @@ class Tile:
     """One picture of a contact sheet.
 
     Attributes:
-        image: RGB.
         caption: One line below it; empty for none.
     """
 
@@ -35,10 +34,7 @@ class Tile:
 def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> Picture:
     """Lay tiles out row by row on white, each scaled to one width with its shape kept.
 
-    Args:
-        tiles: The pictures, of any sizes.
-        columns: Pictures in a row, at most.
-        tile_width: Width of a picture on the sheet, pixels.
+    A row has ``columns`` tiles at most; ``tile_width`` is in pixels.
 
     Raises:
         ValueError: There are no tiles, or a size is below 1.

@@ -70,7 +70,6 @@ class Part:
     """A rigid object the network can learn.
 
     Attributes:
-        name: Unique name; the label of its instances.
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
         diameter: Largest distance between two vertices, metres.
         points: ADD points in the object frame, metres.
@@ -145,13 +144,9 @@ def make_part(
     A mesh of over 200,000 triangles is measured as it is, so that poses, errors and the hash do not
     depend on it, and then decimated for rendering, which the log says.
 
-    Args:
-        name: The label of the part's instances.
-        mesh: Triangles in metres; None for an object known by its points only.
-        points: ADD points in metres; by default 2,000 fixed-seed samples of the surface.
-        symmetries_discrete: Rigid transforms that map the part onto itself.
-        symmetries_continuous: Axes of rotational symmetry.
-        unit: The unit of the file the mesh was read from, named when the size is unlikely.
+    ``mesh`` is None for an object known by its ADD points only; ``points`` are by default 2,000
+    fixed-seed samples of the surface; ``unit`` is that of the file, named when the size is
+    unlikely.
 
     Raises:
         UserError: The name is empty or too long, the diameter lies outside 5 mm – 5 m, or the mesh

@@ -94,11 +94,7 @@ def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
 
 
 class Candidates:
-    """Axes about which a turn by 2π / order may be a symmetry.
-
-    Args:
-        surface: The normalised shape.
-    """
+    """Axes about which a turn by 2π / order may be a symmetry."""
 
     def __init__(self, surface: SurfaceTree) -> None:
         self._surface = surface

@@ -58,12 +58,6 @@ def agreement(
 ) -> float:
     """Compare outline and creases of a part at a pose with an image.
 
-    Args:
-        image: RGB.
-        K: Camera matrix, pixels.
-        T_cam_obj: The pose to check, metres.
-        surface: The part's surface.
-
     Returns:
         0 (edges lie anywhere) to 1 (all lie on the contour). 0, too, where the part is not before
         the camera or has no contour within the image.
@@ -90,11 +84,8 @@ def meshes_of(
 ) -> dict[str, Surface]:
     """Find the surfaces of a checkpoint's parts, which itself holds no mesh.
 
-    Args:
-        known: The checkpoint's parts.
-        given: Built-in parts, mesh files named as the part, or ``NAME=FILE``. A single file stands
-            for a single part whatever its name. Built-in parts need not be given.
-        unit: Of the files.
+    ``given`` are built-in parts, which need not be given, mesh files named as the part, or
+    ``NAME=FILE``. A single file stands for a single part whatever its name. ``unit`` is the files'.
 
     Returns:
         A surface for every known part, by name. A mesh other than the one that was trained on is
@@ -162,12 +153,7 @@ def _contour(
 def _edges(
     item: SceneObject, ids: Int[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """Tell the pixels right before an outline, a step in depth or a crease.
-
-    Args:
-        item: The object.
-        ids: Its triangle at every pixel, −1 beside it.
-    """
+    """Tell the pixels right before an outline, a step in depth or a crease."""
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)

@@ -27,7 +27,6 @@ class Body:
     """A surface that can be posed.
 
     Attributes:
-        surface: Its geometry.
         part: The part it is; None for what no network is to find.
         source: The body it was stretched from.
         stretch: By how much, along x, y and z.
@@ -54,10 +53,6 @@ class Body:
 def make_body(part: Part, *, is_target: bool) -> Body:
     """Prepare a part's mesh.
 
-    Args:
-        part: With its mesh.
-        is_target: Whether the network is to find it.
-
     Raises:
         UserError: The part has no mesh, or one that cannot be rendered.
     """
@@ -76,7 +71,6 @@ class Hull:
 
     Attributes:
         vertices: Object frame, metres; the lowest point of the body is always one of them.
-        triangles: Vertex indices, counter-clockwise from outside.
         facets: Number of the flat face that each triangle belongs to.
         centre: Centre of mass of a solid body, object frame, metres.
     """

@@ -34,11 +34,8 @@ class Factory:
     bytes for the same (seed, epoch, index), in any order.
 
     Args:
-        parts: The parts to show, with their meshes.
-        preset: The distribution of scenes.
         seed: Non-negative seed of the whole supply.
         backgrounds: Where backgrounds come from; procedural ones if not given.
-        renderer: Key of :data:`~dopepp.virtual.renderers.RENDERERS`.
         negatives: Parts that are shown among the distractors, so that a network learns not to
             find them; the built-in parts that are no targets are always among them.
 
@@ -79,11 +76,8 @@ class Factory:
     def render(self, epoch: int, index: int, scale: float = 1.0) -> Rendered:
         """Render an image with its ground truth, as the scene's sensor takes it.
 
-        Args:
-            epoch: The epoch.
-            index: The image.
-            scale: How many times as large its parts appear: the camera of the same scene, moved
-                (see :mod:`dopepp.virtual.arrange.random_scene`).
+        ``scale`` is how many times as large its parts appear: the camera of the same scene, moved
+        (see :mod:`dopepp.virtual.arrange.random_scene`).
 
         Raises:
             UserError: The preset cannot show the part, or the camera cannot stand there (see
@@ -107,11 +101,7 @@ def code_hash() -> str:
 
 
 def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, ...]:
-    """Return the given negatives and the built-in parts that are neither targets nor given.
-
-    Raises:
-        UserError: A given negative has the name or the mesh of a target.
-    """
+    """Return the given negatives and the built-in parts that are neither targets nor given."""
     names, hashes = {part.name for part in parts}, {part.mesh_hash for part in parts}
     for part in given:
         if part.name in names or part.mesh_hash in hashes:

@@ -75,7 +75,6 @@ class Light:
     """A point light.
 
     Attributes:
-        position: Camera frame, metres.
         intensity: Linear RGB that a white surface facing the light shows at ``reach``.
         reach: Distance at which the intensity holds, metres; it falls off with the square.
     """
@@ -91,8 +90,6 @@ class Ambient:
 
     Attributes:
         up: Unit vector to the upper hemisphere, camera frame.
-        above: Linear RGB of the upper hemisphere.
-        below: Linear RGB of the lower hemisphere.
     """
 
     up: Triple = (0.0, -1.0, 0.0)
@@ -123,7 +120,6 @@ class Sensor:
 
     Attributes:
         exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
-        blur_px: Standard deviation of the defocus, pixels.
         motion_px: Displacement (x, y) of the image during the exposure, pixels.
         read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
         shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
@@ -146,9 +142,7 @@ class SceneObject:
     """One posed object.
 
     Attributes:
-        surface: Its geometry.
         T_cam_obj: Rigid transform from object to camera frame, metres.
-        material: Its reflectance.
         part: The part it is an instance of; None for a distractor.
     """
 
@@ -175,11 +169,7 @@ class Scene:
     Attributes:
         K: Camera matrix, pixels.
         background: RGB image that fills the frame; its size is the image's size.
-        objects: Targets and distractors.
-        lights: Point lights, at most a few; the first casts shadows.
         ambient: Light from everywhere else.
-        plane: The supporting plane, or None.
-        sensor: What the camera does to the rendered picture.
     """
 
     K: Float[np.ndarray, "3 3"]
@@ -217,7 +207,6 @@ class Rendered:
     """An image and its ground truth, whichever renderer made it.
 
     Attributes:
-        image: RGB, uint8.
         depth: Metres along z at pixel centres, float32; 0 on the background.
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
         visible_fractions: Per object, its visible pixels over those of its whole silhouette,

@@ -45,16 +45,11 @@ class Sensors:
     Blur and motion belong to the preset's image size and follow it when it is resized.
 
     Attributes:
-        exposure_probability: Chance that the picture is brighter or darker.
         exposure_ev: By how much, stops.
-        blur_probability: Chance of a defocus.
         blur_px: Its standard deviation, pixels.
-        motion_probability: Chance of a motion blur, in any direction.
         motion_px: Its length, pixels.
-        noise_probability: Chance of noise.
         read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
         shot_noise: Standard deviation of the signal-dependent noise at white, grey levels.
-        jpeg_probability: Chance of a JPEG compression.
         jpeg_quality: Its quality, 1 to 100.
     """
 
@@ -116,10 +111,6 @@ def capture(image: Image, sensor: Sensor) -> Image:
     Exposure works on linear light. Both blurs work on the sRGB picture, which spreads highlights
     a little less than light would.
 
-    Args:
-        image: RGB, sRGB-encoded.
-        sensor: Its settings.
-
     Raises:
         UserError: A setting is outside of what :class:`~dopepp.virtual.scene.Sensor` says.
     """
@@ -152,12 +143,9 @@ def motion_blur(image: Image, motion_px: tuple[float, float]) -> Image:
 def add_noise(image: Image, read: float, shot: float, seed: int) -> Image:
     """Add Gaussian noise, independent per pixel and channel.
 
-    Args:
-        image: RGB.
-        read: Standard deviation of the signal-independent part, grey levels of 255.
-        shot: Standard deviation of the signal-dependent part at white, grey levels; its square
-            is proportional to the grey level.
-        seed: Any integer from 0 to 2³² − 1; the same seed gives the same noise.
+    ``read`` and ``shot`` are standard deviations in grey levels of 255: of the signal-independent
+    part, and at white of the signal-dependent one, whose square is proportional to the grey level.
+    The same ``seed`` (0 to 2³² − 1) gives the same noise.
     """
     noisy = np.empty(image.shape, np.uint8)
     values = np.ascontiguousarray(image).reshape(-1)

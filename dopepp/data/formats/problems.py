@@ -100,11 +100,8 @@ class CheckReport:
     """Keeps all problems, as defects: what a check does.
 
     Attributes:
-        root: The folder.
         layout: Which layout was found, e.g. ``BOP``.
-        num_images: Images that were looked at.
         defects: The first ``MAX_KEPT`` of them, in the order in which they were found.
-        num_defects: All of them.
         counts: Defects by kind, which is the field's last part.
         notes: What is worth knowing and no defect.
     """
@@ -215,12 +212,8 @@ def numbers(
 ) -> Float[np.ndarray, "..."]:
     """Return a field's numbers in a shape.
 
-    Args:
-        problems: Takes what is wrong.
-        path: The file.
-        where: The field.
-        value: A number, or (nested) lists of as many as the shape has; None where it is missing.
-        shape: What they are returned in; NaNs where they are anything else, or not finite.
+    ``value`` is a number, or (nested) lists of as many as ``shape`` has, None where it is missing.
+    Anything else, or what is not finite, becomes NaNs.
     """
     try:
         array = np.array(value)
@@ -264,10 +257,7 @@ def picture(
 ) -> Image.Image | None:
     """Decode a BOP image, None where it is missing, damaged, too large or of another format.
 
-    Args:
-        problems: Takes what is wrong.
-        path: The file.
-        content: Its bytes, where they do not lie on the disk by themselves.
+    ``content`` are its bytes, where they do not lie on the disk by themselves.
     """
     if content is None:
         content = attempt_file(problems, Path(path), "image", lambda: read_content(Path(path)))
@@ -316,11 +306,8 @@ def check_map(
 ) -> NDArray[Any] | None:
     """Read a map of YCB-Video, NDDS or FAT, None where that is impossible.
 
-    Args:
-        problems: Takes what is wrong.
-        path: The file.
-        shape: The colour image's (height, width); None for any.
-        colour: Whether it may have several channels, whose meaning no file states: then None.
+    ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
+    map of several channels, whose meaning no file states, gives None.
     """
     image = attempt_file(problems, path, "image", lambda: read_image(path))
     if image is not None and image.ndim > 2 and colour:
@@ -334,11 +321,7 @@ def one_channel(
 ) -> NDArray[Any] | None:
     """Return a map of numbers (depth, mask, labels), None where it cannot be the image's.
 
-    Args:
-        problems: Takes what is wrong.
-        path: The file's name.
-        image: What it holds, None where that could not be read.
-        shape: The colour image's (height, width); None for any.
+    ``shape`` is the colour image's (height, width); None for any.
     """
     if image is None:
         return None

@@ -120,11 +120,7 @@ def make_job(
 
 
 def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
-    """Return the class of a layout's writer; its module is imported only now.
-
-    Raises:
-        UserError: The layout is unknown.
-    """
+    """Return the class of a layout's writer; its module is imported only now."""
     if layout not in WRITERS:
         raise UserError(f"format {layout!r}", ", ".join(WRITERS), "choose one of them")
     module, name = WRITERS[layout]

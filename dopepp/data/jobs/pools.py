@@ -83,10 +83,6 @@ class ProcessPool(Pool):
 
     They are spawned, not forked: Mitsuba's thread pool does not survive a fork, and a spawned
     process starts alike on every system. It costs each of them about a second, once.
-
-    Args:
-        content: A pickled job and the data set's folder.
-        num_workers: Number of processes.
     """
 
     images_per_task = 2
@@ -148,11 +144,7 @@ class _Process:
         there.close()  # so that the pipe ends when the worker does
 
     def perform(self, task: Task) -> Outcome:
-        """Have a task done.
-
-        Raises:
-            StoppedError: The process has died.
-        """
+        """Have a task done."""
         try:
             if self._content is not None:
                 self.connection.send_bytes(self._content)
@@ -209,9 +201,7 @@ class ClusterPool(Pool):
     repeats the tasks of a machine that is lost.
 
     Args:
-        content: A pickled job and the data set's folder.
         address: The cluster's address; None starts one on this machine that ends with the job.
-        num_workers: Cores of that local cluster.
 
     Attributes:
         num_tasks: Tasks done so far, by the node's id.

@@ -35,12 +35,8 @@ _AXIS_LENGTH: Final = 0.5
 def write_preview(job: Job, out: Path) -> Path:
     """Write a contact sheet of the job's first images.
 
-    Args:
-        job: The job.
-        out: A PNG file, or the data set's folder: the sheet then lies beside it.
-
-    Returns:
-        Where the sheet is.
+    ``out`` is a PNG file, or the data set's folder: the sheet then lies beside it. Returns its
+    path.
 
     Raises:
         UserError: The preset cannot show the part, or the sheet cannot be written.

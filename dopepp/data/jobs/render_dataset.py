@@ -54,12 +54,10 @@ class RenderRequest:
     """How much of a job is done here, and by whom; it decides none of the bytes.
 
     Attributes:
-        out: The data set's folder.
         num: Images of the whole job.
         shard: ``i/n``.
         workers: Processes; None for one per core.
         engine: One of :data:`ENGINES`.
-        ray_address: Of a running Ray cluster.
     """
 
     out: Path
@@ -77,7 +75,6 @@ class RenderReport:
     Attributes:
         num_images: Images of the shard, all there now.
         num_rendered: Those that this run made.
-        wall_s: Seconds it took.
         render_s: CPU seconds of rendering.
         write_s: CPU seconds of encoding and writing.
     """
@@ -145,13 +142,7 @@ def render_dataset(
     What is there is kept: whatever stopped an earlier run, this one goes on. Several shards may
     share the folder at the same time; whoever completes a chunk finalizes it.
 
-    Args:
-        job: What to render.
-        root: The folder.
-        num_items: Images of the whole job.
-        open_pool: Makes the processes that do the work.
-        shard: Which part of the job; all of it by default.
-        on_progress: See :data:`OnProgress`.
+    ``open_pool`` makes the processes that do the work.
 
     Raises:
         UserError: The count, the folder or the preset cannot be right.
@@ -208,11 +199,7 @@ class _Run:
             yield Task(number, self._chunks[number].required, finalizes=True)
 
     def note(self, outcome: Outcome) -> None:
-        """Count an outcome.
-
-        Raises:
-            Exception: The outcome's error.
-        """
+        """Count an outcome."""
         task, report = outcome.task, self.report
         if outcome.error is not None:
             raise outcome.error
@@ -228,11 +215,7 @@ class _Run:
 
 
 class ProgressDisplay:
-    """An :data:`OnProgress`, while it is entered: a bar, or without a terminal lines in the log.
-
-    Args:
-        console: Where the bar goes.
-    """
+    """An :data:`OnProgress`, while it is entered: a bar, or without a terminal lines in the log."""
 
     def __init__(self, console: Console) -> None:
         self._bar = Progress(

@@ -26,12 +26,7 @@ from dopepp.virtual.factory import Factory
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several equal, contiguous parts of a job.
-
-    Attributes:
-        number: Which one, from 0.
-        total: How many there are.
-    """
+    """One of several equal, contiguous parts of a job."""
 
     number: int = 0
     total: int = 1
@@ -64,7 +59,6 @@ class Chunk:
     """What a shard has to do with a chunk.
 
     Attributes:
-        number: The chunk.
         required: All of the job's images in it, also those of other shards: with these it is
             finalized.
         missing: The shard's images in it that are not there yet.
@@ -93,7 +87,6 @@ class Task:
     """Images to render and write, or a chunk to finalize.
 
     Attributes:
-        chunk: The chunk it belongs to.
         indices: The images; for finalizing, those without which it must not happen.
         finalizes: Whether the chunk is to be finalized.
     """
@@ -108,10 +101,8 @@ class Outcome:
     """What came of a task.
 
     Attributes:
-        task: The task.
         render_s: CPU seconds that rendering took.
         write_s: CPU seconds that encoding and writing took.
-        error: What went wrong.
         node: Machine of a cluster that did it, by its id; empty for this one.
     """
 

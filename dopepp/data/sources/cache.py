@@ -45,9 +45,6 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
 
     All of its disk space is taken now: a disk that is full now is an error that can be told, and
     one that becomes full under a map with holes kills the process.
-
-    Raises:
-        UserError: The file cannot be made as large as it must be.
     """
     size = dtype.itemsize * num_items
     try:
@@ -79,7 +76,6 @@ class CachedSource:
     index, so two processes that fill one slot at once write the same bytes.
 
     Args:
-        source: The source to keep, of images of one size.
         input_size: (width, height) the images are shrunk to fit in, so no more than that is kept;
             None keeps size and depth, which training does not need.
         folder: Where to keep them across runs; None keeps them in memory, for this run. Each cache

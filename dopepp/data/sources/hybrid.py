@@ -58,13 +58,9 @@ class HybridSource:
 
     Args:
         real: Real camera frames; without them the real share is 0.
-        virtual: Renders.
         real_fraction: Share of ``real``, in [0, 1].
-        samples_per_epoch: Items of an epoch.
-        seed: Seed of the mix.
         synthetic: A data set's own synthetic frames.
         synthetic_fraction: Share of ``synthetic`` in what is not real, in [0, 1].
-        name: Name of the mix.
 
     Raises:
         UserError: No source at all, a fraction outside [0, 1], or no item in an epoch.

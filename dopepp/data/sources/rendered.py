@@ -26,10 +26,7 @@ class RenderedSource:
     """A range of a factory's images.
 
     Args:
-        factory: Renders an image as a pure function of (its seed, epoch, index).
-        num_items: Images of an epoch.
         split: Which of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
-        name: Name of the source.
         scale: How many times as large the parts appear: the camera of the same scenes, moved (see
             :mod:`dopepp.virtual.arrange.random_scene`).
 
@@ -57,11 +54,7 @@ class RenderedSource:
         return self._num_items
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Render item ``index``.
-
-        Raises:
-            IndexError: ``index`` is not in 0 … len − 1.
-        """
+        """Render item ``index``."""
         if not 0 <= index < self._num_items:
             raise IndexError(f"item {index} of {self._num_items}")
         epoch = epoch if self.split == "train" else 0

@@ -30,15 +30,10 @@ class Photometric:
     Args:
         brightness: Largest offset, as a share of 255.
         contrast: Largest relative change of the contrast about mid-grey.
-        saturation: Largest relative change of the saturation.
         hue: Largest hue rotation, radians.
         colour_gain: Largest relative change of each colour channel (white balance).
-        blur_probability: Chance of a Gaussian blur.
         blur_sigma: Range of its sigma, pixels.
-        noise_probability: Chance of Gaussian noise, independent per pixel and channel.
         noise_sigma: Range of its standard deviation, grey levels.
-        jpeg_probability: Chance of one JPEG compression.
-        jpeg_quality: Range of its quality, 1 … 100.
 
     Raises:
         ValueError: A range is negative or its ends are exchanged, or a probability is outside

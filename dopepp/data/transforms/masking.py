@@ -40,8 +40,6 @@ class BackgroundCrops:
     Args:
         image: RGB, unpadded, so that padding is never taken as background.
         silhouettes: What each object covers; no crop touches any of it.
-        min_contrast: See :data:`MIN_CONTRAST`.
-        max_draws: See :data:`MAX_DRAWS`.
     """
 
     def __init__(
@@ -145,10 +143,7 @@ def covered_instance(
 ) -> Instance:
     """Return an instance without the covered pixels; keypoints and pose stay as they are.
 
-    Args:
-        instance: Before covering.
-        seen: Its silhouette before covering.
-        covered: All covered pixels of the image.
+    ``seen`` is its silhouette before, ``covered`` are all covered pixels of the image.
     """
     before = int(np.count_nonzero(seen))
     if before == 0:
@@ -166,7 +161,6 @@ class RandomMask:
     """Cover each instance with one background patch, with a probability.
 
     Args:
-        probability: Chance of each instance to get a patch.
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
         min_contrast: A crop counts as solid when no colour channel's standard deviation reaches
@@ -197,10 +191,8 @@ class RandomMask:
     def __call__(self, sample: Sample, rng: np.random.Generator, other: Backgrounds) -> Sample:
         """Return a masked copy of the sample; the argument is not changed.
 
-        Args:
-            sample: Image with instances, unpadded, so that padding is never taken as background.
-            rng: The item's generator.
-            other: Gives another picture when the image has no fitting background left.
+        The image must be unpadded, so that padding is never taken as background; ``other`` gives
+        another picture when the image has no fitting background left.
         """
         silhouettes = [
             silhouette(instance, sample.image.shape[:2]) for instance in sample.instances

@@ -28,12 +28,7 @@ def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 
 def resize_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
-    """Scale a sample by one factor so that it just fits into ``input_size``, without padding.
-
-    Args:
-        sample: Any sample; it is not changed.
-        input_size: (width, height) in pixels.
-    """
+    """Scale a sample by one factor so that it just fits into ``input_size``, without padding."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample

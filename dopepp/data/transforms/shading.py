@@ -40,7 +40,6 @@ class Shaded:
     """An image with shaded objects.
 
     Attributes:
-        share: What was asked for.
         sample: The image; masks, visible fractions and masked fractions say what is left, depth is
             unknown where a patch lies.
         reached: The share of each instance's visible pixels that is covered; None of an instance
@@ -55,12 +54,8 @@ class Shaded:
 def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> list[Shaded]:
     """Shade an image's objects, once for each share.
 
-    Args:
-        sample: An image with instance masks; not changed.
-        shares: Of the visible pixels of each instance, each in [0, 1]. An image depends on its own
-            share alone, not on the others asked for.
-        seed: Seed of the protocol.
-        index: The image's place in the test set.
+    ``shares`` are of the visible pixels of each instance, each in [0, 1]: an image depends on its
+    own share alone, not on the others asked for. ``index`` is its place in the test set.
 
     Raises:
         ValueError: A share is outside [0, 1].
@@ -118,16 +113,11 @@ class _Cover:
     """Patches over one instance and the order in which they cover its box, pixel by pixel.
 
     Attributes:
-        box: Rows and columns of the instance's box.
-        pixels: What the patches show.
         order: When each pixel is covered, :data:`_NEVER` where none of the patches lies.
 
     Args:
-        seen: The instance's visible pixels, at least one.
         spared: Pixels that no patch may cover.
-        crops: The image's background.
         share: Up to which share of the visible pixels patches are needed.
-        rng: The instance's generator.
     """
 
     def __init__(

@@ -45,12 +45,8 @@ def decimate(
 ]:
     """Replace triangles by at most ``max_faces`` larger ones.
 
-    Args:
-        vertices: Positions.
-        faces: Triangles with an area.
-        uv: Texture coordinates per vertex. Vertices that share a position and a cell but no edge,
-            such as those on both sides of a seam, keep coordinates of their own.
-        max_faces: How many triangles may remain.
+    All ``faces`` have an area. Vertices that share a position and a cell but no edge, such as those
+    on both sides of a seam, keep texture coordinates of their own.
 
     Returns:
         Vertices, faces and uv, and the largest distance that a vertex was moved by.

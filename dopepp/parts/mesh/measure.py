@@ -187,10 +187,6 @@ class SurfaceTree:
     A point is measured against the triangles of its nearest surface points, so that its distance
     is never too small, and too large by no more than the surface points are apart.
 
-    Args:
-        vertices: Positions in any unit.
-        faces: Triangles.
-
     Raises:
         ValueError: The triangles have no area.
     """

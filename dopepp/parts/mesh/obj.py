@@ -39,9 +39,7 @@ class ObjFile:
         coordinates: u, v of each ``vt`` line.
         corners: Position and coordinate index of each corner of each ``f`` line.
         counts: Corners of each ``f`` line.
-        lines: Its number in the file.
         materials: Names of the materials that faces use; None for faces before any ``usemtl``.
-        libraries: Names of the MTL files.
     """
 
     positions: array[float] = field(default_factory=lambda: array("d"))
@@ -203,10 +201,8 @@ def _text(path: Path) -> str:
 def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     """Return the path of a file that a mesh file names.
 
-    Args:
-        mesh_path: The mesh's path.
-        name: What it wrote, relative to its own folder; Windows separators are understood.
-        statement: Where the name stands, for the error.
+    ``name`` is relative to the mesh's folder, Windows separators are understood; ``statement``
+    tells, for the error, where it stands.
 
     Raises:
         UserError: The name leads out of the mesh's folder, or there is no such file.

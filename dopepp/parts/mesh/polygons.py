@@ -61,10 +61,8 @@ def fans(
 ) -> Int[np.ndarray, "triangles 3"]:
     """Cut polygons into fans of triangles around their first corners.
 
-    Args:
-        vertices: Positions.
-        corners: The vertex at each corner, one polygon behind the other.
-        counts: Corners of each polygon.
+    ``corners`` has the vertex at each corner, one polygon behind the other; ``counts`` the corners
+    of each.
 
     Returns:
         Triangles, each as three places in ``corners``.

@@ -22,7 +22,6 @@ class Topology:
 
     Attributes:
         num_open: Edges of one triangle: the rim of a hole.
-        num_crowded: Edges of three triangles or more.
         neighbours: The two triangles at every other edge.
         opposed: Whether these two run along the edge in the same direction, so that one of them
             shows its inside where the other one shows its outside.

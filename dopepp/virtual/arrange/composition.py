@@ -41,8 +41,6 @@ class Composition:
     """Objects that a preset accepts beside each other.
 
     Args:
-        preset: The distribution of scenes.
-        rng: Source of randomness.
         negatives: The bodies that a distractor may be instead of a primitive.
     """
 
@@ -73,11 +71,7 @@ class Composition:
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
     def add(self, body: Body, T_cam_obj: Float[np.ndarray, "4 4"], material: Material) -> bool:
-        """Add a body where it stands before the camera and no target is hidden too much.
-
-        Returns:
-            Whether it was added.
-        """
+        """Add a body where it stands before the camera and no target is hidden too much."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
             return False
@@ -99,13 +93,7 @@ class Composition:
 
 
 class Preview:
-    """The objects accepted so far, seen coarsely.
-
-    Args:
-        K: Camera matrix of the image, pixels.
-        size: Image (width, height), pixels.
-        min_visible: Smallest visible fraction of every target.
-    """
+    """The objects accepted so far, seen coarsely."""
 
     def __init__(
         self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], min_visible: float
@@ -120,11 +108,7 @@ class Preview:
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object if every target, itself included, stays visible enough.
-
-        Returns:
-            Whether it was added; if not, nothing has changed.
-        """
+        """Add an object if every target, itself included, stays visible enough."""
         layer = self._draw(item)
         if layer is None:
             return False

@@ -35,10 +35,8 @@ _CORE: Final = 0.6
 def arrange_floating(composition: Composition, targets: Sequence[Body], usual: Body) -> float:
     """Place targets and distractors.
 
-    Args:
-        composition: Empty; they are added to it.
-        targets: What to place; none if the first finds no place.
-        usual: The body to take the depth from where there is no target.
+    There are no targets if the first finds no place; ``usual`` is the body to take the depth from
+    where there is no target.
 
     Returns:
         The targets' mean depth, metres.

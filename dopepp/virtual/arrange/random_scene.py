@@ -38,14 +38,9 @@ def random_scene(
 ) -> Scene:
     """Draw a scene.
 
-    Args:
-        preset: Its distribution.
-        targets: The parts' bodies to choose targets from.
-        negatives: The bodies that a distractor may be instead of a primitive.
-        rng: Source of randomness; the scene is a pure function of its state.
-        backgrounds: Where the background comes from.
-        scale: How many times as large the targets appear as the preset has it. It decides from
-            where the scene is seen, nothing else.
+    The scene is a pure function of the state of ``rng``. A distractor may be one of ``negatives``
+    instead of a primitive. ``scale`` is how many times as large the targets appear as the preset
+    has it: it decides from where the scene is seen, nothing else.
 
     Raises:
         UserError: The part is too large or too small for the preset to show it, or the scale takes

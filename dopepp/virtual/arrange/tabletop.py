@@ -57,10 +57,7 @@ def arrange_on_table(
 ) -> Float[np.ndarray, "4 4"]:
     """Choose a view and place targets and distractors.
 
-    Args:
-        composition: Empty; objects are added to it, no target if none finds a place.
-        table: How they may lie.
-        targets: What to place.
+    They are added to an empty ``composition``; no target if none finds a place.
 
     Returns:
         T_cam_table, which maps the table's frame (z up, plane z = 0) to the camera's.
@@ -85,8 +82,6 @@ class _Lying:
     """One way in which a body could lie.
 
     Attributes:
-        T_table_obj: Its pose in the table's frame.
-        footprint: What it covers.
         place: x and y of its origin, in the height map's cells.
         height: Of its lowest point above the plane, metres.
         centre: Of its centre of mass above the plane, metres.
@@ -193,7 +188,6 @@ class HeightMap:
     """What lies on the table.
 
     Args:
-        cell: Size of a cell, metres.
         reach: The map covers x and y from −reach to reach, metres; beyond it nothing can lie.
     """
 
@@ -208,10 +202,7 @@ class HeightMap:
     ) -> Footprint | None:
         """See a turned object from below and above.
 
-        Args:
-            surface: The object.
-            rotation: From the object to the table frame.
-            lowest: Height of its lowest point relative to its origin, metres.
+        ``lowest`` is the height of its lowest point relative to its origin, metres.
 
         Returns:
             None where the object covers too many cells.
@@ -244,9 +235,7 @@ class HeightMap:
     def height(self, footprint: Footprint, place: tuple[int, int]) -> float | None:
         """Return how high an object's lowest point would come to lie, metres.
 
-        Args:
-            footprint: The object.
-            place: x and y of its origin, in cells.
+        ``place`` is x and y of its origin, in cells.
 
         Returns:
             None beyond the map.

@@ -57,10 +57,7 @@ class Distractors:
     ) -> Body:
         """Draw a distractor.
 
-        Args:
-            rng: Source of randomness.
-            width_at_depth: What the image's width shows at the distractor's depth, metres.
-            negatives: Other parts.
+        ``width_at_depth`` is what the image's width shows at its depth, metres.
         """
         if rng.random() < self.lookalike_share and negatives:
             negative = negatives[int(rng.integers(len(negatives)))]

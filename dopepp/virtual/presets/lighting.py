@@ -37,8 +37,6 @@ class Lighting:
 
     Attributes:
         num_lights: Smallest and largest number of point lights; the first casts shadows.
-        key_intensity: Of the first light.
-        fill_intensity: Of every other light.
         ambient_intensity: Of the light from everywhere.
         max_angle_deg: Largest angle between a light's direction and the camera's, as seen from
             the scene; 0 is a flash light on the camera, 90 a light from the side. Over a plane,
@@ -79,10 +77,8 @@ class Lighting:
     ) -> tuple[tuple[Light, ...], Ambient]:
         """Draw point lights around a point of the scene, and the ambient light.
 
-        Args:
-            rng: Source of randomness.
-            centre: What the lights stand around, camera frame, metres.
-            normal: Of the supporting plane, camera frame; None where there is none.
+        They stand around ``centre``; ``normal`` is the supporting plane's, None where there is
+        none; both in the camera frame, metres.
         """
         towards = np.array([0.0, 0.0, -1.0]) if normal is None else normal
         far = float(np.linalg.norm(centre))

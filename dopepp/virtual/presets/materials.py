@@ -31,15 +31,12 @@ class Materials:
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
-        saturation: Of the coloured ones, as in HSV.
         roughness: GGX roughness of dielectrics.
         specular: Their reflectance at normal incidence.
         texture_gain: Factor on the colours of textured surfaces.
         noise: Relative amplitude of the albedo's variation over an untextured surface.
         noise_pitch: Size of that variation over the object's radius.
-        metal_share: Share of untextured surfaces that are bare metal.
         metal_albedo: Their reflectance at normal incidence.
-        metal_roughness: Their GGX roughness.
         brushed_share: Share of metals that are brushed.
         brush_pitch: Mean distance of brush marks, metres.
         brush_slope: Largest slope of their flanks, the tangent of the normal's tilt.

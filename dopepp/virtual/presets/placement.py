@@ -51,11 +51,7 @@ class Placement(Protocol):
     ) -> Vector:
         """Return the object's origin in the camera frame, metres.
 
-        Args:
-            rng: Source of randomness.
-            K: Camera matrix, pixels.
-            size: Image (width, height), pixels.
-            rotated_hull: The object's extreme vertices, already turned into camera axes, metres.
+        ``rotated_hull``: its extreme vertices, already turned into camera axes, metres.
         """
 
     def redraw(self, rng: np.random.Generator, place: Vector) -> Vector | None:
@@ -64,9 +60,7 @@ class Placement(Protocol):
         What a placement keeps of such a place has the distribution it was drawn from, however often
         the camera does not see the object there.
 
-        Args:
-            rng: Source of randomness.
-            place: The last place tried, metres.
+        ``place`` is the last place tried, metres.
 
         Returns:
             Another place for the same orientation; None to draw both anew.
@@ -122,7 +116,6 @@ class OffsetPlacement(Placement):
     is uniform over those at which the object is seen there.
 
     Attributes:
-        distance: Of the box's centre from the camera, metres.
         axial: Largest offset along the optical axis to either side, metres.
         lateral: Largest offset along image x and along image y to either side, metres.
     """
@@ -163,7 +156,6 @@ class DistancePlacement(Placement):
 
     Attributes:
         nearest: Smallest depth of the object's origin, metres.
-        farthest: Largest depth, metres.
         margin: Share of the image's width and height that the origin keeps from the border.
     """
 
@@ -198,10 +190,6 @@ class FillPlacement(Placement):
 
     The share is the larger of bounding-box width over image width and bounding-box height over
     image height. The distance follows from it by iteration.
-
-    Attributes:
-        smallest: Smallest share.
-        largest: Largest share.
     """
 
     smallest: float = 0.60

@@ -43,14 +43,10 @@ class Preset:
     """A distribution of scenes.
 
     Attributes:
-        name: Its name.
-        width: Image width, pixels.
-        height: Image height, pixels.
         horizontal_fov_deg: Horizontal field of view, degrees, of a camera with square pixels that
             looks through the image's middle; ignored where ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
         turning: Distribution of the targets' orientation; of no use on a table.
-        placement: Distribution of the targets' position; of no use on a table.
         table: The plane that everything lies on; None for objects in mid-air.
         targets_per_image: Smallest and largest number of targets, each a random part; one after
             the first that finds no place is left out. Images without any are for learning and
@@ -59,10 +55,7 @@ class Preset:
             a bounded number of times, to keep it.
         centroid_inside: Whether the image of every target's cuboid centre must lie inside the
             frame.
-        lighting: Distribution of light.
         materials: Distribution of what targets and distractors are made of.
-        distractors: Distribution of distractors.
-        sensors: Distribution of what the camera does to the light.
     """
 
     name: str
@@ -178,11 +171,9 @@ PRESETS: dict[str, Preset] = {
 def customised_preset(name: str, changes: Mapping[str, Any]) -> Preset:
     """Return a preset by name, with nested fields replaced.
 
-    Args:
-        name: Key of :data:`PRESETS`.
-        changes: Field to value; for a field that is itself a group of fields, a mapping, e.g.
-            ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the
-            preset lacks (``table`` of ``paper``) starts from its defaults; None takes it away.
+    ``changes`` give a value by field or, for a field that is itself a group of fields, a mapping,
+    e.g. ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the preset
+    lacks (``table`` of ``paper``) starts from its defaults; None takes it away.
 
     Raises:
         UserError: The name or a field is unknown, or a value is of the wrong kind or outside of
@@ -209,11 +200,7 @@ def _changed(described: T, changes: Any, where: str) -> T:
 def _converted(value: Any, hint: Any, old: Any, where: str) -> Any:
     """Return a plain value as what a field's annotation asks for.
 
-    Args:
-        value: The plain value.
-        hint: The annotation: a number, a text, a tuple of them, a group, or one of these or None.
-        old: The value to be replaced; a group's other fields stay as they are there.
-        where: The field, for messages.
+    A group's other fields stay as they are in ``old``; ``where`` names the field in messages.
     """
     if get_origin(hint) is UnionType:
         if value is None:

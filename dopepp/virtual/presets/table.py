@@ -35,8 +35,6 @@ class Table:
         elevation_deg: Angle between the plane and the camera's line of sight; 90 looks straight
             down.
         roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
-        tilted_share: Share of objects that do not rest but lean over.
-        tilt_deg: By how much, degrees.
         heaped: Whether objects are dropped onto a heap; otherwise each lies on the plane beside
             the others.
         heap_radius: Radius within which a heap's objects are dropped, in units of the largest

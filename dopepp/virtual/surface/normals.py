@@ -52,12 +52,9 @@ def corner_normals(
 ) -> Float[np.ndarray, "faces 3 3"]:
     """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
 
-    Args:
-        merged: Merged vertex of every corner.
-        doubled: Cross product of two edges of every face: its normal, twice its area long.
-        length: Length of the same.
-        edges: The three edge vectors of every face.
-        crease_angle_deg: Faces that meet at a larger angle keep a sharp edge.
+    ``merged`` is the merged vertex of every corner; ``doubled`` the cross product of two ``edges``
+    of every face (its normal, twice its area long), ``length`` its length. Faces that meet at more
+    than ``crease_angle_deg`` keep a sharp edge.
     """
     face_normals = doubled / np.maximum(length, 1e-300)[:, None]
     unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)

@@ -73,11 +73,7 @@ def bake_open_sky(
 
     The last ones are kept, because a run prepares its parts anew for every set of its data.
 
-    Args:
-        vertices: Object frame, metres.
-        faces: Vertex indices.
-        normals: Unit normal of every corner.
-        closed: Whether nobody sees the back sides.
+    ``normals`` are of every corner; ``closed`` tells that nobody sees the back sides.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):

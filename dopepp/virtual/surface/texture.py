@@ -56,13 +56,7 @@ def make_texture(
     uv: Float[np.ndarray, "vertices 2"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> Texture:
-    """Build the pyramid of an image that a mesh uses.
-
-    Args:
-        image: RGB, first row on top.
-        uv: Texture coordinates per vertex, v up.
-        faces: The vertices of every triangle.
-    """
+    """Build the pyramid of an image that a mesh uses."""
     shapes = [image.shape[:2]]
     while max(shapes[-1]) > 1:
         shapes.append((max(shapes[-1][0] // 2, 1), max(shapes[-1][1] // 2, 1)))

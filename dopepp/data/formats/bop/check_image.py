@@ -120,16 +120,8 @@ def check_image(
 ) -> None:
     """Check camera, poses, boxes, counts and masks.
 
-    Args:
-        report: Takes the defects.
-        place: Says where a record stands.
-        camera: The image's camera record; None where there is none.
-        truths: Its ``gt`` records.
-        infos: Its ``gt_info`` records, one for each of them.
-        shape: (height, width) of the image; None where it cannot be read.
-        has_depth: Whether its depth must have a scale.
-        models: The objects; None where they are not known.
-        silhouettes: The masks.
+    ``shape`` is the image's (height, width), None where it cannot be read; ``has_depth`` tells
+    whether its depth must have a scale.
     """
     K = None if camera is None else _check_camera(report, place, camera, shape, has_depth)
     poses = read_poses(truths, infos, place, report)

@@ -28,10 +28,6 @@ _MAX_UNITS: Final = 65_535
 def decode_rgb(content: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Read a colour or grey image as RGB; an alpha channel is dropped.
 
-    Args:
-        content: The file.
-        where: Its name, for the error.
-
     Raises:
         UserError: It is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
     """
@@ -47,11 +43,7 @@ def decode_depth(
 ) -> Float[np.ndarray, "height width"]:
     """Read a depth image as metres, float32, 0 where unknown.
 
-    Args:
-        content: The file.
-        where: Its name, for the error.
-        depth_scale: Millimetres a unit; NaN where it is not stated.
-        shape: (height, width) of the colour image.
+    ``depth_scale`` is millimetres a unit, NaN where it is not stated; ``shape`` the colour image's.
 
     Raises:
         UserError: As :func:`decode_rgb`, or it is of another size, has no whole numbers, or no
@@ -87,12 +79,8 @@ def one_channel_of(
 ) -> NDArray[Any] | None:
     """Read a depth image or a mask as it is, None where that is impossible.
 
-    Args:
-        problems: Takes what is wrong.
-        path: The file.
-        shape: The colour image's (height, width); None for any.
-        content: Its bytes, where they do not lie on the disk by themselves.
-        modes: Pillow's names of the pixels it may have; none for any with one channel.
+    ``content`` are its bytes, where they do not lie on the disk by themselves; ``modes`` Pillow's
+    names of the pixels it may have, none for any with one channel.
     """
     image = picture(problems, path, content)
     if image is None:
@@ -119,9 +107,7 @@ def depth_units(
     The finest scale that reaches to the farthest object is taken, which is 0.1 mm within 6.5 m.
     What lies beyond the scale's range (a background) becomes 0, unknown.
 
-    Args:
-        depth: Metres, 0 where unknown.
-        covered: The objects' pixels.
+    ``depth`` is in metres, 0 where unknown; ``covered`` are the objects' pixels.
     """
     farthest = 1000 * float(depth[covered].max(initial=0.0))
     fine, coarse = DEPTH_SCALES_MM
@@ -149,12 +135,7 @@ def decode_runs(
 
     It must have that size, so a file cannot ask for more memory, and its runs must fill it.
 
-    Args:
-        record: A plain JSON value that anybody may have written.
-        shape: The image's (height, width).
-        path: The file.
-        where: The mask's place in it.
-        problems: Takes what is wrong.
+    ``record`` is a plain JSON value that anybody may have written.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")

@@ -56,8 +56,6 @@ class ModelInfo:
     """One object of ``models_info.json``.
 
     Attributes:
-        name: The part's name.
-        path: Its PLY file.
         diameter: Metres; NaN where it is not stated.
         symmetries_discrete: Rigid transforms without the identity, (S, 4, 4), metres; or None.
         symmetries_continuous: (axis, offset) pairs, metres.
@@ -73,9 +71,7 @@ class ModelInfo:
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
     """Make parts from a BOP data set's models, with their symmetries.
 
-    Args:
-        root: The data set's folder.
-        objects: Names of the objects, in the order wanted; None takes all, by number.
+    ``objects`` are names in the order wanted; None takes all, by number.
 
     Raises:
         UserError: There are no models, an object is unknown, or a file is damaged.
@@ -154,13 +150,7 @@ def info_path(root: Path) -> Path | None:
 
 
 def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
-    """Return the objects of what a ``models_info.json`` holds, by number.
-
-    Args:
-        path: The file.
-        records: What it holds.
-        problems: Takes what is wrong, e.g. two objects of one name.
-    """
+    """Return the objects of what a ``models_info.json`` holds, by number."""
     if not isinstance(records, dict):
         problems.report(path, "top level", f"{records!r:.60}", _ALLOWED)
     infos: dict[int, ModelInfo] = {}
@@ -299,9 +289,7 @@ def model_info(part: Part) -> dict[str, object]:
 def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
     """Return a mesh as binary PLY.
 
-    Args:
-        mesh: Metres.
-        texture_name: File name of its texture, written beside the PLY; None without one.
+    Its texture, named ``texture_name``, is written beside it.
     """
     textured = texture_name is not None and mesh.uv is not None
     names = ["x", "y", "z", "nx", "ny", "nz"]

@@ -92,11 +92,8 @@ def read_poses(
     A field that is missing or of another shape, a matrix that is no rotation, and a fraction that
     is not in [0, 1] is a problem.
 
-    Args:
-        truths: Records with ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``.
-        infos: As many records with ``visib_fract``; None where there are none.
-        place: Says where a record stands.
-        problems: Takes what is wrong.
+    ``truths`` have ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``; ``infos``, one
+    for each of them or None, have ``visib_fract``.
     """
 
     def report(number: int, field: str, got: str, allowed: str, what: str = "gt") -> None:
@@ -141,14 +138,6 @@ def make_instance(
     A fraction that is not stated (NaN) is estimated: mask pixels or, without a mask, the hull's
     area inside the image, over the area of the convex hull of the projected ADD points. For a
     concave object that comes out too small.
-
-    Args:
-        part: The object.
-        T_cam_obj: Its pose, metres.
-        K: Camera matrix, pixels.
-        visible_fraction: As stated, or NaN.
-        mask: Its visible pixels, or None.
-        shape: (height, width) of the image.
     """
     if math.isnan(visible_fraction):
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), shape)

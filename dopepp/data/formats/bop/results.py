@@ -50,10 +50,6 @@ class PoseResult:
     """One estimated pose.
 
     Attributes:
-        scene_id: BOP's number of the scene.
-        im_id: BOP's number of the image in it.
-        obj_id: BOP's number of the object.
-        score: Confidence.
         T_cam_obj: Object-to-camera transform, metres.
         seconds: What the whole image took; −1 where unknown.
     """
@@ -88,9 +84,7 @@ def write_results(path: Path, results: Sequence[PoseResult]) -> None:
 def read_results(path: Path, objects: Collection[int]) -> list[PoseResult]:
     """Read a results file; the header may be missing, and blank lines do not matter.
 
-    Args:
-        path: The file.
-        objects: Numbers of the data set's objects.
+    ``objects`` are the numbers of the data set's objects.
 
     Raises:
         UserError: The file is missing, not text, or has more than 500,000 poses; a line has

@@ -50,14 +50,11 @@ class SceneFolder:
     """A scene's images, in the order of their numbers.
 
     Attributes:
-        folder: The scene's folder.
         image_ids: BOP's ``im_id`` of every image.
         files: File of every image, relative to the folder; empty where it is not on disk.
-        K: Camera matrix of every image, pixels.
         depth_scales: Millimetres a unit of its depth image; NaN where not stated.
         first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
         gt_ids: Each object's place in its image's list, which names its masks.
-        poses: The objects of interest.
         num_other: Objects that are none of the parts.
         num_behind: Objects of interest behind the camera, left out like the others.
     """

@@ -66,13 +66,11 @@ class BopSource:
     :func:`~dopepp.data.formats.bop.records.make_instance`.
 
     Args:
-        root: The data set's folder, with ``models/`` beside the split.
         parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
         split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
         targets: File in ``root`` that selects images, e.g. ``test_targets_bop19.json``.
         part_of: Consecutive share of the images to take, as (first, last) fractions: disjoint
             shares of one folder serve training, validation and test.
-        read_depth: Whether samples carry depth; training does not need it.
 
     Raises:
         UserError: The folder or a file in it is wrong, or no image is left.
@@ -137,11 +135,7 @@ class BopSource:
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an image; the epoch does not matter.
-
-        Raises:
-            UserError: A file is missing or damaged, sizes differ, or K is impossible.
-        """
+        """Read an image; the epoch does not matter."""
         number, row = self._items[index]
         scene = self._scenes[number]
         path = scene.folder / scene.files[row]

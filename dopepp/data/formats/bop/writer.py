@@ -55,9 +55,7 @@ class BopFolder:
     """What the writers of BOP's layouts share: a folder with models beside a split of images.
 
     Args:
-        root: The data set's folder.
         parts: The objects, numbered from 1 in this order.
-        split: Name of the split's folder.
     """
 
     chunk_size = IMAGES_A_SCENE
@@ -175,11 +173,7 @@ class Labels:
 
     Attributes:
         camera: ``cam_K`` and ``depth_scale``.
-        truths: One ``scene_gt`` record per instance.
-        infos: One ``scene_gt_info`` record per instance.
         depth: Units of ``depth_scale`` mm, 0 where unknown.
-        masks: Whole silhouettes within the image.
-        visible_masks: Visible pixels.
     """
 
     camera: Record
@@ -199,10 +193,7 @@ def make_labels(
     coordinates (a single pixel has width 0), −1 for an object of which no pixel is visible; the
     silhouette counts beyond the image's border.
 
-    Args:
-        sample: An image with depth and masks.
-        object_ids: BOP's object number by label.
-        parts: Part and surface by label.
+    ``object_ids`` are BOP's numbers by label, ``parts`` parts and surfaces by label.
 
     Raises:
         ValueError: The sample has no depth, an instance has no mask, or a label is unknown.

@@ -90,15 +90,7 @@ class Majority:
 
 
 class ObjectCheck:
-    """One object; lengths are in the file's unit, whatever it is.
-
-    Args:
-        report: Takes the defects.
-        path: The annotation.
-        one: The object as the reader understands it.
-        item: The object as it is in the file.
-        majority: Collects what the data set does one way or the other.
-    """
+    """One object; lengths are in the file's unit, whatever it is."""
 
     def __init__(
         self,
@@ -125,11 +117,7 @@ class ObjectCheck:
     ) -> None:
         """Check pose, cuboid, projections and boxes.
 
-        Args:
-            K: Camera matrix, None where it is not known.
-            shape: (height, width) of the image, None where it cannot be read.
-            mask: The object's pixels, None where they are not known.
-            sides: Its class's ``cuboid_dimensions``, None where they are not known.
+        What is not known is None; ``sides`` are its class's ``cuboid_dimensions``.
         """
         rotations = self._rotations()
         if self._cuboid is not None and not _is_box(self._cuboid):

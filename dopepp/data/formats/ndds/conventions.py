@@ -93,12 +93,8 @@ class Observation:
     """An annotated object whose part is known: what a convention can be tried on.
 
     Attributes:
-        item: What the annotation says.
-        part: The part.
-        K: The image's camera matrix, pixels.
         fixed: The class's ``fixed_model_transform``, rigid, translation in the file's unit; None
             where there is none.
-        path: The annotation, for errors.
     """
 
     item: NddsObject
@@ -195,13 +191,11 @@ class Finding:
     """The convention of a data set, and how sure it is.
 
     Attributes:
-        convention: The one that fits.
         error_px: Three quarters of the instances are no farther than this from
             ``projected_cuboid``.
         rival_px: The same of the best convention that gives other poses.
         undecided: Conventions that give the same poses in these instances, e.g. of a turn whose
             quaternion reads the same in both orders.
-        num_instances: How many instances were compared.
     """
 
     convention: PoseConvention
@@ -225,9 +219,7 @@ class Finding:
 def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     """Find the one convention under which the part's cuboid lands on ``projected_cuboid``.
 
-    Args:
-        observations: Instances with ``projected_cuboid``; one is enough in most cases.
-        where: The data set, for errors.
+    ``observations`` have ``projected_cuboid``; one is enough in most cases.
 
     Raises:
         UserError: None fits three quarters of the instances within 5 px, or two that give different

@@ -40,8 +40,6 @@ class NddsObject:
 
     Attributes:
         field: Where it stands, e.g. ``objects[2]``.
-        label: Its ``class``.
-        location: Three numbers.
         quaternion: The four numbers under ``quaternion_xyzw``, in whatever order.
         corners_px: ``projected_cuboid`` without its centroid; None where it is not given.
         cuboid: The same corners in space; None where they are not given.

@@ -63,12 +63,7 @@ def image_of(annotation: Path) -> Path | None:
 
 
 class Settings:
-    """The settings files of a data set, each read once and only when it is needed.
-
-    Args:
-        root: The data set's folder.
-        problems: Takes what is wrong with them.
-    """
+    """The settings files of a data set, each read once and only when it is needed."""
 
     def __init__(self, root: Path, problems: Problems = STRICT) -> None:
         self._root, self._problems = root, problems
@@ -216,10 +211,7 @@ class Masks:
     """The masks of one image; its labels are read when the first one is asked for.
 
     Args:
-        objects: The annotation's, as :func:`~dopepp.data.formats.ndds.fields.objects_of` has them.
         has_own_ids: Whether labels are known to be ``segmentation_id``, never a class's.
-        annotation: The annotation.
-        settings: The data set's settings.
         read: Reads the labels, None where there are none to be understood.
     """
 
@@ -240,12 +232,7 @@ class Masks:
     def of(
         self, segmentation_id: int | None, label: str
     ) -> Bool[np.ndarray, "height width"] | None:
-        """Return an instance's mask, or None where its pixels' value is unknown or not only its.
-
-        Args:
-            segmentation_id: The object's own value, if it has one.
-            label: Its class.
-        """
+        """Return an instance's mask, or None where its pixels' value is unknown or not only its."""
         class_id = None
         if not self._has_own_ids:
             class_id = self._settings.class_id(self._annotation, label)

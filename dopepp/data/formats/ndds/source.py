@@ -74,12 +74,10 @@ class NddsSource:
     FAT's naming (``.left``, ``.right``) says it is 0.1 mm.
 
     Args:
-        folder: The data set's folder.
         parts: The objects to return; an instance's ``class`` is a part's name, or FAT's form of it
             (``NAME_16k``), or one that ``classes`` translates.
         part_of: First and last share of the sorted items to use, e.g. (0, 0.9) and (0.9, 1).
         classes: Names of parts by the class names that the files use for them.
-        read_depth: Whether samples carry depth; training does not need it.
 
     Raises:
         UserError: The folder has no items, a setting is damaged, no instance of the parts is there,

@@ -65,12 +65,7 @@ _DATA_SUFFIXES: Final = (".json", ".png", ".jpg", ".tar")
 
 
 class NddsWriter:
-    """Writes samples as one NDDS folder.
-
-    Args:
-        root: The folder.
-        parts: The parts that the samples' instances may be of.
-    """
+    """Writes samples as one NDDS folder."""
 
     name = "ndds"
     chunk_size = 1000
@@ -202,11 +197,7 @@ def object_record(
 ) -> dict[str, Any]:
     """Return one of an annotation's ``objects``.
 
-    Args:
-        number: Its number on the image, from 1: its id and its value in ``.seg.png``.
-        instance: The instance.
-        cuboid_obj: Its part's cuboid, metres, object frame.
-        K: Camera matrix, pixels.
+    ``number``, from 1, is its id and its value in ``.seg.png``; ``cuboid_obj`` its part's, metres.
     """
     cuboid = transform(instance.T_cam_obj, cuboid_obj)
     rotation, location = instance.T_cam_obj[:3, :3], CM * instance.T_cam_obj[:3, 3]

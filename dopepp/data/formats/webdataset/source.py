@@ -48,12 +48,9 @@ class WebdatasetSource:
     ``gt_info.json``; without it, see :func:`~dopepp.data.formats.bop.records.make_instance`.
 
     Args:
-        root: The data set's folder, with ``models/`` in it where the data set has models.
         parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
         shards: A folder in ``root``, a file or a URL, or several; see
             :func:`~dopepp.data.formats.webdataset.shards.find_shards`.
-        part_of: Consecutive share of the images to take, as (first, last) fractions.
-        read_depth: Whether samples carry depth; training does not need it.
         download_dir: Where shards from URLs are kept; None refuses URLs.
         allow_commands: Whether ``pipe:`` may run a command.
 
@@ -88,11 +85,7 @@ class WebdatasetSource:
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an image; the epoch does not matter.
-
-        Raises:
-            UserError: A member is damaged, sizes differ, or a pose or K is impossible.
-        """
+        """Read an image; the epoch does not matter."""
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
         records = self._records(shard, image)
         content = shard.read(image, "image")
@@ -162,7 +155,6 @@ class ShardRecords:
     Args:
         start: What the members' paths begin with, ``SHARD/KEY``.
         read: Returns a member's content by its name, e.g. ``gt``; None where there is none.
-        problems: Takes what is wrong.
     """
 
     def __init__(

@@ -53,8 +53,6 @@ class ShardIndex:
     """The images of a shard, in its order.
 
     Attributes:
-        path: The shard.
-        keys: Key of every image.
         spans: First byte and size of every image's :data:`FIELDS`; −1 where it has none.
     """
 
@@ -63,11 +61,7 @@ class ShardIndex:
     spans: Int64[np.ndarray, "images 6 2"]
 
     def read(self, image: int, field: str) -> bytes | None:
-        """Return a member's content; None where the image has none.
-
-        Raises:
-            UserError: The shard has become shorter or has gone.
-        """
+        """Return a member's content; None where the image has none."""
         offset, size = self.spans[image, FIELDS.index(field)].tolist()
         return None if offset < 0 else read_span(self.path, offset, size)
 

@@ -79,7 +79,6 @@ class FrameMeta:
         poses: T_cam_obj of every object, by class index (from 1), metres; with NaN where damaged.
         columns: Where each of them stands in the file's ``poses``.
         K: Camera matrix in pixels, None where the file has none.
-        factor_depth: Depth image values per metre.
     """
 
     poses: Mapping[int, Float[np.ndarray, "4 4"]]
@@ -206,7 +205,6 @@ class YcbFrame:
         image: RGB, with alpha on synthetic frames.
         label: Class index of every pixel, 0 where no object is labelled.
         depth: Metres, 0 where unknown; None where it was not asked for.
-        K: Camera matrix, pixels.
         poses: T_cam_obj of every object, by class index, metres.
     """
 

@@ -46,14 +46,12 @@ class YcbVideoSource:
     the image border counts. In ``data_syn`` labels are complete, so it is hidden: fraction 0.
 
     Args:
-        root: The data set's folder.
         parts: The objects to return, named as in ``classes.txt``.
         image_set: Name of the list in ``image_sets/``; exclusive with ``frames``.
         subset: ``real`` reads ``data/``, ``synthetic`` reads ``data_syn/``.
         frames: Frames instead of a list: ``0050/000003`` (real) or ``000000`` (synthetic).
         backgrounds: Pictures behind synthetic frames, whose own background is transparent.
         seed: Seed of those backgrounds; they change with the epoch.
-        read_depth: Whether samples carry depth; training does not need it.
 
     Raises:
         UserError: The folder is wrong, an object is unknown, or none of the frames is on disk.
@@ -118,11 +116,7 @@ class YcbVideoSource:
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read a frame; only the background of a synthetic one depends on the epoch.
-
-        Raises:
-            UserError: A file is missing or damaged, sizes differ, or a pose or K is impossible.
-        """
+        """Read a frame; only the background of a synthetic one depends on the epoch."""
         frame = self.frames[index]
         raw = read_frame(self.root, self.subset, frame, self._read_depth)
         instances = [

@@ -52,13 +52,7 @@ def make_shapes(mi: Any, scene: Scene) -> list[Any]:
 
 
 def make_surroundings(mi: Any, scene: Scene, bounds: Sphere) -> dict[str, Any]:
-    """Return the lamps and the sky, to be merged into Mitsuba's description of the scene.
-
-    Args:
-        mi: The ``mitsuba`` module.
-        scene: The scene.
-        bounds: A sphere around all objects.
-    """
+    """Return the lamps and the sky, to be merged into Mitsuba's description of the scene."""
     entries: dict[str, Any] = {"sky": _sky(mi, scene.ambient)}
     for number, light in enumerate(scene.lights):
         radius = lamp_radius(light, scene, bounds)

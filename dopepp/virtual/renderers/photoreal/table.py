@@ -51,9 +51,7 @@ class View:
     """A film with square pixels over a window of the image.
 
     Attributes:
-        window: The part of the image.
         size: (width, height) of the film, pixels.
-        focal_px: Its focal length.
         centre_px: Its principal point; pixel (0, 0) is the centre of the film's first pixel.
         film_from_window: Affine map, 2×3, from the window's pixels to the film's.
     """
@@ -135,12 +133,8 @@ def cast(
 ) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
     """Return depth (0 where nothing is hit) and the number of the shape that each ray hits.
 
-    Args:
-        mi: The ``mitsuba`` module.
-        world: The loaded Mitsuba scene.
-        shapes: Its shapes.
-        rays: Points at depth 1 m; what is nearer than :data:`~dopepp.virtual.scene.NEAR` is
-            looked through.
+    ``rays`` are points at depth 1 m; what is nearer than :data:`~dopepp.virtual.scene.NEAR` is
+    looked through.
     """
     flat = rays.reshape(-1, 3)
     each = _cast_scalar if mi.variant().startswith("scalar") else _cast_vector
@@ -179,7 +173,6 @@ class TableTop:
     """The disc that stands for a scene's plane.
 
     Args:
-        scene: A scene with a plane and objects.
         depth: The plane's depth at pixel centres, metres; 0 where it is not seen.
     """
 

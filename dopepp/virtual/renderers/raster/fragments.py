@@ -33,8 +33,6 @@ class Fragments:
         pixel: Index of the pixel in the window, row by row, shape (n,).
         weight: Number of the pixel's samples that it covers, shape (n,).
         face: Index of its triangle; of one seen from behind, its bitwise complement, shape (n,).
-        x: Image column, pixels, shape (n,).
-        y: Image row.
         share: Weights of the triangle's corners, shape (3, n).
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
@@ -58,12 +56,7 @@ def gather_fragments(
 ) -> Fragments | None:
     """Collect an object's fragments.
 
-    Args:
-        item: The object.
-        seen: Its projected vertices.
-        scene: Its camera.
-        samples: What the window's pixels see.
-        first_id: Number of the object's first triangle there.
+    ``first_id`` is the number of the object's first triangle in ``samples``.
 
     Returns:
         Fragments, which are valid until the next object's are collected; None if it has none.

@@ -44,12 +44,8 @@ def darken_plane(
 ) -> None:
     """Darken the plane's picture where objects keep light from it.
 
-    Args:
-        scene: Its camera, objects and ambient light.
-        plane: The plane.
-        lights: Its shadow maps.
-        samples: What the pixels with objects see; those full of objects are left out.
-        image: The background, uint8, updated in place.
+    ``samples`` are what the pixels with objects see, those full of objects left out; ``image`` is
+    the uint8 background, updated in place.
     """
     frame = _plane_frame(plane)
     sky = hidden_sky(frame, scene.objects)

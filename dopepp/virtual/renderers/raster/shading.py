@@ -63,14 +63,8 @@ def shade_object(
 ) -> None:
     """Add one object's light to the colour of the pixels that show it.
 
-    Args:
-        item: The object.
-        seen: Its projected vertices.
-        scene: Its camera and ambient light.
-        lights: As of :func:`~dopepp.virtual.renderers.raster.shadow.shadow_maps`.
-        samples: What the window's pixels see.
-        first_id: Number of the object's first triangle there.
-        colour: Sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+    ``lights`` as of :func:`~dopepp.virtual.renderers.raster.shadow.shadow_maps`; ``colour`` is the
+    sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
     """
     fragments = gather_fragments(item, seen, scene, samples, first_id)
     if fragments is None:

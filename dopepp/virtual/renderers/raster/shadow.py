@@ -83,11 +83,8 @@ def shadow_map(
 ) -> ShadowMap:
     """Rasterise objects from a light; outside the map nothing casts a shadow.
 
-    Args:
-        light: The light.
-        objects: What casts shadows.
-        projected: Their vertices in the camera frame.
-        texels: About the number of texels across the map's longer side.
+    ``projected`` are their vertices in the camera frame; the map's longer side has about
+    ``texels``.
     """
     points = np.concatenate([transform(item.T_cam_obj, item.surface.hull) for item in objects])
     T_light_cam = _look_at(light, (points.min(axis=0) + points.max(axis=0)) / 2)

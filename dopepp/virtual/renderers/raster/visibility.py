@@ -103,11 +103,7 @@ def draw_samples(
 ) -> Samples:
     """Draw a scene's plane and objects into the samples of a window.
 
-    Args:
-        scene: The scene.
-        projected: Its objects.
-        window: The part of the image to draw.
-        offsets: Of a pixel's samples from its centre, shape (S, 2).
+    ``offsets`` are those of a pixel's samples from its centre, shape (S, 2).
 
     Returns:
         Samples, which are valid until the next scene's are drawn.
@@ -141,10 +137,7 @@ def draw_alone(
 ) -> tuple[Float32[np.ndarray, "height width"], Array]:
     """Draw an object alone at the pixel centres of a box.
 
-    Args:
-        item: The object.
-        hom: Its homogeneous pixels.
-        box: What to draw; it may reach beyond the image.
+    ``box`` may reach beyond the image.
 
     Returns:
         1/m, 0 beside the object; and the object's triangles, of any value beside it.
