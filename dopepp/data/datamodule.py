@@ -17,6 +17,7 @@ from dopepp.data.sample import DescribedSource, Sample
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.data.transforms.resize import letterbox_sample, pad_sample, resize_sample
+from dopepp.drawing.pictures import Size
 from dopepp.virtual.backgrounds import Backgrounds
 
 
@@ -59,7 +60,7 @@ class PoseDataModule(LightningDataModule):
         val: DescribedSource,
         test: DescribedSource,
         object_names: Sequence[str],
-        input_size: tuple[int, int],
+        input_size: Size,
         batch_size: int,
         num_workers: int = 0,
         seed: int = 0,

@@ -12,7 +12,10 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
+
+from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
+from dopepp.geometry.camera import CameraMatrix, Transform
 
 
 @dataclass
@@ -30,10 +33,10 @@ class Instance:
     """
 
     label: str
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     keypoints: Float[np.ndarray, "9 2"]
     visible_fraction: float = 1.0
-    mask: Bool[np.ndarray, "height width"] | None = None
+    mask: Mask | None = None
     masked_fraction: float = 0.0
 
 
@@ -49,10 +52,10 @@ class Sample:
         key: The item within its source, e.g. ``0050/000003``.
     """
 
-    image: UInt8[np.ndarray, "height width 3"]
-    K: Float[np.ndarray, "3 3"]
+    image: Picture
+    K: CameraMatrix
     instances: list[Instance] = field(default_factory=list)
-    depth: Float[np.ndarray, "height width"] | None = None
+    depth: DepthMap | None = None
     source: str = ""
     key: str = ""
 
@@ -103,7 +106,7 @@ class DescribedSource(Source, Protocol):
         """Tell whether any item of any epoch can hold an instance of this object."""
 
 
-def silhouette(instance: Instance, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+def silhouette(instance: Instance, shape: Shape) -> Mask:
     """Return the instance's mask or, where it has none, its projected cuboid's convex hull.
 
     The hull contains the object's true outline, so a background crop that avoids it is free of the

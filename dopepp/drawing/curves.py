@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dopepp.core.files import write_png, write_whole
+from dopepp.drawing.pictures import Picture
 
 MAX_THRESHOLD: Final = 0.1
 """Where accuracy-threshold curves end, metres (paper Fig. 4)."""
@@ -103,7 +104,7 @@ def figure_with_axes(x_label: str, y_label: str, title: str = "") -> tuple[Figur
     return figure, axes
 
 
-def figure_image(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
+def figure_image(figure: Figure) -> Picture:
     """Render a figure to RGB without a window, for files and loggers."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]

@@ -9,12 +9,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dopepp.drawing.curves import figure_with_axes
 from dopepp.drawing.overlay import Colour, draw_line, draw_text
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.pictures import DepthMap, Mask, Picture
 
 _SMOOTHING: Final = 50
 """A line of more points than this is drawn as a moving average over 1/50 of them, above its own
@@ -134,7 +134,7 @@ def message_picture(width: int, height: int, text: str) -> Picture:
     return picture
 
 
-def mask_panel(image: Picture, masks: Sequence[Bool[np.ndarray, "height width"] | None]) -> Picture:
+def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
     """Paint each instance's visible pixels in its colour on the darkened, grey image."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
     panel = _GROUND * grey.astype(np.float64)
@@ -145,9 +145,7 @@ def mask_panel(image: Picture, masks: Sequence[Bool[np.ndarray, "height width"] 
     return np.asarray(np.rint(panel), np.uint8)
 
 
-def depth_panel(
-    depth: Float[np.ndarray, "height width"], shown: Bool[np.ndarray, "height width"]
-) -> tuple[Picture, str]:
+def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
     """Colour depth from near (red) to far (blue); unknown depth is black.
 
     Args:

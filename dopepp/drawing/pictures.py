@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
@@ -24,6 +24,17 @@ from dopepp.core.errors import UserError
 
 Picture = UInt8[np.ndarray, "height width 3"]
 """RGB, first row on top."""
+
+Size = tuple[int, int]
+"""(width, height), pixels."""
+
+Shape = tuple[int, int]
+"""(height, width), as an array's."""
+
+Mask = Bool[np.ndarray, "height width"]
+
+DepthMap = Float[np.ndarray, "height width"]
+"""Metres along z, 0 where unknown."""
 
 FORMATS: Final = ("BMP", "JPEG", "PNG", "TGA", "TIFF", "WEBP")
 """Formats that are nothing but pixels: PIL would hand EPS to another program."""

@@ -16,10 +16,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import transform
+from dopepp.drawing.pictures import Mask, Picture, Size
+from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.parts.catalogue import BUILTIN, load_part
 from dopepp.parts.part import Part
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
@@ -50,12 +51,7 @@ FLOOR: Final = 2.0
 """Gradient, grey levels a pixel, that noise has: a profile of nothing else agrees with nothing."""
 
 
-def agreement(
-    image: UInt8[np.ndarray, "height width 3"],
-    K: Float[np.ndarray, "3 3"],
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    surface: Surface,
-) -> float:
+def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
     """Compare outline and creases of a part at a pose with an image.
 
     Returns:
@@ -129,7 +125,7 @@ def meshes_of(
 
 
 def _contour(
-    item: SceneObject, K: Float[np.ndarray, "3 3"], size: tuple[int, int]
+    item: SceneObject, K: CameraMatrix, size: Size
 ) -> tuple[Float[np.ndarray, "points 4"], float]:
     """Return x, y and normal of contour pixels in the image, and the part's extent, pixels."""
     seen = project_object(item, K)
@@ -150,9 +146,7 @@ def _contour(
     return points, extent
 
 
-def _edges(
-    item: SceneObject, ids: Int[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
+def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
     """Tell the pixels right before an outline, a step in depth or a crease."""
     a, b, c = transform(item.T_cam_obj, item.surface.vertices)[item.surface.faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
@@ -167,7 +161,7 @@ def _edges(
     return edges
 
 
-def _normals(edges: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 2"]:
+def _normals(edges: Mask) -> Float[np.ndarray, "height width 2"]:
     """Return unit normals of drawn lines: the main direction of their blurred structure tensor."""
     soft = cv2.GaussianBlur(edges.astype(np.float32), (0, 0), 1.0)
     gx, gy = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
@@ -177,7 +171,7 @@ def _normals(edges: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "heig
 
 
 def _profiles(
-    image: UInt8[np.ndarray, "height width 3"], contour: Float[np.ndarray, "points 4"], reach: int
+    image: Picture, contour: Float[np.ndarray, "points 4"], reach: int
 ) -> Float[np.ndarray, "points offsets"]:
     """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
     soft = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.rotation import Vector
+from dopepp.parts.mesh.measure import Vertices
 from dopepp.parts.part import Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
@@ -44,7 +46,7 @@ class Body:
             return self.source.hull.scaled(np.array(self.stretch))
         return make_hull(self.surface)
 
-    def stretched(self, scale: Float[np.ndarray, "3"]) -> Body:
+    def stretched(self, scale: Vector) -> Body:
         """Return a body of no part, stretched along its axes by positive factors."""
         stretch = triple(scale)
         return Body(self.surface.scaled(np.array(stretch)), source=self, stretch=stretch)
@@ -75,12 +77,12 @@ class Hull:
         centre: Centre of mass of a solid body, object frame, metres.
     """
 
-    vertices: Float[np.ndarray, "vertices 3"]
+    vertices: Vertices
     triangles: Int[np.ndarray, "triangles 3"]
     facets: Int[np.ndarray, "triangles"]
-    centre: Float[np.ndarray, "3"]
+    centre: Vector
 
-    def scaled(self, scale: Float[np.ndarray, "3"]) -> Hull:
+    def scaled(self, scale: Vector) -> Hull:
         """Return the hull stretched along its axes by positive factors.
 
         A linear map takes the hull to the hull, flat faces to flat faces, the centre to the centre.
@@ -163,7 +165,7 @@ def _facets(hull: ConvexHull) -> Int[np.ndarray, "triangles"]:
     return np.asarray(np.unique(numbers, return_inverse=True)[1])
 
 
-def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "3"]:
+def _centre_of_mass(corners: Float[np.ndarray, "faces 3 3"]) -> Vector:
     """Return the centroid of the volume inside triangles, by signed tetrahedra."""
     origin = corners.reshape(-1, 3).mean(axis=0)
     a, b, c = (corners - origin).swapaxes(0, 1)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int16, UInt8
+from jaxtyping import Float, Float32, Int16
 
-from dopepp.geometry.camera import project_keypoints
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.parts.part import Part
 from dopepp.virtual.surface import Surface
@@ -147,7 +148,7 @@ class SceneObject:
     """
 
     surface: Surface
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     material: Material = field(default_factory=Material)
     part: Part | None = None
 
@@ -172,8 +173,8 @@ class Scene:
         ambient: Light from everywhere else.
     """
 
-    K: Float[np.ndarray, "3 3"]
-    background: UInt8[np.ndarray, "height width 3"]
+    K: CameraMatrix
+    background: Picture
     objects: tuple[SceneObject, ...] = ()
     lights: tuple[Light, ...] = ()
     ambient: Ambient = field(default_factory=Ambient)
@@ -214,7 +215,7 @@ class Rendered:
         scene: What was rendered; poses, camera and keypoints are there.
     """
 
-    image: UInt8[np.ndarray, "height width 3"]
+    image: Picture
     depth: Float32[np.ndarray, "height width"]
     instances: Int16[np.ndarray, "height width"]
     visible_fractions: Float[np.ndarray, "objects"]

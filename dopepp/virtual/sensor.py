@@ -20,10 +20,11 @@ from jaxtyping import Float32, UInt8
 from dopepp.core.checks import check_number, check_range
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
 from dopepp.virtual.scene import Sensor
 from dopepp.virtual.tone import decode_srgb, encode_srgb
 
-Image = UInt8[np.ndarray, "height width 3"]
+Image = Picture
 
 _NOISE_VALUES: Final = 65536
 """Length of the table of normal values that noise is read from; a power of two."""

@@ -24,7 +24,7 @@ from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES, parse_json, read_json
-from dopepp.drawing.pictures import MAX_PIXELS, read_content, read_image, whole_picture
+from dopepp.drawing.pictures import MAX_PIXELS, Shape, read_content, read_image, whole_picture
 
 _log = logging.getLogger(__name__)
 
@@ -290,7 +290,7 @@ def picture_shape(
     return (height, width) if 0 < width * height <= MAX_PIXELS else None
 
 
-def read_map(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
+def read_map(path: Path, shape: Shape) -> NDArray[Any]:
     """Read a frame's map of numbers (depth, labels), of the colour image's (height, width).
 
     Raises:
@@ -302,7 +302,7 @@ def read_map(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
 
 
 def check_map(
-    problems: Problems, path: Path, shape: tuple[int, int] | None, colour: bool = False
+    problems: Problems, path: Path, shape: Shape | None, colour: bool = False
 ) -> NDArray[Any] | None:
     """Read a map of YCB-Video, NDDS or FAT, None where that is impossible.
 

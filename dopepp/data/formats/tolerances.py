@@ -16,8 +16,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import check_camera, project
-from dopepp.geometry.rotation import is_rotation
+from dopepp.drawing.pictures import Shape
+from dopepp.geometry.camera import CameraMatrix, check_camera, project
+from dopepp.geometry.rotation import RotationMatrix, Vector, is_rotation
+from dopepp.parts.mesh.measure import Points
 
 BOX_TOLERANCE_PX: Final = 8.0
 BOX_TOLERANCE_SHARE: Final = 0.05
@@ -80,7 +82,7 @@ class Box:
             and other.bottom <= self.bottom + slack
         )
 
-    def is_inside(self, shape: tuple[int, int]) -> bool:
+    def is_inside(self, shape: Shape) -> bool:
         """Tell whether all of it is in an image of (height, width)."""
         height, width = shape
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
@@ -90,7 +92,7 @@ class Box:
         return f"({self.left:.0f}, {self.top:.0f})–({self.right:.0f}, {self.bottom:.0f})"
 
 
-def rotation_problem(rotation: Float[np.ndarray, "3 3"]) -> str | None:
+def rotation_problem(rotation: RotationMatrix) -> str | None:
     """Say why a matrix is no rotation, None where it is one or not known (NaN)."""
     if is_rotation(rotation) or not np.isfinite(rotation).all():
         return None
@@ -99,9 +101,7 @@ def rotation_problem(rotation: Float[np.ndarray, "3 3"]) -> str | None:
     return f"no rotation: R·Rᵀ off by {deviation:.2g} (allowed 1e-3), determinant {determinant:.3g}"
 
 
-def translation_problem(
-    translation: Float[np.ndarray, "3"], diameter: float | None
-) -> tuple[str, str] | None:
+def translation_problem(translation: Vector, diameter: float | None) -> tuple[str, str] | None:
     """Say what is wrong with an object's place as (kind, message), None where nothing is.
 
     Args:
@@ -123,7 +123,7 @@ def translation_problem(
     )
 
 
-def camera_problem(K: Float[np.ndarray, "3 3"], shape: tuple[int, int]) -> str | None:
+def camera_problem(K: CameraMatrix, shape: Shape) -> str | None:
     """Say why K cannot belong to an image of (height, width), None where it can."""
     try:
         check_camera(K, shape[::-1], "this image")
@@ -136,11 +136,11 @@ def camera_problem(K: Float[np.ndarray, "3 3"], shape: tuple[int, int]) -> str |
 
 
 def box_problem(
-    points_cam: Float[np.ndarray, "points 3"],
-    K: Float[np.ndarray, "3 3"],
+    points_cam: Points,
+    K: CameraMatrix,
     seen: Box | None,
     visible_fraction: float | None = None,
-    shape: tuple[int, int] | None = None,
+    shape: Shape | None = None,
 ) -> str | None:
     """Hold what is seen of an object against where its pose puts it; None where they agree.
 

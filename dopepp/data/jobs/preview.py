@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
@@ -17,8 +17,9 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.panels import COLOURS, depth_panel, draw_axes, mask_panel
+from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.geometry.camera import project, resize_points, transform
+from dopepp.geometry.camera import CameraMatrix, project, resize_points, transform
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
@@ -53,9 +54,7 @@ def write_preview(job: Job, out: Path) -> Path:
     return path
 
 
-def preview_sheet(
-    factory: Factory, num_scenes: int = NUM_SCENES
-) -> UInt8[np.ndarray, "height width 3"]:
+def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> Picture:
     """Render a job's first images and draw, in a row each, the image and its labels.
 
     Raises:
@@ -94,7 +93,7 @@ def _seen(percents: list[int]) -> str:
     return f"visible: {', '.join(f'{percent} %' for percent in percents)}"
 
 
-def _posed(rendered: Rendered, sample: Sample) -> UInt8[np.ndarray, "height width 3"]:
+def _posed(rendered: Rendered, sample: Sample) -> Picture:
     """Draw cuboids in the masks' colours, and the object frames' axes."""
     frames = [
         Wireframe(instance.keypoints, COLOURS[number % len(COLOURS)])
@@ -111,9 +110,7 @@ def _posed(rendered: Rendered, sample: Sample) -> UInt8[np.ndarray, "height widt
     return drawn
 
 
-def _axes(
-    instance: Instance, K: Float[np.ndarray, "3 3"], length: float
-) -> Float[np.ndarray, "4 2"]:
+def _axes(instance: Instance, K: CameraMatrix, length: float) -> Float[np.ndarray, "4 2"]:
     """Return where the object's origin and the ends of its axes (metres long) are seen."""
     points = transform(instance.T_cam_obj, np.vstack([np.zeros(3), length * np.eye(3)]))
     return np.asarray(project(points, K))

@@ -26,6 +26,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo
 from dopepp.data.transforms.resize import resize_sample
+from dopepp.drawing.pictures import Shape, Size
 
 _TEXT_LENGTH: Final = 64
 _LAST_LABEL: Final = 255
@@ -93,7 +94,7 @@ class CachedSource:
     def __init__(
         self,
         source: DescribedSource,
-        input_size: tuple[int, int] | None,
+        input_size: Size | None,
         folder: Path | None = None,
         identity: str = "",
         max_instances: int = 16,
@@ -209,7 +210,7 @@ class CachedSource:
         )
 
 
-def _slot(shape: tuple[int, int], max_instances: int, has_depth: bool) -> np.dtype[Any]:
+def _slot(shape: Shape, max_instances: int, has_depth: bool) -> np.dtype[Any]:
     """Return the layout of one kept sample."""
     instance = np.dtype(
         [

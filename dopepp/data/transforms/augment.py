@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
+from dopepp.drawing.pictures import Picture
 from dopepp.virtual.sensor import add_noise, compress, defocus
 
-Image = UInt8[np.ndarray, "height width 3"]
+Image = Picture
 Range = tuple[float, float]
 
 # BT.601 luma weights: grey keeps its brightness when saturation or hue changes.

@@ -18,9 +18,10 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from dopepp.data.sample import Instance, Sample, silhouette
+from dopepp.drawing.pictures import Mask, Picture, Shape, Size
 from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2
@@ -44,8 +45,8 @@ class BackgroundCrops:
 
     def __init__(
         self,
-        image: UInt8[np.ndarray, "height width 3"],
-        silhouettes: Sequence[Bool[np.ndarray, "height width"]],
+        image: Picture,
+        silhouettes: Sequence[Mask],
         min_contrast: float = MIN_CONTRAST,
         max_draws: int = MAX_DRAWS,
     ) -> None:
@@ -55,9 +56,7 @@ class BackgroundCrops:
             occupied |= seen
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
-    def draw(
-        self, size: tuple[int, int], rng: np.random.Generator
-    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+    def draw(self, size: Size, rng: np.random.Generator) -> Picture | None:
         """Return a crop of (height, width), or None when a few draws gave none with contrast."""
         places = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(places) else 0):
@@ -66,9 +65,7 @@ class BackgroundCrops:
                 return crop
         return None
 
-    def search(
-        self, size: tuple[int, int], rng: np.random.Generator
-    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+    def search(self, size: Size, rng: np.random.Generator) -> Picture | None:
         """Return a crop of (height, width) with contrast, however rare they are.
 
         Where no crop has enough, as on a smooth background under small patches, one that is not of
@@ -88,9 +85,7 @@ class BackgroundCrops:
                 return self._crop(int(rng.choice(places)), size)
         return None
 
-    def largest(
-        self, size: tuple[int, int], rng: np.random.Generator
-    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+    def largest(self, size: Size, rng: np.random.Generator) -> Picture | None:
         """Return a crop of (height, width), of half that where there is none, and so on.
 
         None where the background has no contrast at all, or no room for two pixels by two.
@@ -104,7 +99,7 @@ class BackgroundCrops:
                 return crop
             height, width = max(MIN_PATCH_PX, height // 2), max(MIN_PATCH_PX, width // 2)
 
-    def _is_free(self, size: tuple[int, int]) -> Bool[np.ndarray, "rows columns"]:
+    def _is_free(self, size: Size) -> Bool[np.ndarray, "rows columns"]:
         """Tell of the top left corner of every window whether it is free of objects."""
         return np.asarray(_windows(self._integral, size) == 0)
 
@@ -114,13 +109,13 @@ class BackgroundCrops:
         sums, squares = cv2.integral2(self.image, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
         return sums, squares
 
-    def _crop(self, place: int, size: tuple[int, int]) -> UInt8[np.ndarray, "rows columns 3"]:
+    def _crop(self, place: int, size: Size) -> Picture:
         """Return the window that is counted row by row."""
         row, column = divmod(place, self.image.shape[1] - size[1] + 1)
         return self.image[row : row + size[0], column : column + size[1]]
 
 
-def _windows(integral: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _windows(integral: np.ndarray, size: Size) -> np.ndarray:
     """Return the sum in every window of (height, width), from an integral image."""
     height, width = size
     return np.asarray(
@@ -131,16 +126,12 @@ def _windows(integral: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     )
 
 
-def has_contrast(crop: UInt8[np.ndarray, "rows columns 3"], min_contrast: float) -> bool:
+def has_contrast(crop: Picture, min_contrast: float) -> bool:
     """Tell whether a crop is more than a solid colour."""
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
 
-def covered_instance(
-    instance: Instance,
-    seen: Bool[np.ndarray, "height width"],
-    covered: Bool[np.ndarray, "height width"],
-) -> Instance:
+def covered_instance(instance: Instance, seen: Mask, covered: Mask) -> Instance:
     """Return an instance without the covered pixels; keypoints and pose stay as they are.
 
     ``seen`` is its silhouette before, ``covered`` are all covered pixels of the image.
@@ -215,9 +206,7 @@ class RandomMask:
         ]
         return replace(sample, image=image, instances=instances)
 
-    def _patch(
-        self, seen: Bool[np.ndarray, "height width"], rng: np.random.Generator
-    ) -> tuple[slice, slice] | None:
+    def _patch(self, seen: Mask, rng: np.random.Generator) -> tuple[slice, slice] | None:
         """Draw a patch inside the object's box; None when the box is too small for any."""
         slices = []
         for axis, limit in ((1, self.max_height), (0, self.max_width)):
@@ -232,12 +221,8 @@ class RandomMask:
         return slices[0], slices[1]
 
     def _crop(
-        self,
-        crops: BackgroundCrops,
-        size: tuple[int, int],
-        rng: np.random.Generator,
-        other: Backgrounds,
-    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+        self, crops: BackgroundCrops, size: Size, rng: np.random.Generator, other: Backgrounds
+    ) -> Picture | None:
         """Draw a crop from the image's background, smaller where it must be.
 
         Only where there is no background, or one of a single colour, another picture gives it.
@@ -263,8 +248,8 @@ def _middle(patch: slice, length: int) -> slice:
 
 
 def _crop_of_other(
-    other: Backgrounds, shape: tuple[int, int], size: tuple[int, int], rng: np.random.Generator
-) -> UInt8[np.ndarray, "rows columns 3"]:
+    other: Backgrounds, shape: Shape, size: Size, rng: np.random.Generator
+) -> Picture:
     """Crop (height, width) from another picture of the image's (height, width)."""
     picture = other.draw(rng, shape[1], shape[0])
     row = int(rng.integers(0, shape[0] - size[0] + 1))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.data.sample import Instance, Sample
+from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import Letterbox
 
 
@@ -27,7 +28,7 @@ def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
     return np.asarray(image[rows[:, None], columns])
 
 
-def resize_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
+def resize_sample(sample: Sample, input_size: Size) -> Sample:
     """Scale a sample by one factor so that it just fits into ``input_size``, without padding."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
@@ -50,7 +51,7 @@ def _resize_instance(instance: Instance, box: Letterbox) -> Instance:
     )
 
 
-def pad_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
+def pad_sample(sample: Sample, input_size: Size) -> Sample:
     """Pad with zeros on the right and at the bottom; K and keypoints stay as they are.
 
     Raises:
@@ -74,6 +75,6 @@ def pad_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
     return replace(sample, image=pad(sample.image), depth=depth, instances=instances)
 
 
-def letterbox_sample(sample: Sample, input_size: tuple[int, int]) -> Sample:
+def letterbox_sample(sample: Sample, input_size: Size) -> Sample:
     """Resize and pad a sample to exactly ``input_size`` (width, height)."""
     return pad_sample(resize_sample(sample, input_size), input_size)

@@ -17,11 +17,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Int
 
 from dopepp.data.rng import Purpose, item_rng
 from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instance
+from dopepp.drawing.pictures import Mask, Picture
 
 TOLERANCE: Final = 0.02
 """How far the covered share may be from the asked one."""
@@ -83,10 +84,7 @@ def _can_be_shaded(instance: Instance) -> bool:
 
 
 def _shaded(
-    sample: Sample,
-    silhouettes: Sequence[Bool[np.ndarray, "height width"]],
-    covers: Sequence[_Cover],
-    share: float,
+    sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
 ) -> Shaded:
     """Lay every instance's patches, so far as the share goes."""
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
@@ -122,8 +120,8 @@ class _Cover:
 
     def __init__(
         self,
-        seen: Bool[np.ndarray, "height width"],
-        spared: Bool[np.ndarray, "height width"],
+        seen: Mask,
+        spared: Mask,
         crops: BackgroundCrops,
         share: float,
         rng: np.random.Generator,
@@ -153,9 +151,7 @@ class _Cover:
     def _num_asked(self, share: float) -> int:
         return round(share * self._num_seen)
 
-    def _draw_crop(
-        self, crops: BackgroundCrops, rng: np.random.Generator
-    ) -> UInt8[np.ndarray, "rows columns 3"] | None:
+    def _draw_crop(self, crops: BackgroundCrops, rng: np.random.Generator) -> Picture | None:
         """Draw a crop of random size, of half that size where the background has none, and so on.
 
         None where the box is too small for any, or the background is a single colour.
@@ -168,12 +164,7 @@ class _Cover:
         )
         return crops.largest((height, width), rng)
 
-    def _lay(
-        self,
-        crop: UInt8[np.ndarray, "rows columns 3"],
-        pixel: Int[np.ndarray, "2"],
-        rng: np.random.Generator,
-    ) -> None:
+    def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: np.random.Generator) -> None:
         """Lay a crop at random, so that it covers a given pixel, below all earlier ones."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):
@@ -188,6 +179,6 @@ class _Cover:
         self._num_laid += num_new
 
 
-def _box(seen: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
+def _box(seen: Mask) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

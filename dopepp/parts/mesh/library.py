@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture, whole_picture
+from dopepp.geometry.camera import Transform
 from dopepp.parts.mesh.measure import RawMesh, Vertices, weld
 
 MAX_UNPACKED_BYTES: Final = 50_000_000
@@ -305,7 +305,7 @@ def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     return RawMesh(np.concatenate(vertices), np.concatenate(faces), uv, unit=unit), len(uvs)
 
 
-def _moved(vertices: Vertices, transform: Float[np.ndarray, "4 4"]) -> Vertices:
+def _moved(vertices: Vertices, transform: Transform) -> Vertices:
     if (transform == np.eye(4)).all():
         return vertices  # as they are: a product would make NaN of an infinite one's neighbours
     # Not a product of matrices, whose last digits depend on the processor.

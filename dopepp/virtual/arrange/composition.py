@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dopepp.geometry.camera import project, resize_camera, transform
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix, Transform, project, resize_camera, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets.preset import Preset
@@ -70,7 +71,7 @@ class Composition:
         width_at_depth = self.size[0] * depth / float(self.K[0, 0])
         return self.preset.distractors.draw(self.rng, width_at_depth, self.negatives)
 
-    def add(self, body: Body, T_cam_obj: Float[np.ndarray, "4 4"], material: Material) -> bool:
+    def add(self, body: Body, T_cam_obj: Transform, material: Material) -> bool:
         """Add a body where it stands before the camera and no target is hidden too much."""
         extremes = transform(T_cam_obj, body.surface.hull)
         if extremes[:, 2].min() <= NEAR:
@@ -95,9 +96,7 @@ class Composition:
 class Preview:
     """The objects accepted so far, seen coarsely."""
 
-    def __init__(
-        self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], min_visible: float
-    ) -> None:
+    def __init__(self, K: CameraMatrix, size: Size, min_visible: float) -> None:
         scale = min(_WIDTH_PX / size[0], 1.0)
         self._width, self._height = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
         self._K = resize_camera(K, self._width / size[0], self._height / size[1])

@@ -7,9 +7,8 @@ from itertools import islice
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
-from dopepp.geometry.camera import make_transform, transform
+from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.body import Body
@@ -53,7 +52,7 @@ def arrange_floating(composition: Composition, targets: Sequence[Body], usual: B
     return float(np.mean(depths))
 
 
-def _draw_pose(composition: Composition, body: Body) -> Float[np.ndarray, "4 4"]:
+def _draw_pose(composition: Composition, body: Body) -> Transform:
     preset, rng = composition.preset, composition.rng
     rotation = preset.turning.draw(rng)
     turned = body.surface.hull @ rotation.T
@@ -61,7 +60,7 @@ def _draw_pose(composition: Composition, body: Body) -> Float[np.ndarray, "4 4"]
     return make_transform(rotation, place)
 
 
-def _poses(composition: Composition, body: Body) -> Iterator[Float[np.ndarray, "4 4"]]:
+def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
     """Yield poses to try, each drawn when it is asked for; what the placement keeps comes again."""
     while True:
         pose = _draw_pose(composition, body)
@@ -98,7 +97,7 @@ def _place_distractor(composition: Composition, reference: float) -> None:
             return
 
 
-def _is_clear(composition: Composition, body: Body, T_cam_obj: Float[np.ndarray, "4 4"]) -> bool:
+def _is_clear(composition: Composition, body: Body, T_cam_obj: Transform) -> bool:
     """Tell whether no target reaches into the core of a new object."""
     centre, core = T_cam_obj[:3, 3], _CORE * body.surface.radius
     for target in composition.objects:

@@ -13,11 +13,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import make_transform, transform
+from dopepp.geometry.camera import Transform, make_transform, transform
 from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.arrange.floating import arrange_floating
 from dopepp.virtual.arrange.tabletop import arrange_on_table
@@ -88,7 +88,7 @@ def random_scene(
     return Scene(composition.K, background, objects, lights, ambient, plane, sensor)
 
 
-def approach(objects: Sequence[SceneObject], scale: float) -> Float[np.ndarray, "3"]:
+def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     """Return by how much the world moves in the camera frame, metres.
 
     Args:
@@ -106,9 +106,7 @@ def approach(objects: Sequence[SceneObject], scale: float) -> Float[np.ndarray, 
     return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
 
 
-def _moved_objects(
-    objects: Iterable[SceneObject], shift: Float[np.ndarray, "3"]
-) -> tuple[SceneObject, ...]:
+def _moved_objects(objects: Iterable[SceneObject], shift: Vector) -> tuple[SceneObject, ...]:
     """Return objects after the move, without those that the camera has reached or passed."""
     there = (replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in objects)
     return tuple(
@@ -116,12 +114,10 @@ def _moved_objects(
     )
 
 
-def _moved_light(light: Light, shift: Float[np.ndarray, "3"]) -> Light:
+def _moved_light(light: Light, shift: Vector) -> Light:
     """Return a lamp after the move; how strongly it lights the scene stays the same."""
     return replace(light, position=triple(np.array(light.position) + shift))
 
 
-def _moved(
-    T_cam: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def _moved(T_cam: Transform, shift: Vector) -> Transform:
     return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)

@@ -15,9 +15,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
-from dopepp.geometry.camera import make_transform
+from dopepp.drawing.pictures import Shape
+from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.rotation import RotationMatrix
+from dopepp.parts.mesh.measure import Faces
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
@@ -52,9 +55,7 @@ _NEAR: Final = 0.25
 """Below the least depth, 1/2, that a height is turned into."""
 
 
-def arrange_on_table(
-    composition: Composition, table: Table, targets: Sequence[Body]
-) -> Float[np.ndarray, "4 4"]:
+def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
     """Choose a view and place targets and distractors.
 
     They are added to an empty ``composition``; no target if none finds a place.
@@ -87,7 +88,7 @@ class _Lying:
         centre: Of its centre of mass above the plane, metres.
     """
 
-    T_table_obj: Float[np.ndarray, "4 4"]
+    T_table_obj: Transform
     footprint: Footprint
     place: tuple[int, int]
     height: float
@@ -198,7 +199,7 @@ class HeightMap:
         self._heights = np.zeros((side, side), np.float32)
 
     def footprint(
-        self, surface: Surface, rotation: Float[np.ndarray, "3 3"], lowest: float
+        self, surface: Surface, rotation: RotationMatrix, lowest: float
     ) -> Footprint | None:
         """See a turned object from below and above.
 
@@ -273,10 +274,10 @@ def _greatest(
     x: Float[np.ndarray, "vertices"],
     y: Float[np.ndarray, "vertices"],
     values: Float[np.ndarray, "vertices"],
-    faces: Int[np.ndarray, "faces 3"],
+    faces: Faces,
     cull: bool,
     corner: tuple[int, int],
-    shape: tuple[int, int],
+    shape: Shape,
 ) -> Float32[np.ndarray, "rows columns"]:
     """Return 1 + the greatest value over every cell's centre, 0 beside the object.
 

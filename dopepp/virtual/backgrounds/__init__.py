@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import UInt8
 
+from dopepp.drawing.pictures import Picture
 from dopepp.virtual.backgrounds.photos import PhotoBackgrounds, bundled_photos
 from dopepp.virtual.backgrounds.procedural import ProceduralBackgrounds
 
@@ -21,9 +21,7 @@ __all__ = ["Backgrounds", "PhotoBackgrounds", "ProceduralBackgrounds", "find_bac
 class Backgrounds(Protocol):
     """Draws background images."""
 
-    def draw(
-        self, rng: np.random.Generator, width: int, height: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
         """Return an RGB image of the asked size, a pure function of the generator's state."""
 
     def identity(self) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import MAX_SIDE, read_picture
+from dopepp.drawing.pictures import MAX_SIDE, Picture, read_picture
 
 logger = logging.getLogger(__name__)
 
@@ -84,9 +84,7 @@ class PhotoBackgrounds:
             digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
         return ["photos", str(len(self.paths)), digest.hexdigest()]
 
-    def draw(
-        self, rng: np.random.Generator, width: int, height: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
         """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side.
 
         Raises:

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from dopepp.drawing.pictures import Picture
+
 Field = Float32[np.ndarray, "height width"]
 
 _SHARP_WIDTH_PX: Final = 256
@@ -28,9 +30,7 @@ class ProceduralBackgrounds:
         """Return the kind: there are no files."""
         return ["procedural"]
 
-    def draw(
-        self, rng: np.random.Generator, width: int, height: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
         """Return one texture, or two blended by a third, with 0 to 12 shapes scattered over it."""
         image = _texture(rng, width, height)
         if rng.random() < 0.4:
@@ -43,9 +43,7 @@ class ProceduralBackgrounds:
         return np.asarray(image, np.uint8)
 
 
-def _texture(
-    rng: np.random.Generator, width: int, height: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def _texture(rng: np.random.Generator, width: int, height: int) -> Picture:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     # A background is out of focus, more or less: large ones are drawn coarser and enlarged.
@@ -172,9 +170,7 @@ _PATTERNS: Final[tuple[Callable[[np.random.Generator, int, int], Field], ...]] =
 )  # fmt: skip
 
 
-def _scatter(
-    rng: np.random.Generator, image: UInt8[np.ndarray, "height width 3"], count: int
-) -> None:
+def _scatter(rng: np.random.Generator, image: Picture, count: int) -> None:
     """Draw random ellipses, polygons, lines and circles over an image in place."""
     height, width = image.shape[:2]
     # All of a shape's numbers in one draw: one by one they would take longer than the drawing.

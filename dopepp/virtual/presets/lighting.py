@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.checks import check_counts, check_number, check_range
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.scene import Ambient, Light, triple
 
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
@@ -70,10 +70,7 @@ class Lighting:
         check_range("ground_share", self.ground_share, 0.0, 1.0, "share", of=self)
 
     def draw(
-        self,
-        rng: np.random.Generator,
-        centre: Float[np.ndarray, "3"],
-        normal: Float[np.ndarray, "3"] | None = None,
+        self, rng: np.random.Generator, centre: Vector, normal: Vector | None = None
     ) -> tuple[tuple[Light, ...], Ambient]:
         """Draw point lights around a point of the scene, and the ambient light.
 
@@ -96,7 +93,7 @@ class Lighting:
         below = above * rng.uniform(*self.ground_share)
         return tuple(lights), Ambient(triple(towards), triple(above), triple(below))
 
-    def _colour(self, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    def _colour(self, rng: np.random.Generator) -> Vector:
         """Draw the linear RGB of a lamp of luminance about 1."""
         # Equal steps of 1/T look equally different (mired), so it is what is uniform.
         warm, cold = self.temperature_k
@@ -104,7 +101,7 @@ class Lighting:
         return np.asarray(colour * (1 + rng.uniform(-self.tint, self.tint, 3)))
 
 
-def black_body_rgb(temperature_k: float) -> Float[np.ndarray, "3"]:
+def black_body_rgb(temperature_k: float) -> Vector:
     """Return the linear sRGB colour of luminance 1 of a black body (white at about 6500 K).
 
     The chromaticity is the cubic approximation of the Planckian locus by Kim et al., "Design of
@@ -126,9 +123,7 @@ def black_body_rgb(temperature_k: float) -> Float[np.ndarray, "3"]:
     return np.asarray(colour / (_LUMINANCE @ colour))
 
 
-def _in_cap(
-    rng: np.random.Generator, axis: Float[np.ndarray, "3"], angle_deg: float
-) -> Float[np.ndarray, "3"]:
+def _in_cap(rng: np.random.Generator, axis: Vector, angle_deg: float) -> Vector:
     """Draw a unit vector uniformly over the spherical cap around a unit axis."""
     cosine = rng.uniform(np.cos(np.radians(angle_deg)), 1.0)
     azimuth, sine = rng.uniform(0, 2 * np.pi), np.sqrt(1 - cosine**2)

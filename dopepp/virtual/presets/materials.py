@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.checks import check_number, check_range
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.scene import Grooves, Material, Triple, triple
 from dopepp.virtual.surface import Surface
 
@@ -145,7 +145,7 @@ def _grey(rng: np.random.Generator, brightness: float) -> Triple:
 
 def _build_axis(rng: np.random.Generator, surface: Surface) -> Triple:
     """Draw the axis a print was built up along: two times of three the thinnest, as slicers lay."""
-    extents: Float[np.ndarray, "3"] = np.ptp(surface.hull, axis=0)
+    extents: Vector = np.ptp(surface.hull, axis=0)
     thinnest = rng.random() < 2 / 3
     return _unit_axis(int(extents.argmin()) if thinnest else int(rng.integers(3)))
 

@@ -10,16 +10,18 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import project
-from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-
-Vector = Float[np.ndarray, "3"]
-Matrix = Float[np.ndarray, "3 3"]
-Points = Float[np.ndarray, "points 3"]
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix, project
+from dopepp.geometry.rotation import (
+    RotationMatrix,
+    Vector,
+    random_rotation,
+    rotation_vector_to_matrix,
+)
+from dopepp.parts.mesh.measure import Points
 
 _CENTRING_STEPS: Final = 10
 _CENTRED_PX: Final = 0.05
@@ -39,7 +41,7 @@ FACING: Final = np.diag([1.0, -1.0, -1.0])
 class Turning(Protocol):
     """Draws a target's orientation."""
 
-    def draw(self, rng: np.random.Generator) -> Matrix:
+    def draw(self, rng: np.random.Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
 
 
@@ -47,7 +49,7 @@ class Placement(Protocol):
     """Draws a target's position."""
 
     def draw(
-        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
     ) -> Vector:
         """Return the object's origin in the camera frame, metres.
 
@@ -72,7 +74,7 @@ class Placement(Protocol):
 class FreeTurning:
     """Any rotation, uniform over SO(3)."""
 
-    def draw(self, rng: np.random.Generator) -> Matrix:
+    def draw(self, rng: np.random.Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
         return random_rotation(rng)
 
@@ -97,7 +99,7 @@ class FacingTurning:
         for name in ("in_plane_deg", "tilt_deg"):
             check_number(name, getattr(self, name), 0.0, 180.0, "degrees", of=self)
 
-    def draw(self, rng: np.random.Generator) -> Matrix:
+    def draw(self, rng: np.random.Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
         in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
         tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
@@ -136,7 +138,7 @@ class OffsetPlacement(Placement):
             )
 
     def draw(
-        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
     ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
@@ -176,7 +178,7 @@ class DistancePlacement(Placement):
             )
 
     def draw(
-        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
     ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
@@ -207,7 +209,7 @@ class FillPlacement(Placement):
             )
 
     def draw(
-        self, rng: np.random.Generator, K: Matrix, size: tuple[int, int], rotated_hull: Points
+        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
     ) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         share = rng.uniform(self.smallest, self.largest)
@@ -229,7 +231,7 @@ class FillPlacement(Placement):
 
 
 def _depth_that_fills(
-    share: float, ray: Vector, K: Matrix, size: tuple[int, int], centred_hull: Points
+    share: float, ray: Vector, K: CameraMatrix, size: Size, centred_hull: Points
 ) -> float:
     """Find the depth on a ray at which the hull's bounding box fills a share of the image."""
     closest = float(-centred_hull[:, 2].min()) * (1 + 1e-6)

@@ -14,12 +14,9 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
-import numpy as np
-from jaxtyping import Float
-
 from dopepp.core.checks import check_counts, check_number
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, check_camera, resize_camera
+from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera, resize_camera
 from dopepp.virtual.presets.distractors import Distractors
 from dopepp.virtual.presets.lighting import Lighting
 from dopepp.virtual.presets.materials import Materials
@@ -90,7 +87,7 @@ class Preset:
         check_camera(self.K, (self.width, self.height), f"preset {self.name}")
 
     @property
-    def K(self) -> Float[np.ndarray, "3 3"]:  # noqa: N802 (the field's name of the matrix)
+    def K(self) -> CameraMatrix:  # noqa: N802 (the field's name of the matrix)
         """Camera matrix, pixels."""
         if self.intrinsics_px is not None:
             return camera_matrix(*self.intrinsics_px)

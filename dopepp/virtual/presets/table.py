@@ -7,16 +7,17 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
 from dopepp.core.checks import check_flag, check_number, check_range
-from dopepp.geometry.camera import make_transform
-from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.drawing.pictures import Mask, Picture, Size
+from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
+from dopepp.geometry.rotation import RotationMatrix, Vector, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
 from dopepp.virtual.scene import Plane, triple
 
-Image = UInt8[np.ndarray, "height width 3"]
+Image = Picture
 
 _FARTHEST: Final = 8.0
 """The picture of the table ends at so many camera distances: there, another one begins."""
@@ -63,7 +64,7 @@ class Table:
         check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
         check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
 
-    def draw_view(self, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+    def draw_view(self, rng: np.random.Generator) -> Transform:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
         distance = rng.uniform(*self.distance)
         elevation = np.radians(rng.uniform(*self.elevation_deg))
@@ -96,9 +97,9 @@ class Table:
         self,
         rng: np.random.Generator,
         backgrounds: Backgrounds,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        T_cam_table: Float[np.ndarray, "4 4"],
+        K: CameraMatrix,
+        size: Size,
+        T_cam_table: Transform,
     ) -> TablePicture:
         """Draw a picture that lies on the plane and, if its end is in view, one for beyond it."""
         width, height = size
@@ -130,12 +131,7 @@ class TablePicture:
     end: float
     surroundings: Image | None
 
-    def seen(
-        self,
-        K: Float[np.ndarray, "3 3"],
-        size: tuple[int, int],
-        T_cam_table: Float[np.ndarray, "4 4"],
-    ) -> Image:
+    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Image:
         """Return what a camera sees where nothing lies on the plane."""
         # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
         image_table = K @ T_cam_table[:3, [0, 1, 3]]
@@ -149,12 +145,12 @@ class TablePicture:
         return np.where(beyond[..., None], self.surroundings, image)
 
 
-def plane_of(T_cam_table: Float[np.ndarray, "4 4"]) -> Plane:
+def plane_of(T_cam_table: Transform) -> Plane:
     """Return the plane z = 0 of the table's frame, in the camera frame."""
     return Plane(triple(T_cam_table[:3, 2]), float(T_cam_table[:3, 2] @ T_cam_table[:3, 3]))
 
 
-def inverse_depth_row(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
     """Return what a homogeneous pixel is multiplied with to give the plane's 1/depth, 1/m.
 
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
@@ -162,7 +158,7 @@ def inverse_depth_row(plane: Plane, K: Float[np.ndarray, "3 3"]) -> Float[np.nda
     return np.asarray(np.array(plane.normal) @ np.linalg.inv(K) / plane.offset)
 
 
-def _downwards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _downwards(direction: Vector) -> RotationMatrix:
     """Return a rotation that turns a unit direction to −z."""
     helper = np.eye(3)[np.abs(direction).argmin()]
     across = np.cross(helper, direction)
@@ -170,12 +166,7 @@ def _downwards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.stack([across, np.cross(across, direction), -direction])
 
 
-def _beyond(
-    end: float,
-    K: Float[np.ndarray, "3 3"],
-    size: tuple[int, int],
-    T_cam_table: Float[np.ndarray, "4 4"],
-) -> Bool[np.ndarray, "height width"] | None:
+def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:
     """Tell where the plane is farther away than its end, or is not; None if that is nowhere."""
     width, height = size
     slope = inverse_depth_row(plane_of(T_cam_table), K)

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.rotation import Vector
+from dopepp.parts.mesh.measure import Faces, Points, Vertices
 from dopepp.parts.part import Mesh
 from dopepp.virtual.surface.normals import corner_normals, is_closed, merge_vertices, smooth_patches
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
@@ -41,8 +43,8 @@ class Surface:
         spacing: About the distance between neighbours among them, metres.
     """
 
-    vertices: Float[np.ndarray, "vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
+    vertices: Vertices
+    faces: Faces
     normals: Float[np.ndarray, "faces 3 3"]
     patches: Int[np.ndarray, "faces"]
     uv: Float[np.ndarray, "uvs 2"]
@@ -50,7 +52,7 @@ class Surface:
     sky: OpenSky
     closed: bool
     hull: Float[np.ndarray, "hull 3"]
-    points: Float[np.ndarray, "points 3"]
+    points: Points
     spacing: float
 
     @property
@@ -78,7 +80,7 @@ class Surface:
         """The texture and its halvings as images, the finest first; empty without one."""
         return () if self.texture is None else self.texture.images
 
-    def scaled(self, scale: Float[np.ndarray, "3"]) -> Surface:
+    def scaled(self, scale: Vector) -> Surface:
         """Return the surface stretched along its axes by positive factors.
 
         The open sky stays that of the unstretched surface, which is near enough for stretches up
@@ -150,7 +152,7 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
     )
 
 
-def _extremes(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "hull 3"]:
+def _extremes(vertices: Vertices) -> Float[np.ndarray, "hull 3"]:
     """Return the vertices that are extreme along directions spread over the sphere."""
     if len(vertices) <= _HULL_DIRECTIONS:
         return vertices
@@ -161,7 +163,7 @@ def _extremes(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "h
 
 def _spread_points(
     corners: Float[np.ndarray, "faces 3 3"], weights: Float[np.ndarray, "faces"]
-) -> Float[np.ndarray, "points 3"]:
+) -> Points:
     """Return points evenly spread over triangles, by area; the corners of a mesh without any."""
     if weights.sum() <= 0.0:
         return corners.reshape(-1, 3)[:_NUM_POINTS]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.parts.mesh.measure import Faces, Vertices
 
 _MERGE_STEPS: Final = 2**21 - 1
 """Vertices of one cell of a grid so fine across the mesh are one (STL and UV seams split them);
@@ -19,7 +20,7 @@ _MOST_CORNERS: Final = 1024
 """Normals around a vertex of more corners are not averaged: that takes the square of the number."""
 
 
-def merge_vertices(vertices: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray, "vertices"]:
+def merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
     """Number vertices so that equal positions share a number."""
     step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) / _MERGE_STEPS
     cells = np.round((vertices - vertices.min(axis=0)) / step).astype(np.int64)
@@ -27,9 +28,7 @@ def merge_vertices(vertices: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray,
     return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
 
 
-def is_closed(
-    merged: Int[np.ndarray, "faces 3"], triangles: Float[np.ndarray, "faces 3 3"]
-) -> bool:
+def is_closed(merged: Faces, triangles: Float[np.ndarray, "faces 3 3"]) -> bool:
     """Tell whether every directed edge has exactly one opposite and the volume is positive."""
     collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
     start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
@@ -44,7 +43,7 @@ def is_closed(
 
 
 def corner_normals(
-    merged: Int[np.ndarray, "faces 3"],
+    merged: Faces,
     doubled: Float[np.ndarray, "faces 3"],
     length: Float[np.ndarray, "faces"],
     edges: Float[np.ndarray, "faces 3 3"],
@@ -107,9 +106,7 @@ def _average_normals(
 
 
 def smooth_patches(
-    corners: Int[np.ndarray, "faces 3"],
-    normals: Float[np.ndarray, "faces 3 3"],
-    usable: Bool[np.ndarray, "faces"],
+    corners: Faces, normals: Float[np.ndarray, "faces 3 3"], usable: Bool[np.ndarray, "faces"]
 ) -> Int[np.ndarray, "faces"]:
     """Number faces so that those connected by edges without a crease share a number.
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.parts.mesh.measure import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
 _DIRECTIONS: Final = (24, 256)
@@ -64,10 +65,7 @@ _BAKED: Final[dict[bytes, OpenSky]] = {}
 
 
 def bake_open_sky(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    normals: Float[np.ndarray, "faces 3 3"],
-    closed: bool,
+    vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3 3"], closed: bool
 ) -> OpenSky:
     """Measure the open sky over a mesh; the time grows with the number of triangles.
 

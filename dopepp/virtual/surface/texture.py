@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Picture, Shape
+from dopepp.parts.mesh.measure import Faces
 from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
@@ -51,11 +53,7 @@ class Texture:
         return self.texels[first : first + rows * columns].reshape(rows, columns, 3)
 
 
-def make_texture(
-    image: UInt8[np.ndarray, "height width 3"],
-    uv: Float[np.ndarray, "vertices 2"],
-    faces: Int[np.ndarray, "faces 3"],
-) -> Texture:
+def make_texture(image: Picture, uv: Float[np.ndarray, "vertices 2"], faces: Faces) -> Texture:
     """Build the pyramid of an image that a mesh uses."""
     shapes = [image.shape[:2]]
     while max(shapes[-1]) > 1:
@@ -79,7 +77,7 @@ def make_texture(
 
 
 def _used_texels(
-    uv: Float[np.ndarray, "vertices 2"], faces: Int[np.ndarray, "faces 3"], shape: tuple[int, int]
+    uv: Float[np.ndarray, "vertices 2"], faces: Faces, shape: Shape
 ) -> Float[np.ndarray, "_ _"]:
     """Return 1 at texels that a triangle touches, else 0."""
     rows, columns = shape

@@ -12,13 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.data.formats import STAGING, staged_items
-from dopepp.data.formats.bop.check_image import (
-    Mask,
-    Models,
-    Silhouettes,
-    check_image,
-    load_models,
-)
+from dopepp.data.formats.bop.check_image import Models, Silhouettes, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
 from dopepp.data.formats.bop.scene import (
     DEPTH_SUFFIXES,
@@ -29,6 +23,7 @@ from dopepp.data.formats.bop.scene import (
     read_records,
 )
 from dopepp.data.formats.problems import CheckReport, picture_shape
+from dopepp.drawing.pictures import Mask, Shape
 
 _SCENE_FILES: Final = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
 _MASKS: Final = ("mask", "mask_visib")
@@ -125,7 +120,7 @@ class _Scene:
             self._silhouettes(image, len(truths), shape),
         )
 
-    def _silhouettes(self, image: int, count: int, shape: tuple[int, int] | None) -> Silhouettes:
+    def _silhouettes(self, image: int, count: int, shape: Shape | None) -> Silhouettes:
         """Read an image's masks one by one; those of objects that are not there are defects."""
         files = {name: found.get(image, {}) for name, found in self._masks.items()}
         for found in files.values():

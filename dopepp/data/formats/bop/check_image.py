@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dopepp.data.formats.bop.models import INFO_FILE, info_path, parse_models
 from dopepp.data.formats.bop.records import MM, Place, Record, read_cameras, read_poses
@@ -26,7 +26,8 @@ from dopepp.data.formats.tolerances import (
     camera_problem,
     translation_problem,
 )
-from dopepp.geometry.camera import transform
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 
 FRACTION_TOLERANCE: Final = 0.05
@@ -40,8 +41,6 @@ BOX_EDGE_PX: Final = 2.0
 
 _ROUNDING: Final = 1.001
 """Diameters and boxes are rounded to a few digits."""
-
-Mask = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def check_image(
     camera: object,
     truths: Sequence[Record],
     infos: Sequence[Record | None],
-    shape: tuple[int, int] | None,
+    shape: Shape | None,
     has_depth: bool,
     models: Models | None,
     silhouettes: Silhouettes,
@@ -133,14 +132,10 @@ def check_image(
 
 
 def _check_camera(
-    report: CheckReport,
-    place: Place,
-    camera: object,
-    shape: tuple[int, int] | None,
-    has_depth: bool,
-) -> Float[np.ndarray, "3 3"] | None:
+    report: CheckReport, place: Place, camera: object, shape: Shape | None, has_depth: bool
+) -> CameraMatrix | None:
     path, start = place("camera", 0)
-    K: Float[np.ndarray, "3 3"] = read_cameras([camera], place, report)[0][0]
+    K: CameraMatrix = read_cameras([camera], place, report)[0][0]
     if has_depth and "depth_scale" not in mapping(camera):
         report.report(path, f"{start}.depth_scale", "missing", "millimetres a unit of the depth")
     if not np.isfinite(K).all():
@@ -182,10 +177,10 @@ class _Object:
 
     def check(
         self,
-        T_cam_obj: Float[np.ndarray, "4 4"],
+        T_cam_obj: Transform,
         fraction: float | None,
         info: Record | None,
-        K: Float[np.ndarray, "3 3"] | None,
+        K: CameraMatrix | None,
         silhouettes: Silhouettes,
     ) -> None:
         place = translation_problem(T_cam_obj[:3, 3], self._model.diameter)

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
 from dopepp.data.formats.problems import STRICT, Problems, mapping, one_channel, picture
+from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
 """Millimetres a unit of the depth images that are written: up to 6.5 m, and up to 65 m."""
@@ -25,7 +25,7 @@ DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
 _MAX_UNITS: Final = 65_535
 
 
-def decode_rgb(content: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+def decode_rgb(content: bytes, where: str) -> Picture:
     """Read a colour or grey image as RGB; an alpha channel is dropped.
 
     Raises:
@@ -38,9 +38,7 @@ def decode_rgb(content: bytes, where: str) -> UInt8[np.ndarray, "height width 3"
     return np.array(image.convert("RGB"))
 
 
-def decode_depth(
-    content: bytes, where: str, depth_scale: float, shape: tuple[int, int]
-) -> Float[np.ndarray, "height width"]:
+def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -> DepthMap:
     """Read a depth image as metres, float32, 0 where unknown.
 
     ``depth_scale`` is millimetres a unit, NaN where it is not stated; ``shape`` the colour image's.
@@ -57,9 +55,7 @@ def decode_depth(
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 
-def decode_mask(
-    content: bytes, where: str, shape: tuple[int, int]
-) -> Bool[np.ndarray, "height width"]:
+def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
     """Read a mask of an image of ``shape`` (height, width); every pixel but 0 is the object's.
 
     Raises:
@@ -73,7 +69,7 @@ def decode_mask(
 def one_channel_of(
     problems: Problems,
     path: Path | str,
-    shape: tuple[int, int] | None,
+    shape: Shape | None,
     content: bytes | None = None,
     modes: tuple[str, ...] = (),
 ) -> NDArray[Any] | None:
@@ -99,9 +95,7 @@ def encode_png(pixels: NDArray[Any]) -> bytes:
     return bytes(cv2.imencode(".png", pixels)[1])
 
 
-def depth_units(
-    depth: Float[np.ndarray, "height width"], covered: Bool[np.ndarray, "height width"]
-) -> tuple[NDArray[np.uint16], float]:
+def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
     """Turn metres into units of a 16-bit image and return them with BOP's ``depth_scale``.
 
     The finest scale that reaches to the farthest object is taken, which is 0.1 mm within 6.5 m.
@@ -116,7 +110,7 @@ def depth_units(
     return np.where(units <= _MAX_UNITS, units, 0).astype(np.uint16), scale
 
 
-def encode_runs(mask: Bool[np.ndarray, "height width"]) -> dict[str, list[int]]:
+def encode_runs(mask: Mask) -> dict[str, list[int]]:
     """Return a mask as run lengths, the first of which counts zeros."""
     pixels = mask.ravel(order="F")
     borders = np.flatnonzero(np.diff(pixels)) + 1
@@ -125,12 +119,8 @@ def encode_runs(mask: Bool[np.ndarray, "height width"]) -> dict[str, list[int]]:
 
 
 def decode_runs(
-    record: object,
-    shape: tuple[int, int],
-    path: Path | str,
-    where: str = "",
-    problems: Problems = STRICT,
-) -> Bool[np.ndarray, "height width"] | None:
+    record: object, shape: Shape, path: Path | str, where: str = "", problems: Problems = STRICT
+) -> Mask | None:
     """Read a mask of an image of ``shape`` (height, width), None where that is impossible.
 
     It must have that size, so a file cannot ask for more memory, and its runs must fill it.

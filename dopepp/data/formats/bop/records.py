@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from dopepp.data.formats.problems import FARTHEST, STRICT, Problems, mapping, numbers
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.data.sample import Instance, hull_areas
-from dopepp.geometry.camera import project, project_keypoints, transform
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.parts.part import Part
 
 MM: Final = 1000.0
@@ -127,11 +128,11 @@ def read_poses(
 
 def make_instance(
     part: Part,
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Transform,
+    K: CameraMatrix,
     visible_fraction: float,
-    mask: Bool[np.ndarray, "height width"] | None,
-    shape: tuple[int, int],
+    mask: Mask | None,
+    shape: Shape,
 ) -> Instance:
     """Return an annotated object as an instance.
 

@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.formats.bop.records import MM
+from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import is_rotation
 
 FIELDS: Final = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -58,7 +59,7 @@ class PoseResult:
     im_id: int
     obj_id: int
     score: float
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     seconds: float = UNKNOWN_TIME
 
 

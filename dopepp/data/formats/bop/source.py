@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
@@ -20,15 +20,10 @@ from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import parts_by_id
 from dopepp.data.formats.bop.records import ESTIMATED, make_instance
-from dopepp.data.formats.bop.scene import (
-    DEPTH_SUFFIXES,
-    SceneFolder,
-    read_scene,
-    scene_folders,
-)
+from dopepp.data.formats.bop.scene import DEPTH_SUFFIXES, SceneFolder, read_scene, scene_folders
 from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.drawing.pictures import read_content
-from dopepp.geometry.camera import check_camera
+from dopepp.drawing.pictures import DepthMap, Mask, Shape, read_content
+from dopepp.geometry.camera import CameraMatrix, check_camera
 from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
@@ -140,7 +135,7 @@ class BopSource:
         scene = self._scenes[number]
         path = scene.folder / scene.files[row]
         image = decode_rgb(read_content(path), str(path))
-        shape: tuple[int, int] = image.shape[:2]
+        shape: Shape = image.shape[:2]
         where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
         K = check_camera(scene.K[row], (shape[1], shape[0]), where)
         instances = [self._instance(scene, k, path.stem, K, shape) for k in scene.objects(int(row))]
@@ -149,15 +144,10 @@ class BopSource:
         return Sample(image, K, instances, depth, self.name, key)
 
     def _instance(
-        self,
-        scene: SceneFolder,
-        k: int,
-        stem: str,
-        K: Float[np.ndarray, "3 3"],
-        shape: tuple[int, int],
+        self, scene: SceneFolder, k: int, stem: str, K: CameraMatrix, shape: Shape
     ) -> Instance:
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
-        mask: Bool[np.ndarray, "height width"] | None = None
+        mask: Mask | None = None
         if path.exists():
             mask = decode_mask(read_content(path), str(path), shape)
         poses = scene.poses
@@ -165,9 +155,7 @@ class BopSource:
         fraction = float(poses.visible_fractions[k])
         return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
-    def _depth(
-        self, scene: SceneFolder, row: int, stem: str, shape: tuple[int, int]
-    ) -> Float[np.ndarray, "height width"] | None:
+    def _depth(self, scene: SceneFolder, row: int, stem: str, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
         if not (scene.folder / "depth").is_dir():
             return None

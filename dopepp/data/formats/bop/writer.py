@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt16
+from jaxtyping import UInt16
 from PIL import Image
 
 from dopepp.core.errors import UserError
@@ -30,6 +30,8 @@ from dopepp.data.formats.bop.records import MM
 from dopepp.data.formats.bop.scene import MAX_SCENE_BYTES
 from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
+from dopepp.drawing.pictures import Mask
+from dopepp.geometry.camera import Transform
 from dopepp.parts.part import Part
 from dopepp.virtual.renderers.raster.rasteriser import Silhouette, silhouette
 from dopepp.virtual.scene import SceneObject
@@ -180,8 +182,8 @@ class Labels:
     truths: list[Record]
     infos: list[Record]
     depth: UInt16[np.ndarray, "height width"]
-    masks: list[Bool[np.ndarray, "height width"]]
-    visible_masks: list[Bool[np.ndarray, "height width"]]
+    masks: list[Mask]
+    visible_masks: list[Mask]
 
 
 def make_labels(
@@ -227,14 +229,14 @@ def make_labels(
     )
 
 
-def _mask(instance: Instance) -> Bool[np.ndarray, "height width"]:
+def _mask(instance: Instance) -> Mask:
     if instance.mask is None:
         raise ValueError(f"an instance of {instance.label} without a mask")
     return instance.mask
 
 
 def _truth(instance: Instance, object_id: int) -> Record:
-    T: Float[np.ndarray, "4 4"] = np.asarray(instance.T_cam_obj, np.float64)
+    T: Transform = np.asarray(instance.T_cam_obj, np.float64)
     return {
         "cam_R_m2c": T[:3, :3].ravel().tolist(),
         "cam_t_m2c": (T[:3, 3] * MM).tolist(),
@@ -243,10 +245,7 @@ def _truth(instance: Instance, object_id: int) -> Record:
 
 
 def _info(
-    instance: Instance,
-    visible: Bool[np.ndarray, "height width"],
-    whole: Silhouette,
-    depth: UInt16[np.ndarray, "height width"],
+    instance: Instance, visible: Mask, whole: Silhouette, depth: UInt16[np.ndarray, "height width"]
 ) -> Record:
     seen, inside = Box.of_mask(visible), Box.of_mask(whole.mask)
     return {

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.data.formats.ndds.check_object import Majority, ObjectCheck
@@ -36,6 +35,8 @@ from dopepp.data.formats.ndds.files import (
 )
 from dopepp.data.formats.problems import CheckReport, check_map, entries, mapping, picture_shape
 from dopepp.data.formats.tolerances import camera_problem
+from dopepp.drawing.pictures import Shape
+from dopepp.geometry.camera import CameraMatrix
 
 _MAPS: Final = (".depth.png", ".seg.png")
 _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
@@ -137,9 +138,7 @@ class _Item:
             sides = self._settings.dimensions(path, label)
             ObjectCheck(report, path, one, item, self._majority).check(K, shape, mask, sides)
 
-    def _camera(
-        self, record: Mapping[str, Any], shape: tuple[int, int] | None
-    ) -> Float[np.ndarray, "3 3"] | None:
+    def _camera(self, record: Mapping[str, Any], shape: Shape | None) -> CameraMatrix | None:
         data = mapping(record.get("camera_data"))
         width, height = data.get("width"), data.get("height")
         if shape is not None and None not in (width, height) and (height, width) != shape:

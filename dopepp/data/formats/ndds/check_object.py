@@ -14,13 +14,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dopepp.data.formats.ndds.fields import NddsObject
 from dopepp.data.formats.problems import CheckReport, mapping, numbers
 from dopepp.data.formats.tolerances import Box, box_problem, translation_problem
-from dopepp.geometry.camera import project
-from dopepp.geometry.rotation import is_rotation, quaternion_to_matrix, rotation_angle
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, project
+from dopepp.geometry.rotation import (
+    RotationMatrix,
+    Vector,
+    is_rotation,
+    quaternion_to_matrix,
+    rotation_angle,
+)
 
 PROJECTION_PX: Final = 2.0
 PROJECTION_SHARE: Final = 0.02
@@ -109,11 +116,7 @@ class ObjectCheck:
         self._projected_centroid = self._numbers(name, item.get(name), 2)
 
     def check(
-        self,
-        K: Float[np.ndarray, "3 3"] | None,
-        shape: tuple[int, int] | None,
-        mask: Bool[np.ndarray, "height width"] | None,
-        sides: Float[np.ndarray, "3"] | None,
+        self, K: CameraMatrix | None, shape: Shape | None, mask: Mask | None, sides: Vector | None
     ) -> None:
         """Check pose, cuboid, projections and boxes.
 
@@ -149,7 +152,7 @@ class ObjectCheck:
             return None
         return _known(numbers(self._report, self._path, f"{self._field}.{field}", value, *shape))
 
-    def _rotations(self) -> dict[str, Float[np.ndarray, "3 3"]]:
+    def _rotations(self) -> dict[str, RotationMatrix]:
         """Return the rotation by either order of ``quaternion_xyzw``, none where it is damaged."""
         stored = self._quaternion
         if stored is None:
@@ -165,9 +168,7 @@ class ObjectCheck:
         }
 
     def _check_orientation(
-        self,
-        cuboid: Float[np.ndarray, "8 3"],
-        rotations: Mapping[str, Float[np.ndarray, "3 3"]],
+        self, cuboid: Float[np.ndarray, "8 3"], rotations: Mapping[str, RotationMatrix]
     ) -> None:
         """Hold the quaternion against the cuboid: equal up to quarter turns, in either order."""
         axes = _box_axes(cuboid)
@@ -187,7 +188,7 @@ class ObjectCheck:
             way = next(way for way, fit in fits.items() if fit)
             self._majority.vote(field, way, self._path, f"{self._field}.{field}")
 
-    def _check_transforms(self, rotations: Mapping[str, Float[np.ndarray, "3 3"]]) -> None:
+    def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
         for name in ("pose_transform", "pose_transform_permuted"):
             matrix = self._numbers(name, self._item.get(name), 4, 4)
@@ -234,9 +235,7 @@ class ObjectCheck:
             problem = f"{boxes['row, column']} does not hold the mask's {seen}"
             self._judge("bounding_box", fits, problem)
 
-    def _camera_axes(
-        self, location: Float[np.ndarray, "3"], K: Float[np.ndarray, "3 3"] | None
-    ) -> Float[np.ndarray, "3 3"]:
+    def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
         """Return the file's camera axes as a matrix into OpenCV's.
 
         A point behind an OpenCV camera is before an OpenGL one if it then projects to where the
@@ -252,9 +251,7 @@ class ObjectCheck:
         self._majority.vote("camera axes", way, self._path, f"{self._field}.location")
         return _OPENGL if is_opengl else np.eye(3)
 
-    def _is_place_possible(
-        self, location: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
-    ) -> bool:
+    def _is_place_possible(self, location: Vector, axes: RotationMatrix) -> bool:
         """Check location, centroid and unit; tell whether projections can mean anything."""
         cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
@@ -275,9 +272,9 @@ class ObjectCheck:
 
     def _check_image(
         self,
-        axes: Float[np.ndarray, "3 3"],
-        K: Float[np.ndarray, "3 3"],
-        shape: tuple[int, int] | None,
+        axes: RotationMatrix,
+        K: CameraMatrix,
+        shape: Shape | None,
         seen: Box | None,
         fraction: float | None,
     ) -> None:
@@ -295,9 +292,7 @@ class ObjectCheck:
         if problem is not None:
             self._add("box", problem)
 
-    def _check_projections(
-        self, cuboid: Float[np.ndarray, "8 3"], K: Float[np.ndarray, "3 3"]
-    ) -> None:
+    def _check_projections(self, cuboid: Float[np.ndarray, "8 3"], K: CameraMatrix) -> None:
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
             return  # of what reaches behind the camera, projections mean nothing
@@ -329,7 +324,7 @@ def _is_box(corners: Float[np.ndarray, "8 3"]) -> bool:
     return axes is None or bool(np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE)
 
 
-def _box_axes(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "3 3"] | None:
+def _box_axes(corners: Float[np.ndarray, "8 3"]) -> RotationMatrix | None:
     """Return the directions of a box's edges as columns; None for one that is flat."""
     means = (corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]).mean(axis=1)
     lengths = np.linalg.norm(means, axis=1)
@@ -338,9 +333,7 @@ def _box_axes(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "3 3"] | N
     return np.asarray((means / lengths[:, None]).T)
 
 
-def _size_problem(
-    corners: Float[np.ndarray, "8 3"], sides: Float[np.ndarray, "3"]
-) -> tuple[str, str] | None:
+def _size_problem(corners: Float[np.ndarray, "8 3"], sides: Vector) -> tuple[str, str] | None:
     """Say as (kind, message) how a box differs from its class's sides, None where it does not."""
     edges = np.linalg.norm(corners[_EDGES[:, 0, 1]] - corners[_EDGES[:, 0, 0]], axis=1)
     if np.abs(edges - sides).max() <= SIZE_SHARE * sides.max():
@@ -351,7 +344,7 @@ def _size_problem(
     return ("unit" if in_another_unit else "size"), message
 
 
-def _quarter_turn_distance(rotation: Float[np.ndarray, "3 3"]) -> float:
+def _quarter_turn_distance(rotation: RotationMatrix) -> float:
     """Return the angle to the nearest orthogonal matrix that maps axes onto axes, mirrored or not.
 
     Frames of one object differ by such matrices between tools.

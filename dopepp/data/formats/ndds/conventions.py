@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from dopepp.core.errors import UserError
 from dopepp.data.formats.ndds.fields import NddsObject
 from dopepp.data.formats.problems import STRICT
-from dopepp.geometry.camera import make_transform, project, transform
+from dopepp.geometry.camera import CameraMatrix, Transform, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.geometry.rotation import quaternion_to_matrix
+from dopepp.geometry.rotation import RotationMatrix, quaternion_to_matrix
 from dopepp.parts.part import Part
 
 Quaternion = Literal["xyzw", "wxyz"]
@@ -99,11 +99,11 @@ class Observation:
 
     item: NddsObject
     part: Part
-    K: Float[np.ndarray, "3 3"]
-    fixed: Float[np.ndarray, "4 4"] | None
+    K: CameraMatrix
+    fixed: Transform | None
     path: Path
 
-    def T_cam_obj(self, convention: PoseConvention) -> Float[np.ndarray, "4 4"] | None:  # noqa: N802
+    def T_cam_obj(self, convention: PoseConvention) -> Transform | None:  # noqa: N802
         """Return the mesh's pose, metres, under a convention; None where it cannot apply."""
         fixed = convention.frame.startswith("fixed")
         if fixed and self.fixed is None:
@@ -153,7 +153,7 @@ class Observation:
         return _turned_corners(self.part, rotation)
 
 
-def _turned_corners(part: Part, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "8 3"]:
+def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
     """Return the corners of the box along turned axes, in NDDS order, in the part's frame.
 
     A turn by other than right angles needs the shape itself; the cuboid's box would be too large.
@@ -244,7 +244,7 @@ def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     return Finding(best, errors[best], rival, undecided, len(observations))
 
 
-def check_observation(one: Observation, convention: PoseConvention) -> Float[np.ndarray, "4 4"]:
+def check_observation(one: Observation, convention: PoseConvention) -> Transform:
     """Return an instance's pose after holding it against its own ``projected_cuboid``.
 
     Raises:

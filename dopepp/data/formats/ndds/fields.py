@@ -14,15 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from dopepp.data.formats.problems import (
-    STRICT,
-    Problems,
-    entries,
-    load_object,
-    mapping,
-    numbers,
-)
-from dopepp.geometry.camera import camera_matrix
+from dopepp.data.formats.problems import STRICT, Problems, entries, load_object, mapping, numbers
+from dopepp.geometry.camera import CameraMatrix, camera_matrix
+from dopepp.geometry.rotation import Vector
 
 MAX_ITEM_BYTES: Final = 16_000_000
 """Of one image's annotation; a hundred objects take 0.5 MB."""
@@ -50,11 +44,11 @@ class NddsObject:
 
     field: str
     label: str
-    location: Float[np.ndarray, "3"]
+    location: Vector
     quaternion: Float[np.ndarray, "4"]
     corners_px: Float[np.ndarray, "8 2"] | None
     cuboid: Float[np.ndarray, "8 3"] | None
-    centroid: Float[np.ndarray, "3"] | None
+    centroid: Vector | None
     visibility: float | None
     segmentation_id: int | None
 
@@ -124,7 +118,7 @@ def _has_centroid(points: object) -> bool:
 
 def intrinsics(
     values: Mapping[str, Any], path: Path, field: str, problems: Problems = STRICT
-) -> Float[np.ndarray, "3 3"]:
+) -> CameraMatrix:
     """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
     listed = [values.get(name) for name in ("fx", "fy", "cx", "cy")]
     return camera_matrix(*numbers(problems, path, field, listed, 4))

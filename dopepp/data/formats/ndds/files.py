@@ -16,17 +16,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from dopepp.data.formats.ndds.fields import (
-    Objects,
-    intrinsics,
-    read_record,
-    stated,
-)
+from dopepp.data.formats.ndds.fields import Objects, intrinsics, read_record, stated
 from dopepp.data.formats.problems import STRICT, Problems, one_channel, read_map
-from dopepp.drawing.pictures import read_image
+from dopepp.drawing.pictures import DepthMap, Mask, Shape, read_image
+from dopepp.geometry.camera import CameraMatrix
 
 OBJECT_SETTINGS: Final = "_object_settings.json"
 CAMERA_SETTINGS: Final = "_camera_settings.json"
@@ -89,7 +84,7 @@ class Settings:
 
     def camera(
         self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
-    ) -> Float[np.ndarray, "3 3"]:
+    ) -> CameraMatrix:
         """Return K: the annotation's own ``camera_data.intrinsics`` or the camera settings'.
 
         Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
@@ -175,9 +170,7 @@ DEPTH_UNIT: Final = 0.0001
 """Metres per value of a 16-bit ``.depth.png``: FAT's unit, and what we write; 0 is unknown."""
 
 
-def read_depth(
-    record: Mapping[str, Any], annotation: Path, shape: tuple[int, int]
-) -> Float[np.ndarray, "height width"] | None:
+def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
     """Read depth in metres along z, or None where there is none or its unit is not known.
 
     The unit is known where the annotation states it, or from FAT's naming.
@@ -194,7 +187,7 @@ def read_depth(
     return read_map(path, shape).astype(np.float32) * np.float32(unit)
 
 
-def read_labels(annotation: Path, shape: tuple[int, int]) -> NDArray[Any] | None:
+def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
     """Read ``STEM.seg.png``; None where there is none, or colours, which no file explains.
 
     Raises:
@@ -229,9 +222,7 @@ class Masks:
         self._ids = Counter(value for value in ids if isinstance(value, int))
         self._class_ids = Counter(settings.class_id(annotation, name) for _, _, name in objects)
 
-    def of(
-        self, segmentation_id: int | None, label: str
-    ) -> Bool[np.ndarray, "height width"] | None:
+    def of(self, segmentation_id: int | None, label: str) -> Mask | None:
         """Return an instance's mask, or None where its pixels' value is unknown or not only its."""
         class_id = None
         if not self._has_own_ids:

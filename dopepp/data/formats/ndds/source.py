@@ -15,9 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from jaxtyping import Float
-
 from dopepp.core.errors import UserError
 from dopepp.data.formats import share
 from dopepp.data.formats.ndds.conventions import (
@@ -43,8 +40,8 @@ from dopepp.data.formats.ndds.files import (
 )
 from dopepp.data.formats.problems import STRICT
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
-from dopepp.drawing.pictures import read_rgb
-from dopepp.geometry.camera import check_camera, project_keypoints
+from dopepp.drawing.pictures import Shape, read_rgb
+from dopepp.geometry.camera import CameraMatrix, check_camera, project_keypoints
 from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
@@ -137,7 +134,7 @@ class NddsSource:
         return self._parts.get(label)
 
     def _observations(
-        self, record: Mapping[str, Any], path: Path, K: Float[np.ndarray, "3 3"] | None = None
+        self, record: Mapping[str, Any], path: Path, K: CameraMatrix | None = None
     ) -> Iterator[Observation]:
         """Yield the objects that are instances of the parts."""
         for field, item, label in objects_of(record, path):
@@ -163,7 +160,7 @@ class NddsSource:
         if image_path is None:
             STRICT.report(path, "image", "no file", "a PNG or JPEG beside it")
         image = read_rgb(image_path)
-        shape: tuple[int, int] = image.shape[:2]
+        shape: Shape = image.shape[:2]
         masks = Masks(
             objects_of(record, path), has_own_ids(record), path, self._settings,
             lambda: read_labels(path, shape),
@@ -188,9 +185,7 @@ class NddsSource:
         behind = T_cam_obj is not None and T_cam_obj[2, 3] <= 0
         return behind and one.item.visibility is not None and one.item.visibility <= 0
 
-    def _instance(
-        self, one: Observation, shape: tuple[int, int], counts_truncation: bool
-    ) -> Instance:
+    def _instance(self, one: Observation, shape: Shape, counts_truncation: bool) -> Instance:
         T_cam_obj = check_observation(one, self.finding.convention)
         keypoints = project_keypoints(one.part.cuboid, T_cam_obj, one.K)
         fraction = one.item.visibility

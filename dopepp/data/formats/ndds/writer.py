@@ -25,14 +25,15 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Float, Integer
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
 from dopepp.core.json import read_json
 from dopepp.data.formats.ndds.files import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
 from dopepp.data.sample import Instance, Sample
-from dopepp.geometry.camera import transform
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.parts.part import Part
@@ -190,10 +191,7 @@ def camera_data(sample: Sample) -> dict[str, Any]:
 
 
 def object_record(
-    number: int,
-    instance: Instance,
-    cuboid_obj: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
+    number: int, instance: Instance, cuboid_obj: Float[np.ndarray, "9 3"], K: CameraMatrix
 ) -> dict[str, Any]:
     """Return one of an annotation's ``objects``.
 
@@ -223,9 +221,7 @@ def object_record(
     }
 
 
-def _projected(
-    points_cam: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "9 2"]:
+def _projected(points_cam: Float[np.ndarray, "9 3"], K: CameraMatrix) -> Float[np.ndarray, "9 2"]:
     """Project through the camera's centre: a point behind it has a finite place too."""
     pixels = points_cam @ K.T
     depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
@@ -234,7 +230,7 @@ def _projected(
 
 
 def _bounding_box(
-    mask: Bool[np.ndarray, "height width"] | None, corners_px: Float[np.ndarray, "8 2"]
+    mask: Mask | None, corners_px: Float[np.ndarray, "8 2"]
 ) -> dict[str, list[float]]:
     if mask is None or not mask.any():
         (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
@@ -246,7 +242,7 @@ def _bounding_box(
 
 
 def segmentation_map(
-    instances: Sequence[Instance], shape: tuple[int, int]
+    instances: Sequence[Instance], shape: Shape
 ) -> Integer[np.ndarray, "height width"]:
     """Return 1, 2, … where the first, second, … instance is visible, 0 elsewhere."""
     labels = np.zeros(shape, np.uint8 if len(instances) <= np.iinfo(np.uint8).max else np.uint16)

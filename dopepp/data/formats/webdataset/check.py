@@ -12,13 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.check_image import (
-    Mask,
-    Models,
-    Silhouettes,
-    check_image,
-    load_models,
-)
+from dopepp.data.formats.bop.check_image import Models, Silhouettes, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
 from dopepp.data.formats.problems import CheckReport, attempt, load_object, picture_shape
 from dopepp.data.formats.webdataset.source import ShardRecords
@@ -30,6 +24,7 @@ from dopepp.data.formats.webdataset.tar import (
     members,
     read_span,
 )
+from dopepp.drawing.pictures import Mask, Shape
 
 _MAX_IMAGE_BYTES: Final = 2 * MAX_MEMBER_BYTES
 """Of all members of an image together."""
@@ -91,7 +86,7 @@ def _content(report: CheckReport, path: Path, group: Iterator[TarMember]) -> Con
 def _check_image(report: CheckReport, start: str, content: Content, models: Models | None) -> None:
     """Check the members of one key."""
     names = {field_of(name): name for name in reversed(content)}
-    shape: tuple[int, int] | None = None
+    shape: Shape | None = None
     if "image" in names:
         name = names["image"]
         shape = picture_shape(report, f"{start}.{name}", content[name])

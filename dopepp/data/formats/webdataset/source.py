@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES
@@ -33,6 +32,7 @@ from dopepp.data.formats.problems import STRICT, Problems, decode_json, entries,
 from dopepp.data.formats.webdataset.shards import find_shards
 from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard
 from dopepp.data.sample import Sample, SourceInfo
+from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part
 
@@ -91,7 +91,7 @@ class WebdatasetSource:
         content = shard.read(image, "image")
         assert content is not None  # the index holds no image without
         picture = decode_rgb(content, records.start)
-        shape: tuple[int, int] = picture.shape[:2]
+        shape: Shape = picture.shape[:2]
         K, scales = read_cameras([records.json("camera")], records.place)
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
@@ -194,9 +194,7 @@ class ShardRecords:
         path = f"{self.start}.gt_info.json"
         return pair_infos(self.truths, self._entries("gt_info"), path, "", self._problems)
 
-    def mask(
-        self, name: str, number: int, shape: tuple[int, int]
-    ) -> Bool[np.ndarray, "height width"] | None:
+    def mask(self, name: str, number: int, shape: Shape) -> Mask | None:
         """Return an object's mask in ``mask`` or ``mask_visib``, None where it is damaged."""
         runs, path = self.json(name), f"{self.start}.{name}.json"
         # Objects by number, or (older shards) a list of them.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.problems import CheckReport, check_map, picture_shape
@@ -24,8 +23,9 @@ from dopepp.data.formats.ycb_video.frame import (
     read_image_set,
     read_meta,
 )
-from dopepp.geometry.camera import transform
-from dopepp.parts.mesh.measure import largest_distance
+from dopepp.drawing.pictures import Shape
+from dopepp.geometry.camera import CameraMatrix, transform
+from dopepp.parts.mesh.measure import Points, largest_distance
 
 _MAX_POINTS: Final = 100_000
 
@@ -80,7 +80,7 @@ class _FrameCheck:
         self._report, self._classes = report, classes
         self._shape = cache(self._read_shape)
 
-    def _read_shape(self, name: str) -> tuple[Float[np.ndarray, "points 3"], float] | None:
+    def _read_shape(self, name: str) -> tuple[Points, float] | None:
         """Return an object's points and diameter, metres; None where it has no points."""
         path = self._report.root / "models" / name / "points.xyz"
         if not path.is_file():
@@ -122,12 +122,7 @@ class _FrameCheck:
             self._check_pose(path, meta, index, K, seen)
 
     def _check_pose(
-        self,
-        path: Path,
-        meta: FrameMeta,
-        index: int,
-        K: Float[np.ndarray, "3 3"] | None,
-        seen: Box | None,
+        self, path: Path, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
     ) -> None:
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
@@ -145,7 +140,7 @@ class _FrameCheck:
         if problem is not None:
             self._report.report(path, f"poses[{column}].box", problem)
 
-    def _check_box_file(self, path: Path, shape: tuple[int, int] | None) -> None:
+    def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, where there is one: name, left, top, right and bottom a line."""
         lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
         for number, line in enumerate(lines, 1):

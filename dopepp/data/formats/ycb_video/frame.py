@@ -9,14 +9,20 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import scipy.io
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Integer, UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.problems import STRICT, Problems, numbers, read_map, scalar
 from dopepp.data.formats.tolerances import rotation_problem
-from dopepp.drawing.pictures import read_image
-from dopepp.geometry.camera import camera_matrix, check_camera, make_transform
+from dopepp.drawing.pictures import DepthMap, Shape, read_image
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    camera_matrix,
+    check_camera,
+    make_transform,
+)
 
 Subset = Literal["real", "synthetic"]
 FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
@@ -81,9 +87,9 @@ class FrameMeta:
         K: Camera matrix in pixels, None where the file has none.
     """
 
-    poses: Mapping[int, Float[np.ndarray, "4 4"]]
+    poses: Mapping[int, Transform]
     columns: Mapping[int, int]
-    K: Float[np.ndarray, "3 3"] | None
+    K: CameraMatrix | None
     factor_depth: float
 
 
@@ -105,7 +111,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     if factor_depth <= 0:
         problems.report(path, "factor_depth", f"{factor_depth:g}", "above 0")
     K = fields.get("intrinsic_matrix")
-    poses: dict[int, Float[np.ndarray, "4 4"]] = {}
+    poses: dict[int, Transform] = {}
     columns: dict[int, int] = {}
     for column, (index, pose) in enumerate(_columns(path, fields, problems)):
         if index in poses:
@@ -175,9 +181,7 @@ def _columns(
     return []
 
 
-def _pose(
-    value: NDArray[Any], path: Path, where: str, problems: Problems
-) -> Float[np.ndarray, "4 4"]:
+def _pose(value: NDArray[Any], path: Path, where: str, problems: Problems) -> Transform:
     pose = numbers(problems, path, where, value, 3, 4)
     if problem := rotation_problem(pose[:, :3]):
         problems.report(path, f"{where}.R", problem, "a rigid transform")
@@ -210,9 +214,9 @@ class YcbFrame:
 
     image: UInt8[np.ndarray, "height width channels"]
     label: Integer[np.ndarray, "height width"]
-    depth: Float[np.ndarray, "height width"] | None
-    K: Float[np.ndarray, "3 3"]
-    poses: Mapping[int, Float[np.ndarray, "4 4"]]
+    depth: DepthMap | None
+    K: CameraMatrix
+    poses: Mapping[int, Transform]
 
 
 def read_frame(root: Path, subset: Subset, frame: str, with_depth: bool) -> YcbFrame:
@@ -223,7 +227,7 @@ def read_frame(root: Path, subset: Subset, frame: str, with_depth: bool) -> YcbF
     """
     start = f"{root / FOLDERS[subset] / frame}-"
     image = _read_colour(Path(start + "color.png"), alpha=subset == "synthetic")
-    shape: tuple[int, int] = image.shape[:2]
+    shape: Shape = image.shape[:2]
     meta = read_meta(Path(start + "meta.mat"))
     depth = None
     if with_depth:
@@ -249,6 +253,6 @@ def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width cha
     return image
 
 
-def _camera(subset: Subset, frame: str) -> Float[np.ndarray, "3 3"]:
+def _camera(subset: Subset, frame: str) -> CameraMatrix:
     scene = 0 if subset == "synthetic" else int(frame.partition("/")[0])
     return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
@@ -26,7 +25,8 @@ from dopepp.data.formats.ycb_video.frame import (
 )
 from dopepp.data.rng import Purpose, item_rng
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
-from dopepp.geometry.camera import project, project_keypoints, transform
+from dopepp.drawing.pictures import Mask, Picture
+from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -130,9 +130,7 @@ class YcbVideoSource:
     def _path(self, frame: str, what: str) -> Path:
         return self.root / FOLDERS[self.subset] / f"{frame}-{what}"
 
-    def _rgb(
-        self, image: NDArray[Any], frame: str, epoch: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:
         """Composite a synthetic frame on a background drawn for (seed, epoch, frame)."""
         if self.subset == "real" or self._backgrounds is None:
             return image
@@ -142,13 +140,7 @@ class YcbVideoSource:
         blend = alpha * image[..., :3] + (1 - alpha) * background
         return np.asarray(np.rint(blend), np.uint8)
 
-    def _instance(
-        self,
-        part: Part,
-        T_cam_obj: Float[np.ndarray, "4 4"],
-        K: Float[np.ndarray, "3 3"],
-        mask: Bool[np.ndarray, "height width"],
-    ) -> Instance:
+    def _instance(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, mask: Mask) -> Instance:
         inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), mask.shape)
         num_pixels = int(np.count_nonzero(mask))
         unlabelled = num_pixels == 0 and self.subset == "real"

@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
 from dopepp.core.errors import require
+from dopepp.drawing.pictures import Picture
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, make_shapes, make_surroundings
 from dopepp.virtual.renderers.photoreal.table import (
     Area,
@@ -134,7 +135,7 @@ def _paint_on_table(
     shapes: list[Any],
     window: Window | None,
     plane: Float32[np.ndarray, "height width"],
-    image: UInt8[np.ndarray, "height width 3"],
+    image: Picture,
 ) -> None:
     """Paint objects and their shadows; ``plane`` is the plane's depth."""
     table = TableTop(scene, plane)
@@ -190,8 +191,8 @@ def _seed(scene: Scene) -> int:
 def _over(
     light: Float32[np.ndarray, "height width 3"],
     alpha: Float32[np.ndarray, "height width"],
-    behind: UInt8[np.ndarray, "height width 3"],
-) -> UInt8[np.ndarray, "height width 3"]:
+    behind: Picture,
+) -> Picture:
     """Lay light that covers a share of each pixel over a picture, in linear light."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]

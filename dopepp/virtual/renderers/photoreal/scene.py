@@ -17,12 +17,13 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dopepp.geometry.camera import transform
+from dopepp.geometry.camera import CameraMatrix, transform
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.tone import SRGB_TO_LINEAR
 
-Sphere = tuple[Float[np.ndarray, "3"], float]
+Sphere = tuple[Vector, float]
 """Centre and radius, camera frame, metres."""
 
 LAMP_SHARE: Final = 0.06
@@ -89,7 +90,7 @@ def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
     return max(min(LAMP_SHARE * distance, _LAMP_CLEARANCE * min(room)), _LEAST_LAMP)
 
 
-def rgb(values: Float[np.ndarray, "3"]) -> dict[str, Any]:
+def rgb(values: Vector) -> dict[str, Any]:
     """Return a colour as Mitsuba takes it."""
     return {"type": "rgb", "value": [float(value) for value in values]}
 
@@ -125,7 +126,7 @@ def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
     return np.asarray(np.take_along_axis(corners, np.sort(axes, axis=2), axis=2).reshape(-1, 2))
 
 
-def _reflectance(mi: Any, item: SceneObject, K: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+def _reflectance(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     """Return the material: Lambert and GGX with a metallic workflow, on both sides."""
     material = item.material
     root = math.sqrt(min(max(material.specular, 1e-4), 0.9))
@@ -152,7 +153,7 @@ def _roughness(material: Material) -> float:
     return float(min(variance**0.25, 1.0))
 
 
-def _colour(mi: Any, item: SceneObject, K: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     """Return the albedo: constant, mottled or a texture, linear RGB."""
     surface, material = item.surface, item.material
     colour = np.asarray(material.colour, np.float32)
@@ -179,7 +180,7 @@ def _bitmap(
     }
 
 
-def _texture_level(item: SceneObject, K: Float[np.ndarray, "3 3"]) -> int:
+def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
     """Return the texture level whose texels are about half as large as the object's pixels."""
     surface, depth = item.surface, float(item.T_cam_obj[2, 3])
     if surface.uv_area == 0.0 or depth <= 0.0:

@@ -16,8 +16,11 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int16, UInt8
+from jaxtyping import Float, Float32, Int16
 
+from dopepp.drawing.pictures import Picture, Size
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, rgb
 from dopepp.virtual.scene import NEAR, Scene
 from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
@@ -57,7 +60,7 @@ class View:
     """
 
     window: Window
-    size: tuple[int, int]
+    size: Size
     focal_px: float
     centre_px: tuple[float, float]
     film_from_window: Float[np.ndarray, "2 3"]
@@ -102,7 +105,7 @@ class View:
         return np.asarray(np.maximum(picture, np.float32(0)))
 
 
-def make_view(K: Float[np.ndarray, "3 3"], window: Window) -> View:
+def make_view(K: CameraMatrix, window: Window) -> View:
     """Return the view of a window of the image."""
     left, top, right, bottom = window
     focal = float(max(K[0, 0], K[1, 1]))
@@ -121,7 +124,7 @@ def make_view(K: Float[np.ndarray, "3 3"], window: Window) -> View:
     return View(window, size, focal, (-float(low[0]) - 0.5, -float(low[1]) - 0.5), rays)
 
 
-def pixel_rays(K: Float[np.ndarray, "3 3"], window: Window) -> Float[np.ndarray, "height width 3"]:
+def pixel_rays(K: CameraMatrix, window: Window) -> Float[np.ndarray, "height width 3"]:
     """Return the points at depth 1 m that the window's pixel centres see."""
     left, top, right, bottom = window
     y, x = np.mgrid[top:bottom, left:right]
@@ -236,7 +239,7 @@ class TableTop:
             light += strength[..., None] * np.array(lamp.intensity)
         return light
 
-    def _estimated_albedo(self) -> Float[np.ndarray, "3"]:
+    def _estimated_albedo(self) -> Vector:
         """Return the albedo with which the disc is as bright as its picture, within reason."""
         seen = self._away < 1
         if not seen.any():
@@ -273,9 +276,7 @@ def split_light(
     return np.where(alpha[..., None] > 0, np.maximum(own, 0), 0).astype(np.float32), kept
 
 
-def shadowed(
-    picture: UInt8[np.ndarray, "height width 3"], kept: Float[np.ndarray, "height width 3"]
-) -> UInt8[np.ndarray, "height width 3"]:
+def shadowed(picture: Picture, kept: Float[np.ndarray, "height width 3"]) -> Picture:
     """Return a picture of which shares of the light are left."""
     steps = np.minimum(SRGB_TO_LINEAR[picture] * kept * CODE_STEPS + 0.5, CODE_STEPS)
     changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)

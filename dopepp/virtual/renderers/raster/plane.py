@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import transform
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.raster.light import ambient_row
 from dopepp.virtual.renderers.raster.shadow import ShadowMap, hidden_sky
 from dopepp.virtual.renderers.raster.visibility import Box, Samples, inverse_depth_of
@@ -128,7 +129,7 @@ def _warp(source: Array, to_source: Array, box: Box, out: Array) -> None:
 def _shadowed_box(
     scene: Scene,
     frame: Float[np.ndarray, "3 4"],
-    grid: Float[np.ndarray, "3"],
+    grid: Vector,
     cells: tuple[int, ...],
     lights: Sequence[ShadowMap],
 ) -> Box | None:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int16
+from jaxtyping import Float, Int16
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Mask, Size
 from dopepp.geometry.camera import resize_camera
 from dopepp.virtual.renderers.raster.plane import darken_plane
 from dopepp.virtual.renderers.raster.shading import shade_object
@@ -73,12 +74,12 @@ class Silhouette:
             it may reach beyond the image. None behind the camera.
     """
 
-    mask: Bool[np.ndarray, "height width"]
+    mask: Mask
     num_px: float
     box: Box | None
 
 
-def silhouette(item: SceneObject, K: Array, size: tuple[int, int]) -> Silhouette:
+def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
     """Return an object's whole silhouette, for formats that store it (BOP's ``mask``)."""
     seen = project_object(item, K)
     mask = draw_alone(item, seen.hom, (0, 0, *size))[0] > 0

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.camera import make_transform, transform
+from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.raster.light import light_row
 from dopepp.virtual.renderers.raster.visibility import Projected
 from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
@@ -114,7 +115,7 @@ def shadow_map(
     return ShadowMap(light_row(light), inverse_depth, P, 1 / focal)
 
 
-def _look_at(light: Light, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def _look_at(light: Light, centre: Vector) -> Transform:
     """Return the transform from the camera frame to a frame at the light that looks at a point."""
     position = np.array(light.position, np.float64)
     forward = centre - position
@@ -129,7 +130,7 @@ def _look_at(light: Light, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
 
 def hidden_sky(
     frame: Float[np.ndarray, "3 4"], objects: Sequence[SceneObject]
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "rows columns"]] | None:
+) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
     """Return the share of a plane's sky that objects hide; None if they are all below it.
 
     Args:

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int16, UInt8
+from jaxtyping import Float32, Int16
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Picture, Size
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.triangles import (
     CENTRE_SAMPLE,
@@ -42,7 +44,7 @@ class Projected:
     hom: Array
     extent: tuple[float, float, float, float]
 
-    def box(self, size: tuple[int, int]) -> Box | None:
+    def box(self, size: Size) -> Box | None:
         """Return the pixels of an image of a size that it may touch; None if there are none."""
         left, top, right, bottom = self.extent
         if left > right:
@@ -55,7 +57,7 @@ class Projected:
         )
         return box if box[0] < box[2] and box[1] < box[3] else None
 
-    def inside(self, size: tuple[int, int]) -> bool:
+    def inside(self, size: Size) -> bool:
         """Tell whether its whole image lies within the pixel centres of an image of a size."""
         left, top, right, bottom = self.extent
         return 0 <= left <= right <= size[0] - 1 and 0 <= top <= bottom <= size[1] - 1
@@ -152,11 +154,7 @@ def draw_alone(
 
 def backdrop(
     scene: Scene,
-) -> tuple[
-    UInt8[np.ndarray, "height width 3"],
-    Float32[np.ndarray, "height width"],
-    Int16[np.ndarray, "height width"],
-]:
+) -> tuple[Picture, Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
     """Return image, depth and instances of a scene without its objects."""
     depth = np.zeros(scene.background.shape[:2], np.float32)
     if scene.plane is not None:
@@ -164,7 +162,7 @@ def backdrop(
     return scene.background.copy(), depth, np.full(depth.shape, -1, np.int16)
 
 
-def inverse_depth_of(plane: Plane, K: Array) -> Float[np.ndarray, "3"]:
+def inverse_depth_of(plane: Plane, K: Array) -> Vector:
     """Return (a, b, c) with 1/z = a u + b v + c on the plane; positive in front of the camera."""
     return np.asarray(np.linalg.solve(K.T, np.array(plane.normal, np.float64)) / plane.offset)
 
