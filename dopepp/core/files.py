@@ -88,11 +88,9 @@ def _is_running(process: int) -> bool:
 
 @cache
 def _machine() -> str:
-    """Return eight hex digits for the set of processes among which a process id is unique.
-
-    Containers may share a host's name and hosts may all be called ``localhost``, so on Linux the
-    boot and the process namespace count as well.
-    """
+    """Return eight hex digits for the set of processes among which a process id is unique."""
+    # Containers may share a host's name and hosts may all be called ``localhost``, so on Linux the
+    # boot and the process namespace count as well.
     facts = [socket.gethostname()]
     boot, namespace = Path("/proc/sys/kernel/random/boot_id"), Path("/proc/self/ns/pid")
     if boot.is_file() and namespace.is_symlink():

@@ -42,8 +42,7 @@ class Interruption(KeyboardInterrupt):
 def interruptible(advice: str = _RESUME) -> Iterator[None]:
     """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only).
 
-    Args:
-        advice: What the interruption tells to do next.
+    ``advice`` is what the interruption tells to do next.
     """
 
     def interrupt(number: int, _: FrameType | None) -> NoReturn:

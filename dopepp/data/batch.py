@@ -43,7 +43,6 @@ class Batch:
     sources: list[str]
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return int(self.images.shape[0])
 
     def to(self, *args: Any, **kwargs: Any) -> Batch:

@@ -28,15 +28,13 @@ Item = Callable[[int, int], Sample]
 class SampleDataset(Dataset[Sample | UserError]):
     """Items by (epoch, index); a user's mistake is an item too, see :class:`PoseLoader`.
 
-    Args:
-        item: Makes an item, a pure function of (epoch, index).
+    ``item`` makes one, a pure function of (epoch, index).
     """
 
     def __init__(self, item: Item, num_items: int) -> None:
         self._item, self._num_items = item, num_items
 
     def __len__(self) -> int:
-        """Return how many items an epoch has."""
         return self._num_items
 
     def __getitem__(self, key: tuple[int, int]) -> Sample | UserError:
@@ -65,7 +63,6 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
         self._skip = 0
 
     def __len__(self) -> int:
-        """Return how many items of an epoch this rank gets."""
         if self.shuffle:
             return self._num_items // self._world_size
         return len(range(self._rank, self._num_items, self._world_size))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
+from numpy.random import Generator
 
 
 class Purpose(IntEnum):
@@ -22,7 +23,7 @@ class Purpose(IntEnum):
     SHADING = 106
 
 
-def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> np.random.Generator:
+def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:
     """Return the generator of one item (all arguments non-negative)."""
     # Last, because a generator ignores trailing zeros: [seed, epoch, index], from which the
     # factory draws its scenes, is [seed, epoch, index, 0].

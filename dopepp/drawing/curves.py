@@ -124,8 +124,7 @@ def _area(errors: Float[np.ndarray, "n"], max_threshold: float) -> float:
 class RateCurve:
     """One line: rates in [0, 1] at ascending values of a quantity.
 
-    Attributes:
-        low: Lower end of its confidence interval.
+    ``low`` and ``high`` are the ends of its confidence interval.
     """
 
     x: Float[np.ndarray, "points"]

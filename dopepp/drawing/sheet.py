@@ -23,8 +23,7 @@ _MIN_CAPTION_PX: Final = 9
 class Tile:
     """One picture of a contact sheet.
 
-    Attributes:
-        caption: One line below it; empty for none.
+    ``caption`` is one line below it; empty for none.
     """
 
     image: Picture

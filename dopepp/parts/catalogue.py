@@ -118,10 +118,8 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
 
 
 def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:
-    """Extrude convex sections along z while they shrink by ``SLOPE`` all around.
-
-    Walls of another direction than the plate's make the features visible from straight above.
-    """
+    """Extrude convex sections along z while they shrink by ``SLOPE`` all around."""
+    # Walls of another direction than the plate's make the features visible from straight above.
     solids = []
     for section in sections:
         outlines = ((section, foot), (section.offset(-SLOPE, JoinType.Miter), top))

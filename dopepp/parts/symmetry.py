@@ -157,10 +157,8 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
 def _largest_group(
     shape: _Shape, generators: list[RotationMatrix]
 ) -> Float[np.ndarray, "rotations 3 3"]:
-    """Return a group of rotations that all fit, without the identity.
-
-    A rotation that fits only just may bring others with it that do not; then it is left out.
-    """
+    """Return a group of rotations that all fit, without the identity."""
+    # A rotation that fits only just may bring others with it that do not; then it is left out.
     group = np.eye(3)[None]
     for rotation in generators:
         larger = exact_group(np.concatenate([group, rotation[None]]))

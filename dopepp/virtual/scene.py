@@ -89,8 +89,8 @@ class Light:
 class Ambient:
     """Light from everywhere: a hemisphere above and one below.
 
-    Attributes:
-        up: Unit vector to the upper hemisphere, camera frame.
+    ``up`` is a unit vector to the upper hemisphere, camera frame; ``above`` and ``below`` are
+    linear RGB.
     """
 
     up: Triple = (0.0, -1.0, 0.0)

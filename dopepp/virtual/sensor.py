@@ -16,6 +16,7 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
+from numpy.random import Generator
 
 from dopepp.core.checks import check_number, check_range
 from dopepp.core.compiled import Array, compiled
@@ -67,7 +68,6 @@ class Sensors:
     jpeg_quality: tuple[int, int] = (70, 95)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for step in ("exposure", "blur", "motion", "noise", "jpeg"):
             name = f"{step}_probability"
             check_number(name, getattr(self, name), 0.0, 1.0, "probability", of=self)
@@ -83,7 +83,7 @@ class Sensors:
         blur, motion = ((scale * low, scale * high) for low, high in (self.blur_px, self.motion_px))
         return replace(self, blur_px=blur, motion_px=motion)
 
-    def draw(self, rng: np.random.Generator) -> Sensor:
+    def draw(self, rng: Generator) -> Sensor:
         """Draw a sensor's settings."""
         on = rng.random(5) < (
             self.exposure_probability, self.blur_probability, self.motion_probability,
@@ -187,10 +187,8 @@ def _line_kernel(x: float, y: float) -> Float32[np.ndarray, "side side"]:
 
 @cache
 def _normal_values() -> Float32[np.ndarray, "values"]:
-    """Return the table of noise: quantiles of a normal distribution, shuffled, deviation 1.
-
-    Its beginning is repeated at its end, so that a run may start anywhere.
-    """
+    """Return the table of noise: quantiles of a normal distribution, shuffled, deviation 1."""
+    # Its beginning is repeated at its end, so that a run may start anywhere.
     normal = NormalDist()
     quantiles = [normal.inv_cdf((k + 0.5) / _NOISE_VALUES) for k in range(_NOISE_VALUES)]
     values = np.array(quantiles, np.float32)
@@ -210,15 +208,11 @@ def _shuffle(values: Array) -> None:
 def _add_noise(
     image: Array, read: np.float32, shot: np.float32, table: Array, seed: int, noisy: Array
 ) -> None:
-    """Add noise from the table, in runs.
+    """Add noise from the table (normal values, ``_NOISE_RUN`` more than a power of two), in runs.
 
-    Args:
-        image: Grey levels, uint8, flat.
-        read: Variance of the signal-independent part, squared grey levels, float32.
-        shot: Variance of the signal-dependent part per grey level, float32.
-        table: Normal values, float32, ``_NOISE_RUN`` more than a power of two.
-        seed: 0 to 2³² − 1.
-        noisy: Result, uint8, flat.
+    ``image`` and ``noisy``, the result, are flat uint8. ``read`` is the variance of the
+    signal-independent part, squared grey levels; ``shot`` that of the signal-dependent part per
+    grey level.
     """
     count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
     start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))

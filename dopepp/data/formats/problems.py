@@ -91,7 +91,6 @@ class Defect:
     message: str
 
     def __str__(self) -> str:
-        """Return one line."""
         return " ".join(f"{self.path}: {self.field}: {self.message}".split())
 
 

@@ -88,7 +88,6 @@ class Box:
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
 
     def __str__(self) -> str:
-        """Return its corners."""
         return f"({self.left:.0f}, {self.top:.0f})–({self.right:.0f}, {self.bottom:.0f})"
 
 

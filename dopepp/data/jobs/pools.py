@@ -68,8 +68,7 @@ class Pool(ABC):
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
         """Do tasks, in any order, and yield their outcomes as they come.
 
-        Args:
-            tasks: Read only as far as workers are free.
+        ``tasks`` are read only as far as workers are free.
 
         Raises:
             StoppedError: A worker has died, or the cluster cannot go on.
@@ -174,10 +173,8 @@ def _serve(connection: Connection) -> None:
 
 @contextmanager
 def _sheltered() -> Iterator[None]:
-    """Let children inherit one thread per library, and signals blocked from their first moment.
-
-    Ctrl-C reaches every process of the terminal, but only this one decides what to do.
-    """
+    """Let children inherit one thread per library, and signals blocked from their first moment."""
+    # Ctrl-C reaches every process of the terminal, but only this one decides what to do.
     kept = {name: os.environ[name] for name in THREAD_LIMITS if name in os.environ}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     can_block = hasattr(signal, "pthread_sigmask")

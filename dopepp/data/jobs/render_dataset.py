@@ -86,7 +86,6 @@ class RenderReport:
     write_s: float = 0.0
 
     def __str__(self) -> str:
-        """Say it in a line, with the rate."""
         if not self.num_rendered:
             return f"all {self.num_images:,} images were there"
         ms = 1000 / self.num_rendered

@@ -116,9 +116,8 @@ class Outcome:
 class Worker:
     """Does tasks in one process, on one thread.
 
-    Args:
-        content: A pickled job and the data set's folder; unpickled with the first task, so that
-            whatever is wrong with it on this machine becomes that task's outcome.
+    ``content`` is a pickled job and the data set's folder, unpickled with the first task, so that
+    whatever is wrong with it on this machine becomes that task's outcome.
     """
 
     def __init__(self, content: bytes) -> None:

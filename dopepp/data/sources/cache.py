@@ -42,11 +42,9 @@ def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " ite
 
 
 def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
-    """Map a file that is there, or else a new one of zeros, into memory.
-
-    All of its disk space is taken now: a disk that is full now is an error that can be told, and
-    one that becomes full under a map with holes kills the process.
-    """
+    """Map a file that is there, or else a new one of zeros, into memory."""
+    # All of its disk space is taken now: a disk that is full now is an error that can be told, and
+    # one that becomes full under a map with holes kills the process.
     size = dtype.itemsize * num_items
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +122,6 @@ class CachedSource:
         self._store(0, first)
 
     def __len__(self) -> int:
-        """Return the number of slots."""
         return len(self._source)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

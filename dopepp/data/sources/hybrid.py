@@ -32,11 +32,7 @@ def _shares(
     real, virtual, synthetic = present
     real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
     synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0
-    return [
-        real_share,
-        (1 - real_share) * (1 - synthetic_part),
-        (1 - real_share) * synthetic_part,
-    ]
+    return [real_share, (1 - real_share) * (1 - synthetic_part), (1 - real_share) * synthetic_part]
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,6 @@ class HybridSource:
         self._orders: dict[tuple[int, int], Int[np.ndarray, " items"]] = {}
 
     def __len__(self) -> int:
-        """Return ``samples_per_epoch``."""
         return self._length
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

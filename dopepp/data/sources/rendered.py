@@ -50,7 +50,6 @@ class RenderedSource:
         self._num_items = num_items
 
     def __len__(self) -> int:
-        """Return how many images an epoch has."""
         return self._num_items
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator
 
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.sensor import add_noise, compress, defocus
@@ -74,7 +75,7 @@ class Photometric:
         self.noise_probability, self.noise_sigma = noise_probability, noise_sigma
         self.jpeg_probability, self.jpeg_quality = jpeg_probability, jpeg_quality
 
-    def __call__(self, image: Image, rng: np.random.Generator) -> Image:
+    def __call__(self, image: Image, rng: Generator) -> Image:
         """Return a changed copy of an RGB image."""
         image = cv2.transform(image, self._colour_matrix(rng))
         if rng.random() < self.blur_probability:
@@ -85,7 +86,7 @@ class Photometric:
             image = compress(image, round(rng.uniform(*self.jpeg_quality)))
         return np.asarray(image)
 
-    def _colour_matrix(self, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
+    def _colour_matrix(self, rng: Generator) -> Float[np.ndarray, "3 4"]:
         """Compose all colour changes into one affine map, so pixels are rounded once."""
         angle = rng.uniform(-self.hue, self.hue)
         chroma = 1 + rng.uniform(-self.saturation, self.saturation)

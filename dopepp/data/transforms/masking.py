@@ -19,6 +19,7 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.random import Generator
 
 from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.drawing.pictures import Mask, Picture, Shape, Size
@@ -56,7 +57,7 @@ class BackgroundCrops:
             occupied |= seen
         self._integral = cv2.integral(occupied.astype(np.uint8))
 
-    def draw(self, size: Size, rng: np.random.Generator) -> Picture | None:
+    def draw(self, size: Size, rng: Generator) -> Picture | None:
         """Return a crop of (height, width), or None when a few draws gave none with contrast."""
         places = np.flatnonzero(self._is_free(size).ravel())
         for _ in range(self.max_draws if len(places) else 0):
@@ -65,7 +66,7 @@ class BackgroundCrops:
                 return crop
         return None
 
-    def search(self, size: Size, rng: np.random.Generator) -> Picture | None:
+    def search(self, size: Size, rng: Generator) -> Picture | None:
         """Return a crop of (height, width) with contrast, however rare they are.
 
         Where no crop has enough, as on a smooth background under small patches, one that is not of
@@ -85,7 +86,7 @@ class BackgroundCrops:
                 return self._crop(int(rng.choice(places)), size)
         return None
 
-    def largest(self, size: Size, rng: np.random.Generator) -> Picture | None:
+    def largest(self, size: Size, rng: Generator) -> Picture | None:
         """Return a crop of (height, width), of half that where there is none, and so on.
 
         None where the background has no contrast at all, or no room for two pixels by two.
@@ -179,7 +180,7 @@ class RandomMask:
         self.probability, self.max_height, self.max_width = probability, max_height, max_width
         self.min_contrast, self.max_draws = min_contrast, max_draws
 
-    def __call__(self, sample: Sample, rng: np.random.Generator, other: Backgrounds) -> Sample:
+    def __call__(self, sample: Sample, rng: Generator, other: Backgrounds) -> Sample:
         """Return a masked copy of the sample; the argument is not changed.
 
         The image must be unpadded, so that padding is never taken as background; ``other`` gives
@@ -206,7 +207,7 @@ class RandomMask:
         ]
         return replace(sample, image=image, instances=instances)
 
-    def _patch(self, seen: Mask, rng: np.random.Generator) -> tuple[slice, slice] | None:
+    def _patch(self, seen: Mask, rng: Generator) -> tuple[slice, slice] | None:
         """Draw a patch inside the object's box; None when the box is too small for any."""
         slices = []
         for axis, limit in ((1, self.max_height), (0, self.max_width)):
@@ -221,12 +222,10 @@ class RandomMask:
         return slices[0], slices[1]
 
     def _crop(
-        self, crops: BackgroundCrops, size: Size, rng: np.random.Generator, other: Backgrounds
+        self, crops: BackgroundCrops, size: Size, rng: Generator, other: Backgrounds
     ) -> Picture | None:
-        """Draw a crop from the image's background, smaller where it must be.
-
-        Only where there is no background, or one of a single colour, another picture gives it.
-        """
+        """Draw a crop from the image's background, smaller where it must be."""
+        # Only where there is no background, or one of a single colour, another picture gives it.
         crop = crops.largest(size, rng)
         if crop is not None:
             return crop
@@ -247,9 +246,7 @@ def _middle(patch: slice, length: int) -> slice:
     return slice(start, start + length)
 
 
-def _crop_of_other(
-    other: Backgrounds, shape: Shape, size: Size, rng: np.random.Generator
-) -> Picture:
+def _crop_of_other(other: Backgrounds, shape: Shape, size: Size, rng: Generator) -> Picture:
     """Crop (height, width) from another picture of the image's (height, width)."""
     picture = other.draw(rng, shape[1], shape[0])
     row = int(rng.integers(0, shape[0] - size[0] + 1))

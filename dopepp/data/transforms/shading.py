@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Int
+from numpy.random import Generator
 
 from dopepp.data.rng import Purpose, item_rng
 from dopepp.data.sample import Instance, Sample, silhouette
@@ -110,21 +111,12 @@ def _shaded(
 class _Cover:
     """Patches over one instance and the order in which they cover its box, pixel by pixel.
 
-    Attributes:
-        order: When each pixel is covered, :data:`_NEVER` where none of the patches lies.
-
-    Args:
-        spared: Pixels that no patch may cover.
-        share: Up to which share of the visible pixels patches are needed.
+    ``order`` is :data:`_NEVER` where none of them lies. They are drawn until they cover ``share``
+    of the visible pixels, and never cover those that are ``spared``.
     """
 
     def __init__(
-        self,
-        seen: Mask,
-        spared: Mask,
-        crops: BackgroundCrops,
-        share: float,
-        rng: np.random.Generator,
+        self, seen: Mask, spared: Mask, crops: BackgroundCrops, share: float, rng: Generator
     ) -> None:
         self.box = _box(seen)
         self._seen, self._spared = seen[self.box], spared[self.box]
@@ -151,7 +143,7 @@ class _Cover:
     def _num_asked(self, share: float) -> int:
         return round(share * self._num_seen)
 
-    def _draw_crop(self, crops: BackgroundCrops, rng: np.random.Generator) -> Picture | None:
+    def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
         """Draw a crop of random size, of half that size where the background has none, and so on.
 
         None where the box is too small for any, or the background is a single colour.
@@ -164,7 +156,7 @@ class _Cover:
         )
         return crops.largest((height, width), rng)
 
-    def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: np.random.Generator) -> None:
+    def _lay(self, crop: Picture, pixel: Int[np.ndarray, "2"], rng: Generator) -> None:
         """Lay a crop at random, so that it covers a given pixel, below all earlier ones."""
         slices = []
         for position, length, extent in zip(pixel, crop.shape, self.order.shape, strict=False):

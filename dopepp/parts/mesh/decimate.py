@@ -70,11 +70,7 @@ def decimate(
 def _cluster(
     vertices: Vertices, faces: Faces, max_faces: int
 ) -> tuple[Int[np.ndarray, " vertices"], Int[np.ndarray, " kept"]]:
-    """Find the grid that leaves most triangles under the limit.
-
-    Returns:
-        The cell of every vertex, numbered from 0, and the triangles that remain.
-    """
+    """Return the cells, of the grid that leaves most triangles under the limit, and these."""
     # A square of a surface that passes through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
@@ -129,11 +125,9 @@ def _means(
 def _place(
     vertices: Vertices, faces: Faces, cells: Int[np.ndarray, " vertices"]
 ) -> Float[np.ndarray, "cells 3"]:
-    """Return each cell's point nearest to the planes of the triangles in it, by squared area.
-
-    With normals n of a triangle's area and o from the cell's mean to the triangle, the offset x
-    from that mean solves Σ n nᵀ x = Σ n (n·o). It stays within the box of the cell's vertices.
-    """
+    """Return each cell's point nearest to the planes of the triangles in it, by squared area."""
+    # With normals n of a triangle's area and o from the cell's mean to the triangle, the offset x
+    # from that mean solves Σ n nᵀ x = Σ n (n·o). It stays within the box of the cell's vertices.
     means = _means(vertices, cells)
     lower, upper = means.copy(), means.copy()
     np.minimum.at(lower, cells, vertices)

@@ -125,11 +125,9 @@ def read_3mf(path: Path) -> RawMesh:
 
 
 def _count_pieces(model: bytes) -> int:
-    """Count the meshes that a 3MF build shows.
-
-    trimesh follows objects that contain themselves, and one that is doubled twenty times over, for
-    hours. Of objects in another file it takes all where one is meant.
-    """
+    """Count the meshes that a 3MF build shows."""
+    # trimesh follows objects that contain themselves, and one that is doubled twenty times over,
+    # for hours. Of objects in another file it takes all where one is meant.
     from lxml import etree
 
     pieces: dict[str, int] = {}

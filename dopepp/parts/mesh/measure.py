@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.random import Generator
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import cdist
 
@@ -79,7 +80,7 @@ def sample_surface(
 
 
 def _points_inside(
-    triangles: Float[np.ndarray, "triangles 3 3"], rng: np.random.Generator
+    triangles: Float[np.ndarray, "triangles 3 3"], rng: Generator
 ) -> Float[np.ndarray, "triangles 3"]:
     """Draw a point of each triangle, uniformly."""
     a, b, c = triangles.swapaxes(0, 1)
@@ -138,11 +139,9 @@ def _farthest(some: Float[np.ndarray, "some 3"], points: Points) -> tuple[float,
 
 
 def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
-    """Yield the distance between the two extreme points along each direction, and one of them.
-
-    Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
-    least, and 2,500 directions leave φ under 2.42°.
-    """
+    """Yield the distance between the two extreme points along each direction, and one of them."""
+    # Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
+    # least, and 2,500 directions leave φ under 2.42°.
     # Single precision finds the extreme points as well, in half of the time.
     directions = half_sphere(_NUM_DIRECTIONS).astype(np.float32)
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
@@ -239,10 +238,8 @@ class SurfaceTree:
 def _closest_on_triangles(
     points: Float[np.ndarray, "*#batch 3"], triangles: Float[np.ndarray, "*batch 3 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Return the point of each triangle that is closest to a point.
-
-    It is the foot of the perpendicular where that falls inside, else on one of the three edges.
-    """
+    """Return the point of each triangle that is closest to a point."""
+    # It is the foot of the perpendicular where that falls inside, else on one of the three edges.
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)
     offset = points - a

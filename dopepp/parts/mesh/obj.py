@@ -165,10 +165,8 @@ def _texture(obj: ObjFile, path: Path) -> Picture | None:
 
 
 def _colour_maps(path: Path) -> dict[str | None, str | None]:
-    """Return the file name of each MTL material's colour map, None for one without.
-
-    A map with options is refused, as they would change how it lies on the part.
-    """
+    """Return the file name of each MTL material's colour map, None for one without."""
+    # A map with options is refused, as they would change how it lies on the part.
     if path.stat().st_size > MAX_MATERIAL_BYTES:
         raise UserError(
             f"material file {path} of {path.stat().st_size / 1e6:.0f} MB",

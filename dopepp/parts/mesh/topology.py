@@ -86,12 +86,10 @@ def turn_over(faces: Faces, turned: Bool[np.ndarray, " faces"]) -> Faces:
 
 
 def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np.ndarray, " faces"]:
-    """Return the triangles that face against most of their connected surface.
-
-    Each triangle is two nodes of a graph, as it is and turned over, and an edge joins the nodes
-    that face the same way. A surface with two sides falls into two components: each is one way of
-    facing, and triangle f is to be turned if the component of its turned node is the better one.
-    """
+    """Return the triangles that face against most of their connected surface."""
+    # Each triangle is two nodes of a graph, as it is and turned over, and an edge joins the nodes
+    # that face the same way. A surface with two sides falls into two components: each is one way of
+    # facing, and triangle f is to be turned if the component of its turned node is the better one.
     num_faces = len(areas)
     one, other = topology.neighbours.T
     swap = np.where(topology.opposed, num_faces, 0)

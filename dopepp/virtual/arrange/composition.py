@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32
+from numpy.random import Generator
 
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, Transform, project, resize_camera, transform
@@ -41,11 +42,10 @@ _MARGIN: Final = 0.03
 class Composition:
     """Objects that a preset accepts beside each other.
 
-    Args:
-        negatives: The bodies that a distractor may be instead of a primitive.
+    A distractor may be one of ``negatives`` instead of a primitive.
     """
 
-    def __init__(self, preset: Preset, rng: np.random.Generator, negatives: Sequence[Body]) -> None:
+    def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
         self.K, self.size = preset.K, (preset.width, preset.height)
         self._alike = rng.random() < preset.materials.alike_share

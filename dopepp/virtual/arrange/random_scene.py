@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform, transform
@@ -32,7 +33,7 @@ def random_scene(
     preset: Preset,
     targets: Sequence[Body],
     negatives: Sequence[Body],
-    rng: np.random.Generator,
+    rng: Generator,
     backgrounds: Backgrounds,
     scale: float = 1.0,
 ) -> Scene:

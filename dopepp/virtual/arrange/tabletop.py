@@ -80,13 +80,7 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
 
 @dataclass(frozen=True, eq=False)
 class _Lying:
-    """One way in which a body could lie.
-
-    Attributes:
-        place: x and y of its origin, in the height map's cells.
-        height: Of its lowest point above the plane, metres.
-        centre: Of its centre of mass above the plane, metres.
-    """
+    """One way to lie; ``height``, of the lowest point, and ``centre``, of mass, above the plane."""
 
     T_table_obj: Transform
     footprint: Footprint
@@ -188,8 +182,7 @@ class Footprint:
 class HeightMap:
     """What lies on the table.
 
-    Args:
-        reach: The map covers x and y from −reach to reach, metres; beyond it nothing can lie.
+    It covers x and y from −``reach`` to ``reach``, metres; beyond it nothing can lie.
     """
 
     def __init__(self, cell: float, reach: float) -> None:
@@ -279,11 +272,9 @@ def _greatest(
     corner: tuple[int, int],
     shape: Shape,
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return 1 + the greatest value over every cell's centre, 0 beside the object.
-
-    The rasteriser keeps the greatest 1/z and interpolates it linearly over the image, so a vertex
-    at column x and row y with z = 1/(1 + value) makes it a map of any linear value in [0, 1].
-    """
+    """Return 1 + the greatest value over every cell's centre, 0 beside the object."""
+    # The rasteriser keeps the greatest 1/z and interpolates it linearly over the image, so a vertex
+    # at column x and row y with z = 1/(1 + value) makes it a map of any linear value in [0, 1].
     z = 1.0 / (1.0 + values)
     hom = np.stack([x * z, y * z, z], axis=1)
     greatest, ids = np.zeros((*shape, 1), np.float32), np.empty((*shape, 1), np.int32)

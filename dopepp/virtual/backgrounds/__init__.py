@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
+from numpy.random import Generator
 
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.backgrounds.photos import PhotoBackgrounds, bundled_photos
@@ -21,7 +21,7 @@ __all__ = ["Backgrounds", "PhotoBackgrounds", "ProceduralBackgrounds", "find_bac
 class Backgrounds(Protocol):
     """Draws background images."""
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return an RGB image of the asked size, a pure function of the generator's state."""
 
     def identity(self) -> list[str]:
@@ -31,9 +31,8 @@ class Backgrounds(Protocol):
 def find_backgrounds(choice: str | Path | None) -> Backgrounds:
     """Return the backgrounds that a user names.
 
-    Args:
-        choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
-            installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
+    ``choice`` is None or ``procedural``, the same on every machine; ``skimage`` for the photos in
+    an installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
 
     Raises:
         UserError: The folder is missing or holds no photo, or scikit-image is not installed.

@@ -14,6 +14,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from numpy.random import Generator
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import MAX_SIDE, Picture, read_picture
@@ -84,7 +85,7 @@ class PhotoBackgrounds:
             digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
         return ["photos", str(len(self.paths)), digest.hexdigest()]
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side.
 
         Raises:

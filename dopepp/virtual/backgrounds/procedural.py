@@ -11,6 +11,7 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
+from numpy.random import Generator
 
 from dopepp.drawing.pictures import Picture
 
@@ -30,7 +31,7 @@ class ProceduralBackgrounds:
         """Return the kind: there are no files."""
         return ["procedural"]
 
-    def draw(self, rng: np.random.Generator, width: int, height: int) -> Picture:
+    def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return one texture, or two blended by a third, with 0 to 12 shapes scattered over it."""
         image = _texture(rng, width, height)
         if rng.random() < 0.4:
@@ -43,7 +44,7 @@ class ProceduralBackgrounds:
         return np.asarray(image, np.uint8)
 
 
-def _texture(rng: np.random.Generator, width: int, height: int) -> Picture:
+def _texture(rng: Generator, width: int, height: int) -> Picture:
     """Return a random pattern in a random palette of two to five colours."""
     pattern = _PATTERNS[int(rng.integers(len(_PATTERNS)))]
     # A background is out of focus, more or less: large ones are drawn coarser and enlarged.
@@ -60,7 +61,7 @@ def _texture(rng: np.random.Generator, width: int, height: int) -> Picture:
     return np.asarray(cv2.applyColorMap(codes, _palette(rng)), np.uint8)
 
 
-def _palette(rng: np.random.Generator) -> UInt8[np.ndarray, "256 1 3"]:
+def _palette(rng: Generator) -> UInt8[np.ndarray, "256 1 3"]:
     """Return a colour map through random colours; most are muted or close to one colour."""
     count = int(rng.integers(2, 6))
     colours = rng.uniform(0, 255, (count, 3))
@@ -77,7 +78,7 @@ def _palette(rng: np.random.Generator) -> UInt8[np.ndarray, "256 1 3"]:
     return np.asarray(np.clip(colours, 0, 255), np.uint8)[:, None]
 
 
-def _noise(rng: np.random.Generator, width: int, height: int, cells: int) -> Field:
+def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
     """Return smooth noise in [0, 1] with about ``cells`` cells along the image's width."""
     rows = max(round(cells * height / width), 1)
     grid = rng.random((rows + 1, cells + 1), np.float32)
@@ -90,7 +91,7 @@ def _noise(rng: np.random.Generator, width: int, height: int, cells: int) -> Fie
     return np.asarray(cv2.resize(grid, (width, height), interpolation=smooth))
 
 
-def _clouds(rng: np.random.Generator, width: int, height: int) -> Field:
+def _clouds(rng: Generator, width: int, height: int) -> Field:
     """Return noise summed over several scales, each with a random share."""
     field = np.zeros((height, width), np.float32)
     total, cells, gain = 0.0, int(rng.integers(2, 8)), rng.uniform(0.4, 0.9)
@@ -103,7 +104,7 @@ def _clouds(rng: np.random.Generator, width: int, height: int) -> Field:
     return np.asarray((field / total - 0.5) * 1.8 + 0.5)
 
 
-def _coordinates(rng: np.random.Generator, width: int, height: int) -> tuple[Field, Field]:
+def _coordinates(rng: Generator, width: int, height: int) -> tuple[Field, Field]:
     """Return image coordinates, turned, in perspective and bent; the width is about 1."""
     angle, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.08)
     x = np.linspace(-0.5, 0.5, width, dtype=np.float32)[None]
@@ -117,12 +118,12 @@ def _coordinates(rng: np.random.Generator, width: int, height: int) -> tuple[Fie
     return along, across
 
 
-def _gradient(rng: np.random.Generator, width: int, height: int) -> Field:
+def _gradient(rng: Generator, width: int, height: int) -> Field:
     along, across = _coordinates(rng, width, height)
     return np.asarray(along * np.float32(rng.uniform(0.5, 1.5)) + across * across + 0.5)
 
 
-def _checker(rng: np.random.Generator, width: int, height: int) -> Field:
+def _checker(rng: Generator, width: int, height: int) -> Field:
     along, across = _coordinates(rng, width, height)
     tiles = np.float32(rng.uniform(2, 16))
     odd = _whole(along * tiles) + _whole(across * tiles) & 1
@@ -134,7 +135,7 @@ def _whole(values: Field) -> Int32[np.ndarray, "height width"]:
     return np.asarray(np.floor(values), np.int32)
 
 
-def _bricks(rng: np.random.Generator, width: int, height: int) -> Field:
+def _bricks(rng: Generator, width: int, height: int) -> Field:
     """Return a running bond with mortar joints and a shade of its own for every brick."""
     along, across = _coordinates(rng, width, height)
     across = across * np.float32(rng.uniform(4, 14))
@@ -148,7 +149,7 @@ def _bricks(rng: np.random.Generator, width: int, height: int) -> Field:
     return np.where(mortar, np.float32(rng.random()), shade)
 
 
-def _wood(rng: np.random.Generator, width: int, height: int) -> Field:
+def _wood(rng: Generator, width: int, height: int) -> Field:
     """Return year rings of a trunk cut lengthwise: bent stripes with fibres."""
     along, across = _coordinates(rng, width, height)
     rings = across * np.float32(rng.uniform(6, 30)) + 2 * _noise(rng, width, height, 3)
@@ -158,19 +159,19 @@ def _wood(rng: np.random.Generator, width: int, height: int) -> Field:
     return np.asarray(0.7 * (rings - np.floor(rings)) + 0.3 * fibre)
 
 
-def _speckle(rng: np.random.Generator, width: int, height: int) -> Field:
+def _speckle(rng: Generator, width: int, height: int) -> Field:
     """Return fine noise over coarse noise: concrete, carpet, terrazzo."""
     cells = max(int(rng.integers(width // 4, width // 2 + 1)), 1)
     share = np.float32(rng.uniform(0.2, 0.7))
     return share * _noise(rng, width, height, cells) + (1 - share) * _clouds(rng, width, height)
 
 
-_PATTERNS: Final[tuple[Callable[[np.random.Generator, int, int], Field], ...]] = (
+_PATTERNS: Final[tuple[Callable[[Generator, int, int], Field], ...]] = (
     _clouds, _gradient, _checker, _bricks, _wood, _speckle,
 )  # fmt: skip
 
 
-def _scatter(rng: np.random.Generator, image: Picture, count: int) -> None:
+def _scatter(rng: Generator, image: Picture, count: int) -> None:
     """Draw random ellipses, polygons, lines and circles over an image in place."""
     height, width = image.shape[:2]
     # All of a shape's numbers in one draw: one by one they would take longer than the drawing.

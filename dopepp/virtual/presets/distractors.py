@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
+from numpy.random import Generator
 
 from dopepp.core.checks import check_counts, check_number, check_range
 from dopepp.parts.part import Mesh
@@ -45,16 +46,13 @@ class Distractors:
     lookalike_scale: tuple[float, float] = (0.7, 1.3)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_counts("number", self.number, 0, 100, of=self)
         check_range("image_share", self.image_share, 1e-3, 10.0, "image widths", of=self)
         check_range("depth", self.depth, 0.01, 100.0, "depths of the first target", of=self)
         check_number("lookalike_share", self.lookalike_share, 0.0, 1.0, "share", of=self)
         check_range("lookalike_scale", self.lookalike_scale, 0.01, 100.0, "factor", of=self)
 
-    def draw(
-        self, rng: np.random.Generator, width_at_depth: float, negatives: Sequence[Body]
-    ) -> Body:
+    def draw(self, rng: Generator, width_at_depth: float, negatives: Sequence[Body]) -> Body:
         """Draw a distractor.
 
         ``width_at_depth`` is what the image's width shows at its depth, metres.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.checks import check_counts, check_number, check_range
 from dopepp.geometry.rotation import Vector
@@ -59,7 +60,6 @@ class Lighting:
     ground_share: tuple[float, float] = (0.3, 0.9)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_counts("num_lights", self.num_lights, 0, 8, of=self)
         for name in ("key_intensity", "fill_intensity", "ambient_intensity"):
             check_range(name, getattr(self, name), 0.0, 10.0, "1 = white", of=self)
@@ -70,7 +70,7 @@ class Lighting:
         check_range("ground_share", self.ground_share, 0.0, 1.0, "share", of=self)
 
     def draw(
-        self, rng: np.random.Generator, centre: Vector, normal: Vector | None = None
+        self, rng: Generator, centre: Vector, normal: Vector | None = None
     ) -> tuple[tuple[Light, ...], Ambient]:
         """Draw point lights around a point of the scene, and the ambient light.
 
@@ -93,7 +93,7 @@ class Lighting:
         below = above * rng.uniform(*self.ground_share)
         return tuple(lights), Ambient(triple(towards), triple(above), triple(below))
 
-    def _colour(self, rng: np.random.Generator) -> Vector:
+    def _colour(self, rng: Generator) -> Vector:
         """Draw the linear RGB of a lamp of luminance about 1."""
         # Equal steps of 1/T look equally different (mired), so it is what is uniform.
         warm, cold = self.temperature_k
@@ -123,7 +123,7 @@ def black_body_rgb(temperature_k: float) -> Vector:
     return np.asarray(colour / (_LUMINANCE @ colour))
 
 
-def _in_cap(rng: np.random.Generator, axis: Vector, angle_deg: float) -> Vector:
+def _in_cap(rng: Generator, axis: Vector, angle_deg: float) -> Vector:
     """Draw a unit vector uniformly over the spherical cap around a unit axis."""
     cosine = rng.uniform(np.cos(np.radians(angle_deg)), 1.0)
     azimuth, sine = rng.uniform(0, 2 * np.pi), np.sqrt(1 - cosine**2)

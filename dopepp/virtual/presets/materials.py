@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.checks import check_number, check_range
 from dopepp.geometry.rotation import Vector
@@ -66,7 +67,6 @@ class Materials:
     alike_share: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for name in (
             "coloured_share",
             "metal_share",
@@ -86,7 +86,7 @@ class Materials:
         for name in ("brush_slope", "layer_slope"):
             check_range(name, getattr(self, name), 0.0, 2.0, "tangent", of=self)
 
-    def draw(self, rng: np.random.Generator, surface: Surface) -> Material:
+    def draw(self, rng: Generator, surface: Surface) -> Material:
         """Draw what a surface is made of."""
         pitch = surface.radius * rng.uniform(*self.noise_pitch)
         if len(surface.uv):
@@ -98,7 +98,7 @@ class Materials:
             return self._metal(rng, noise, pitch)
         return self._dielectric(rng, surface, noise, pitch)
 
-    def _metal(self, rng: np.random.Generator, noise: float, pitch: float) -> Material:
+    def _metal(self, rng: Generator, noise: float, pitch: float) -> Material:
         """Draw a bare metal: grey but for a cast, brushed along one of the object's axes or not."""
         colour = _grey(rng, rng.uniform(*self.metal_albedo))
         grooves = None
@@ -114,9 +114,7 @@ class Materials:
             colour, roughness, metallic=1.0, noise=noise, noise_pitch=pitch, grooves=grooves
         )
 
-    def _dielectric(
-        self, rng: np.random.Generator, surface: Surface, noise: float, pitch: float
-    ) -> Material:
+    def _dielectric(self, rng: Generator, surface: Surface, noise: float, pitch: float) -> Material:
         """Draw a plastic; a printed one has layers along the axis it was built up."""
         brightness = rng.uniform(*self.albedo)
         coloured = rng.random() < self.coloured_share
@@ -133,17 +131,17 @@ class Materials:
             colour, roughness, specular, noise=noise, noise_pitch=pitch, grooves=grooves
         )
 
-    def _colour(self, rng: np.random.Generator, brightness: float) -> Triple:
+    def _colour(self, rng: Generator, brightness: float) -> Triple:
         """Draw the linear albedo of a random hue whose brightest channel is given."""
         srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
         return triple(brightness * channel**_DISPLAY_POWER for channel in srgb)
 
 
-def _grey(rng: np.random.Generator, brightness: float) -> Triple:
+def _grey(rng: Generator, brightness: float) -> Triple:
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
 
 
-def _build_axis(rng: np.random.Generator, surface: Surface) -> Triple:
+def _build_axis(rng: Generator, surface: Surface) -> Triple:
     """Draw the axis a print was built up along: two times of three the thinnest, as slicers lay."""
     extents: Vector = np.ptp(surface.hull, axis=0)
     thinnest = rng.random() < 2 / 3

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
@@ -41,22 +42,20 @@ FACING: Final = np.diag([1.0, -1.0, -1.0])
 class Turning(Protocol):
     """Draws a target's orientation."""
 
-    def draw(self, rng: np.random.Generator) -> RotationMatrix:
+    def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
 
 
 class Placement(Protocol):
     """Draws a target's position."""
 
-    def draw(
-        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
-    ) -> Vector:
+    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres.
 
         ``rotated_hull``: its extreme vertices, already turned into camera axes, metres.
         """
 
-    def redraw(self, rng: np.random.Generator, place: Vector) -> Vector | None:
+    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
         """Return what to try after a place at which the object is not well in the frame.
 
         What a placement keeps of such a place has the distribution it was drawn from, however often
@@ -74,7 +73,7 @@ class Placement(Protocol):
 class FreeTurning:
     """Any rotation, uniform over SO(3)."""
 
-    def draw(self, rng: np.random.Generator) -> RotationMatrix:
+    def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
         return random_rotation(rng)
 
@@ -95,11 +94,10 @@ class FacingTurning:
     tilt_deg: float = 40.0
 
     def __post_init__(self) -> None:
-        """Check the angles."""
         for name in ("in_plane_deg", "tilt_deg"):
             check_number(name, getattr(self, name), 0.0, 180.0, "degrees", of=self)
 
-    def draw(self, rng: np.random.Generator) -> RotationMatrix:
+    def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
         in_plane = np.radians(rng.uniform(-self.in_plane_deg, self.in_plane_deg))
         tilt = np.arccos(rng.uniform(np.cos(np.radians(self.tilt_deg)), 1.0))
@@ -127,7 +125,6 @@ class OffsetPlacement(Placement):
     lateral: float = 0.15
 
     def __post_init__(self) -> None:
-        """Check that the box lies before the camera."""
         for name in ("distance", "axial", "lateral"):
             check_number(name, getattr(self, name), 0.0, _FARTHEST, "metres", of=self)
         if not self.axial < self.distance:
@@ -137,18 +134,16 @@ class OffsetPlacement(Placement):
                 "move the box of positions before the camera",
             )
 
-    def draw(
-        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
-    ) -> Vector:
+    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         x, y = rng.uniform(-self.lateral, self.lateral, 2)
         return np.array([x, y, self._draw_depth(rng)])
 
-    def redraw(self, rng: np.random.Generator, place: Vector) -> Vector:
+    def redraw(self, rng: Generator, place: Vector) -> Vector:
         """Return the same offsets across the optical axis at another depth, metres."""
         return np.array([place[0], place[1], self._draw_depth(rng)])
 
-    def _draw_depth(self, rng: np.random.Generator) -> float:
+    def _draw_depth(self, rng: Generator) -> float:
         return self.distance + rng.uniform(-self.axial, self.axial)
 
 
@@ -166,7 +161,6 @@ class DistancePlacement(Placement):
     margin: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the range."""
         for name in ("nearest", "farthest"):
             check_number(name, getattr(self, name), 1e-6, _FARTHEST, "metres", of=self)
         check_number("margin", self.margin, 0.0, 0.49, "share", of=self)
@@ -177,9 +171,7 @@ class DistancePlacement(Placement):
                 "change the placement's range",
             )
 
-    def draw(
-        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
-    ) -> Vector:
+    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         depth = rng.uniform(self.nearest, self.farthest)
         pixel = rng.uniform(self.margin, 1 - self.margin, 2) * size - 0.5
@@ -198,7 +190,6 @@ class FillPlacement(Placement):
     largest: float = 0.95
 
     def __post_init__(self) -> None:
-        """Check the range."""
         for name in ("smallest", "largest"):
             check_number(name, getattr(self, name), 1e-3, 1.0, "share of the image", of=self)
         if self.smallest > self.largest:
@@ -208,9 +199,7 @@ class FillPlacement(Placement):
                 "change the placement's range",
             )
 
-    def draw(
-        self, rng: np.random.Generator, K: CameraMatrix, size: Size, rotated_hull: Points
-    ) -> Vector:
+    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
         share = rng.uniform(self.smallest, self.largest)
         offset = rng.uniform(-0.5, 0.5, 2)

@@ -72,7 +72,6 @@ class Preset:
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
-        """Check what a user may have replaced."""
         check_counts("targets_per_image", self.targets_per_image, 0, 100, of=self)
         for name in ("width", "height"):
             check_number(name, getattr(self, name), 8, 16384, "pixels", of=self)
@@ -195,10 +194,8 @@ def _changed(described: T, changes: Any, where: str) -> T:
 
 
 def _converted(value: Any, hint: Any, old: Any, where: str) -> Any:
-    """Return a plain value as what a field's annotation asks for.
-
-    A group's other fields stay as they are in ``old``; ``where`` names the field in messages.
-    """
+    """Return a plain value as what a field's annotation asks for."""
+    # A group's other fields stay as they are in ``old``; ``where`` names the field in messages.
     if get_origin(hint) is UnionType:
         if value is None:
             return None

@@ -8,6 +8,7 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator
 
 from dopepp.core.checks import check_flag, check_number, check_range
 from dopepp.drawing.pictures import Mask, Picture, Size
@@ -54,7 +55,6 @@ class Table:
     picture_width: tuple[float, float] = (1.2, 2.4)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_range("distance", self.distance, 0.02, 100.0, "metres", of=self)
         check_range("elevation_deg", self.elevation_deg, 10.0, 90.0, "degrees", of=self)
         check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
@@ -64,7 +64,7 @@ class Table:
         check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
         check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
 
-    def draw_view(self, rng: np.random.Generator) -> Transform:
+    def draw_view(self, rng: Generator) -> Transform:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""
         distance = rng.uniform(*self.distance)
         elevation = np.radians(rng.uniform(*self.elevation_deg))
@@ -74,9 +74,7 @@ class Table:
         rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, roll])) @ level
         return make_transform(rotation, np.array([0.0, 0.0, distance]))
 
-    def draw_turning(
-        self, rng: np.random.Generator, hull: Hull
-    ) -> tuple[Float[np.ndarray, "3 3"], float]:
+    def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
         """Draw how an object lies: on one of its stable faces, any way round, or leaning.
 
         Returns:
@@ -95,7 +93,7 @@ class Table:
 
     def draw_picture(
         self,
-        rng: np.random.Generator,
+        rng: Generator,
         backgrounds: Backgrounds,
         K: CameraMatrix,
         size: Size,

@@ -74,13 +74,10 @@ def _average_normals(
 ) -> None:
     """Average, at every corner, the normals of the faces around its vertex within an angle.
 
-    Args:
-        face_normals: Unit normal of every face, shape (F, 3), zero for degenerate ones.
-        weights: Weight of every corner (its angle in the triangle), shape (F, 3).
-        offsets: Start of every vertex's corners in ``corners``, shape (V + 1,).
-        corners: Corner numbers 3·face + k sorted by vertex, shape (3F,).
-        cosine: Cosine of the crease angle; faces that differ by more are not averaged.
-        out: Normals, shape (F, 3, 3), float32.
+    Faces have unit normals, zero for degenerate ones, and corners ``weights`` (their angles), both
+    of shape (F, 3). ``corners`` are the numbers 3·face + k sorted by vertex, shape (3F,), of which
+    each vertex's start at ``offsets``, shape (V + 1,). Faces that differ by more than ``cosine``
+    are not averaged. ``out`` are normals, shape (F, 3, 3), float32.
     """
     for vertex in range(offsets.shape[0] - 1):
         for p in range(offsets[vertex], offsets[vertex + 1]):

@@ -192,20 +192,11 @@ def _bake(
 ) -> None:  # fmt: skip
     """Sum the open and all of the cosine over directions, for front and back sides.
 
-    Args:
-        vertices: Object frame, metres.
-        faces: Vertex indices.
-        closed: Drop back faces.
-        centre: Of the mesh.
-        radius: Of the mesh around its centre.
-        directions: Unit vectors, shape (D, 3).
-        side: Texels across a depth map.
-        samples: The one at a texel's centre.
-        points: To measure at, shape (n, 3).
-        upright: Their normals, shape (n, 3).
-        flat: Normal of every face.
-        ground: Face of every point, shape (n,).
-        sums: Open front, all front, open back and all back, shape (4, n), updated in place.
+    The mesh lies within ``radius`` around ``centre``; ``closed`` drops back faces. Depth maps along
+    ``directions`` (units, shape (D, 3)) have ``side`` texels across, sampled at their centres.
+    ``points`` with normals ``upright``, both of shape (n, 3), are measured at; ``ground`` is the
+    face of each, shape (n,), ``flat`` every face's normal. ``sums`` are open front, all front, open
+    back and all back, shape (4, n), updated in place.
     """
     distance = _DISTANCE * radius
     focal = 0.5 * (side - 4) * distance / radius
@@ -266,13 +257,9 @@ def look_up_sky(
 ) -> None:
     """Interpolate the open sky at an object's fragments.
 
-    Args:
-        face: Triangle of every fragment, complemented for back sides, shape (n,).
-        share: Weights of the triangle's corners, shape (3, n).
-        steps: Of an :class:`OpenSky`; firsts and values too.
-        firsts: First point of every triangle.
-        values: Shares of both sides, shape (2, points).
-        out: Result, shape (n,).
+    ``face`` is each one's triangle, complemented for back sides, shape (n,); ``share`` weighs its
+    corners, shape (3, n); ``steps``, ``firsts`` and ``values`` are those of an :class:`OpenSky`;
+    ``out`` is the result, shape (n,).
     """
     for p in range(face.shape[0]):
         f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)

@@ -163,18 +163,11 @@ def sample_texture(
 ) -> None:  # fmt: skip
     """Look up the texture at an object's fragments, filtered over a pixel.
 
-    Args:
-        face: Triangle of every fragment, complemented for back faces, shape (n,).
-        share: Weights of the triangle's corners, shape (3, n).
-        x: Image column, pixels, shape (n,).
-        y: Image row.
-        hom: Homogeneous pixels of the vertices, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        uv: Texture coordinates per vertex, shape (V, 2).
-        texels: Of a :class:`Texture`.
-        levels: Of the same.
-        decode: Linear light of every code.
-        out: Linear RGB, shape (3, n), overwritten.
+    ``face`` is each one's triangle, complemented for back faces, shape (n,); ``share`` weighs its
+    corners, shape (3, n); ``x`` and ``y`` are image column and row, pixels, shape (n,). ``hom`` are
+    the vertices' homogeneous pixels, shape (V, 3), with ``faces``, shape (F, 3), and ``uv``, shape
+    (V, 2); ``texels`` and ``levels`` are those of a :class:`Texture`; ``decode`` is the linear
+    light of every code. ``out`` is linear RGB, shape (3, n), overwritten.
     """
     last = levels.shape[0] - 1
     rows, columns = float(levels[0, 1]), float(levels[0, 2])

@@ -151,10 +151,8 @@ def make_instance(
 def _column(
     records: Sequence[object], field: str, count: int, place: Place, what: str, problems: Problems
 ) -> Float[np.ndarray, "records count"]:
-    """Return a field of all records; one by one only to find those that are wrong.
-
-    Nested lists of the right size, ``[[…], […], […]]`` for a matrix, are taken as other tools do.
-    """
+    """Return a field of all records; one by one only to find those that are wrong."""
+    # Nested lists of the right size, ``[[…], […], […]]`` for a matrix, are taken as other tools do.
     if not records:
         return np.empty((0, count))
     try:

@@ -126,7 +126,6 @@ class BopSource:
             )  # fmt: skip
 
     def __len__(self) -> int:
-        """Return how many images there are."""
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

@@ -56,8 +56,7 @@ NO_BOX = [-1, -1, -1, -1]
 class BopFolder:
     """What the writers of BOP's layouts share: a folder with models beside a split of images.
 
-    Args:
-        parts: The objects, numbered from 1 in this order.
+    ``parts`` are numbered from 1 in their order.
     """
 
     chunk_size = IMAGES_A_SCENE
@@ -267,10 +266,8 @@ def _bop_box(box: Box | None) -> list[int]:
 
 
 def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
-    """Return the outermost pixels of a silhouette, those beyond the image included.
-
-    Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
-    """
+    """Return the outermost pixels of a silhouette, those beyond the image included."""
+    # Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
     if inside is None or whole.box is None:
         return inside
     height, width = whole.mask.shape

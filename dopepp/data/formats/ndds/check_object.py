@@ -236,11 +236,9 @@ class ObjectCheck:
             self._judge("bounding_box", fits, problem)
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
-        """Return the file's camera axes as a matrix into OpenCV's.
-
-        A point behind an OpenCV camera is before an OpenGL one if it then projects to where the
-        file says.
-        """
+        """Return the file's camera axes as a matrix into OpenCV's."""
+        # A point behind an OpenCV camera is before an OpenGL one if it then projects to where the
+        # file says.
         projected, is_opengl = self._projected, False
         is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
         if location[2] < 0 and not is_before and projected is not None and K is not None:

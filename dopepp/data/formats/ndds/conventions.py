@@ -71,7 +71,6 @@ class PoseConvention:
     frame: Frame = "mesh"
 
     def __str__(self) -> str:
-        """Say it in one phrase."""
         return (
             f"quaternion {','.join(self.quaternion)}, lengths in {self.unit}, "
             f"{self.camera} camera axes, frame: {self.frame}"
@@ -92,9 +91,7 @@ POSE_CONVENTIONS: Final = tuple(
 class Observation:
     """An annotated object whose part is known: what a convention can be tried on.
 
-    Attributes:
-        fixed: The class's ``fixed_model_transform``, rigid, translation in the file's unit; None
-            where there is none.
+    ``fixed`` is the class's ``fixed_model_transform``, rigid, translation in the file's unit.
     """
 
     item: NddsObject
@@ -154,10 +151,8 @@ class Observation:
 
 
 def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
-    """Return the corners of the box along turned axes, in NDDS order, in the part's frame.
-
-    A turn by other than right angles needs the shape itself; the cuboid's box would be too large.
-    """
+    """Return the corners of the box along turned axes, in NDDS order, in the part's frame."""
+    # A turn by other than right angles needs the shape itself; the cuboid's box would be too large.
     quarter_turns = np.abs(np.abs(rotation).max(axis=0) - 1).max() < 1e-6
     shape = part.points if part.mesh is None else part.mesh.vertices
     turned = (part.cuboid[:8] if quarter_turns else shape) @ rotation.T
@@ -205,7 +200,6 @@ class Finding:
     num_instances: int
 
     def __str__(self) -> str:
-        """Say what was found and how sure it is."""
         text = (
             f"{self.convention} (reprojection error {self.error_px:.2g} px, of the next best "
             f"{self.rival_px:.3g} px, {self.num_instances} instances)"

@@ -145,7 +145,6 @@ class NddsSource:
                 yield Observation(parse_object(item, field, path), part, K, fixed, path)
 
     def __len__(self) -> int:
-        """Return the number of annotated images."""
         return len(self.items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

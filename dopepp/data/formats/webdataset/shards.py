@@ -87,10 +87,8 @@ def _expanded(texts: Sequence[str]) -> list[str]:
 
 
 def _longest_range(text: str) -> int:
-    """Return the length of the longest ``{1..9}``, all of which the library lists at once.
-
-    Texts too long, or with more braces than a path needs, count as too long a range.
-    """
+    """Return the length of the longest ``{1..9}``, all of which the library lists at once."""
+    # Texts too long, or with more braces than a path needs, count as too long a range.
     if len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES:
         return MAX_SHARDS
     return max((abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text)), default=0)

@@ -81,7 +81,6 @@ class WebdatasetSource:
         self._items = table[share(len(table), part_of, self.name)]
 
     def __len__(self) -> int:
-        """Return how many images there are."""
         return len(self._items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

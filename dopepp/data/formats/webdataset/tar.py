@@ -52,8 +52,7 @@ class TarMember(NamedTuple):
 class ShardIndex:
     """The images of a shard, in its order.
 
-    Attributes:
-        spans: First byte and size of every image's :data:`FIELDS`; −1 where it has none.
+    ``spans`` has first byte and size of every image's :data:`FIELDS`, −1 where it has none.
     """
 
     path: Path

@@ -149,10 +149,8 @@ def _load(path: Path, problems: Problems) -> dict[str, NDArray[Any]] | None:
 
 
 def _is_complete(content: bytes) -> bool:
-    """Follow the MAT-5 elements (type, length, data): the last one must end where the file ends.
-
-    SciPy reads a file that was cut off between or inside variables it is not asked for.
-    """
+    """Follow the MAT-5 elements (type, length, data): the last one must end where the file ends."""
+    # SciPy reads a file that was cut off between or inside variables it is not asked for.
     start = _HEADER_BYTES
     order = "<" if content[126:128] == b"IM" else ">"
     while start + 8 <= len(content):

@@ -112,7 +112,6 @@ class YcbVideoSource:
         return present
 
     def __len__(self) -> int:
-        """Return how many listed frames are on disk."""
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:

@@ -175,8 +175,7 @@ def _cast_scalar(
 class TableTop:
     """The disc that stands for a scene's plane.
 
-    Args:
-        depth: The plane's depth at pixel centres, metres; 0 where it is not seen.
+    ``depth`` is the plane's at pixel centres, metres; 0 where it is not seen.
     """
 
     def __init__(self, scene: Scene, depth: Float32[np.ndarray, "height width"]) -> None:

@@ -197,12 +197,10 @@ def _interpolate(
 def _corner_heights(
     vertices: Array, a: int, b: int, c: int, normals: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Return how far the other two corners lie below each corner's tangent plane, metres.
-
-    A point of the triangle lies below these planes by sums of them; weighted by its shares of the
-    corners, that is how far it lies below the surface its normals belong to (Hanika, "Hacking the
-    shadow terminator", Ray Tracing Gems II, 2021).
-    """
+    """Return how far the other two corners lie below each corner's tangent plane, metres."""
+    # A point of the triangle lies below these planes by sums of them; weighted by its shares of the
+    # corners, that is how far it lies below the surface its normals belong to (Hanika, "Hacking the
+    # shadow terminator", Ray Tracing Gems II, 2021).
     h0, h1, h2, h3, h4, h5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(3):
         ab = vertices[a, r] - vertices[b, r]

@@ -90,8 +90,7 @@ def _plane_frame(plane: Plane) -> Float[np.ndarray, "3 4"]:
 def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
     """Return the share of every texel that hides the plane from the light, penumbra included.
 
-    Returns:
-        The map with a margin around it for the penumbra, and the margin, texels.
+    The map has a margin around it for the penumbra, whose width, texels, comes second.
     """
     P = shadow.P.astype(np.float64)
     # In the map, too, the plane's 1/depth is linear: n · x = offset with x = M⁻¹ (depth (u, v, 1)
@@ -169,21 +168,12 @@ def _darken(
 ) -> None:  # fmt: skip
     """Multiply the picture by the share of the plane's light that is left.
 
-    Args:
-        corner: Image pixel (x, y) of the first element of ``shades``.
-        to_point: Pixel to point and 1/z, shape (4, 3).
-        near: Metres before which nothing is seen.
-        normal: The plane's.
-        shades: Share that is hidden, of the sky and of every light, shape (1 + lights, h, w).
-        sky: Linear RGB of the sky's light on the plane.
-        lights: Position and linear RGB at one metre, shape (lights, 6).
-        P: Their shadow maps' projections, shape (lights, 3, 4).
-        decode: Code to linear light; encode: its inverse, in ``steps`` per unit.
-        encode: Idem.
-        steps: Idem.
-        origin: Image pixel (x, y) of the first element of ``ids``.
-        ids: Triangle ids per sample.
-        image: uint8, updated in place.
+    Pixels (x, y) of the first elements are ``corner`` of ``shades`` (the share that is hidden of
+    the sky and of every light, shape (1 + lights, h, w)) and ``origin`` of ``ids`` (triangles per
+    sample). ``to_point`` maps a pixel to its point and 1/z, shape (4, 3). ``sky`` is linear RGB,
+    ``lights`` have position and linear RGB at one metre, shape (lights, 6), ``P`` projects into
+    their shadow maps, shape (lights, 3, 4). ``decode`` turns codes into linear light, ``encode``,
+    in ``steps`` per unit, back. ``image`` is uint8, updated in place.
     """
     width = shades.shape[2]
     total, lost = np.empty((3, width), np.float32), np.empty((3, width), np.float32)

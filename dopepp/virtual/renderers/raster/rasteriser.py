@@ -183,15 +183,11 @@ def _composite(
 ) -> None:  # fmt: skip
     """Put a window of samples over the background and read its centre samples as labels.
 
-    Args:
-        origin: Image pixel (x, y) of the window's first element.
-        ids: Triangle ids per sample; the last sample is the pixel's centre.
-        inverse_depth: 1/m per sample.
-        colour: Sum of the covered samples' sRGB values.
-        first_ids: First triangle id of every object, ascending.
-        image: Background on entry, result on return, uint8.
-        depth: Metres at pixel centres, float32.
-        instances: Object index at pixel centres, int16.
+    ``origin`` is the image pixel (x, y) of the window's first element; ``ids`` and
+    ``inverse_depth`` (1/m) are per sample, the last of which is the pixel's centre; ``colour`` sums
+    the covered samples' sRGB values; ``first_ids`` ascend by object. Updated in place: ``image``
+    (uint8, the background on entry) and, at pixel centres, ``depth`` (metres, float32) and
+    ``instances`` (object index, int16).
     """
     height, width, num_samples = ids.shape
     centre = num_samples - 1

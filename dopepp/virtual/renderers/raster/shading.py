@@ -138,14 +138,8 @@ def _tint_albedo(
 ) -> None:  # fmt: skip
     """Vary the albedo over an object's surface; variation finer than a pixel fades.
 
-    Args:
-        noise: :data:`_NOISE`.
-        position: Points in the camera frame, metres, shape (3, n).
-        T_cam_obj: Object to camera frame.
-        focal: Focal length, pixels.
-        amplitude: Relative amplitude.
-        pitch: Of the lattice, metres.
-        albedo: Linear RGB, shape (3, n), updated in place.
+    ``position`` is in the camera frame, metres, shape (3, n); ``focal`` in pixels; ``pitch`` that
+    of the lattice, metres; ``albedo`` linear RGB, shape (3, n), updated in place.
     """
     for p in range(position.shape[1]):
         # Two lattice steps are the shortest wave; it needs two pixels.
@@ -172,17 +166,11 @@ def _tilt_normals(
 ) -> None:  # fmt: skip
     """Tilt the normals of grooved points, or widen their highlight where grooves are fine.
 
-    Args:
-        noise: :data:`_NOISE`.
-        position: Points in the camera frame, metres, shape (3, n).
-        axis: Unit vector across the grooves, camera frame.
-        phase_origin: ``axis · origin`` of the object's frame, metres.
-        focal: (fx, fy), pixels.
-        pitch: Metres from groove to groove.
-        slope: Largest slope of the flanks.
-        irregularity: 0 for sines, 1 for noise.
-        normal: Unit normals towards the camera, shape (3, n), updated in place.
-        alpha: GGX width, the square of the roughness, shape (n,), updated in place.
+    In the camera frame are ``position`` (metres, shape (3, n)) and ``axis``, a unit vector across
+    the grooves; ``phase_origin`` is ``axis · origin`` of the object's frame, metres; ``focal`` is
+    (fx, fy), pixels; ``pitch`` metres from groove to groove; ``irregularity`` 0 for sines, 1 for
+    noise. Updated in place: unit normals towards the camera, shape (3, n), and ``alpha``, the GGX
+    width (the square of the roughness), shape (n,).
     """
     ax, ay, az = axis
     for p in range(position.shape[1]):
@@ -253,16 +241,10 @@ def _add_colour(
 ) -> None:  # fmt: skip
     """Add fragments to the sums of their pixels' sRGB values.
 
-    Light is encoded before samples are averaged, so a highlight's edge stays smooth.
-
-    Args:
-        pixel: Index of every fragment's pixel, shape (n,).
-        weight: Number of samples it stands for, shape (n,).
-        radiance: Linear RGB, shape (3, n).
-        curve: sRGB value per step of radiance.
-        limit: Radiance at which the curve ends.
-        steps: Steps of the curve per unit.
-        colour: Sums, float32, shape (pixels, 3), updated in place.
+    Light is encoded before samples are averaged, so a highlight's edge stays smooth. A fragment
+    stands for ``weight`` samples of its ``pixel``, both of shape (n,), with linear RGB
+    ``radiance``, shape (3, n). ``curve`` gives sRGB in ``steps`` per unit of radiance up to
+    ``limit``. ``colour`` are the sums, float32, shape (pixels, 3), updated in place.
     """
     for p in range(pixel.shape[0]):
         for c in range(3):
