@@ -27,22 +27,14 @@ def check_number(
 
 
 def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
-    """Return an integer of a closed range.
-
-    Raises:
-        UserError: It is not an integer of that range.
-    """
+    """Return an integer of a closed range; anything else is a :class:`UserError`."""
     if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
         raise _refused(name, value, f"an integer from {lowest} to {highest}")
     return value
 
 
 def check_flag(name: str, value: object, of: object = None) -> bool:
-    """Return a truth value.
-
-    Raises:
-        UserError: It is neither true nor false.
-    """
+    """Return a truth value; anything else is a :class:`UserError`."""
     if not isinstance(value, bool):
         raise _refused(name, value, "true or false", of)
     return value

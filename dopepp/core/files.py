@@ -22,11 +22,7 @@ from jaxtyping import UInt8
 
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB image.
-
-    Raises:
-        ValueError: The image is not uint8 (H, W, 3), or empty.
-    """
+    """Write an RGB image; a ValueError, where it is not uint8 (H, W, 3), or empty."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]

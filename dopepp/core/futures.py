@@ -45,13 +45,9 @@ def connect(
 ) -> Any:
     """Import Ray and connect to a cluster, or start a local one.
 
-    A local one binds to this machine only and reports to nobody.
-
-    Args:
-        address: Of the cluster; None starts one on this machine that ends with this process.
-        num_workers: Cores of that local cluster.
-        asked_by: The choice that needs Ray, for messages.
-        option: The option that holds the address, for messages.
+    A local one, without an ``address``, has ``num_workers`` cores, binds to this machine only,
+    reports to nobody and ends with this process. ``asked_by`` and ``option`` name, for messages,
+    the choice that needs Ray and the option that holds the address.
 
     Raises:
         UserError: Ray is not installed, or there is no cluster at the address.

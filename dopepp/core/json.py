@@ -40,9 +40,6 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 
     A file of more than ``max_bytes`` is refused before it is read.
 
-    Returns:
-        Dicts, lists, strings, finite numbers, booleans and None.
-
     Raises:
         UserError: The file is missing or too large, or what :func:`parse_json` refuses.
     """
@@ -62,11 +59,7 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 
 
 def parse_json(text: str | bytes, where: str) -> object:
-    """Parse JSON text.
-
-    Args:
-        text: UTF-8, with or without a byte order mark. Its size is the caller's to bound.
-        where: The file it comes from, for the error.
+    """Parse JSON text in UTF-8, with or without a byte order mark, of a size its caller bounds.
 
     Raises:
         UserError: It is no UTF-8, no JSON, has a key twice in one object, is nested more than 64

@@ -9,7 +9,7 @@ against the images. To add a layout, write ``check_NAME(report)`` in ``check.py`
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -22,40 +22,23 @@ from dopepp.data.formats.webdataset.check import check_webdataset, shard_paths
 from dopepp.data.formats.ycb_video.check import check_ycb
 
 
-def _is_ycb(root: Path) -> bool:
-    return (root / "image_sets").is_dir() and (root / "data").is_dir()
-
-
-def _is_webdataset(root: Path) -> bool:
-    return next(iter(shard_paths(root)), None) is not None
-
-
-def _is_bop(root: Path) -> bool:
-    return next(iter(scene_folders(root)), None) is not None
-
-
 def _is_ndds(root: Path) -> bool:
     """Tell by the settings file or by an annotation beside an image of its name."""
-    for folder, names in _folders(root):
+    for folder, _, names in os.walk(root):
         present = set(names)
         if OBJECT_SETTINGS in present:
             return True
         for name in names:
             stem = name.removesuffix(".json")
             if stem != name and any(stem + suffix in present for suffix in (".png", ".jpg")):
-                return (folder / name).is_file()
+                return Path(folder, name).is_file()
     return False
 
 
-def _folders(root: Path) -> Iterator[tuple[Path, list[str]]]:
-    for folder, _, names in os.walk(root):
-        yield Path(folder), names
-
-
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
-    "YCB-Video": (_is_ycb, check_ycb),
-    "BOP-WebDataset": (_is_webdataset, check_webdataset),
-    "BOP": (_is_bop, check_bop),
+    "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
+    "BOP-WebDataset": (lambda root: any(shard_paths(root)), check_webdataset),
+    "BOP": (lambda root: any(scene_folders(root)), check_bop),
     "NDDS": (_is_ndds, check_ndds),
 }
 """How each layout is told, in this order, and checked."""

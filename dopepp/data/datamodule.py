@@ -122,11 +122,7 @@ class PoseDataModule(LightningDataModule):
         )
 
     def check_objects(self) -> None:
-        """Fail when an object to learn is in no training source.
-
-        Raises:
-            UserError: Names the objects that are missing.
-        """
+        """Raise a UserError that names the objects to learn that are in no training source."""
         missing = [name for name in self.object_names if not self.train_source.contains(name)]
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())

@@ -30,10 +30,8 @@ _SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
     """Give parts the symmetries that a user has chosen.
 
-    Args:
-        parts: The objects, with what their data set states.
-        choice: None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
-            them on the mesh; anything else is a file that has them for every part, by name.
+    The choice None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
+    them on the mesh; anything else is a file that has them for every part, by name.
 
     Raises:
         UserError: A part has no mesh to look at, or the file is damaged or lacks a part.

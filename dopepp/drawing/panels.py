@@ -101,11 +101,7 @@ def smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Put pictures side by side, row by row, on white.
-
-    Raises:
-        ValueError: There are none, or fewer than one column.
-    """
+    """Put pictures side by side, row by row, on white; a ValueError, if there is none to put."""
     if not pictures or columns < 1:
         raise ValueError(f"a grid needs pictures and columns, got {len(pictures)} and {columns}")
     rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
@@ -146,15 +142,10 @@ def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
 
 
 def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
-    """Colour depth from near (red) to far (blue); unknown depth is black.
+    """Colour depth from near (red) to far (blue), unknown black; return the ends in words, too.
 
-    Args:
-        depth: Metres, 0 where unknown.
-        shown: Pixels that the scale is for: those of the objects. A plane that reaches far behind
-            them would leave them one colour.
-
-    Returns:
-        The panel, and the scale's ends in words.
+    The scale is for the ``shown`` pixels, the objects': a plane that reaches far behind them would
+    leave them one colour.
     """
     known = depth > 0
     scale = depth[known & shown] if (known & shown).any() else depth[known]

@@ -98,11 +98,7 @@ def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.I
 
 
 def read_content(path: Path) -> bytes:
-    """Return an image file's bytes.
-
-    Raises:
-        UserError: The file is missing or too large.
-    """
+    """Return an image file's bytes; a UserError where it is missing or too large."""
     try:
         return _content(path)
     except OSError as error:

@@ -54,9 +54,8 @@ FLOOR: Final = 2.0
 def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:
     """Compare outline and creases of a part at a pose with an image.
 
-    Returns:
-        0 (edges lie anywhere) to 1 (all lie on the contour). 0, too, where the part is not before
-        the camera or has no contour within the image.
+    0 says that edges lie anywhere, 1 that all lie on the contour. It is 0, too, where the part is
+    not before the camera or has no contour within the image.
     """
     if transform(T_cam_obj, surface.hull)[:, 2].min() <= NEAR:
         return 0.0

@@ -53,11 +53,7 @@ class Body:
 
 
 def make_body(part: Part, *, is_target: bool) -> Body:
-    """Prepare a part's mesh.
-
-    Raises:
-        UserError: The part has no mesh, or one that cannot be rendered.
-    """
+    """Prepare a part's mesh; without one that can be rendered, it is a UserError."""
     if part.mesh is None:
         raise UserError(
             f"part {part.name} without a mesh",

@@ -192,11 +192,7 @@ class Scene:
         return tuple(i for i, item in enumerate(self.objects) if item.is_target)
 
     def keypoints(self, index: int) -> Float[np.ndarray, "9 2"]:
-        """Return a target's projected cuboid corners and centroid, pixels.
-
-        Raises:
-            ValueError: The object is no target.
-        """
+        """Return a target's projected corners and centroid, pixels; ValueError for no target."""
         item = self.objects[index]
         if item.part is None:
             raise ValueError(f"object {index} is a distractor and has no {NUM_KEYPOINTS} keypoints")

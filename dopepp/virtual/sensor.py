@@ -25,8 +25,6 @@ from dopepp.drawing.pictures import Picture
 from dopepp.virtual.scene import Sensor
 from dopepp.virtual.tone import decode_srgb, encode_srgb
 
-Image = Picture
-
 _NOISE_VALUES: Final = 65536
 """Length of the table of normal values that noise is read from; a power of two."""
 
@@ -106,7 +104,7 @@ class Sensors:
         )
 
 
-def capture(image: Image, sensor: Sensor) -> Image:
+def capture(image: Picture, sensor: Sensor) -> Picture:
     """Return what a sensor makes of an ideal picture; the default sensor returns it unchanged.
 
     Exposure works on linear light. Both blurs work on the sRGB picture, which spreads highlights
@@ -129,19 +127,19 @@ def capture(image: Image, sensor: Sensor) -> Image:
     return image
 
 
-def defocus(image: Image, sigma_px: float) -> Image:
+def defocus(image: Picture, sigma_px: float) -> Picture:
     """Blur with a Gaussian of a standard deviation in pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px))
 
 
-def motion_blur(image: Image, motion_px: tuple[float, float]) -> Image:
+def motion_blur(image: Picture, motion_px: tuple[float, float]) -> Picture:
     """Average the picture along a displacement (x, y) in pixels, centred, so that it stays put."""
     return np.asarray(
         cv2.filter2D(image, -1, _line_kernel(*motion_px), borderType=cv2.BORDER_REFLECT_101)
     )
 
 
-def add_noise(image: Image, read: float, shot: float, seed: int) -> Image:
+def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
     """Add Gaussian noise, independent per pixel and channel.
 
     ``read`` and ``shot`` are standard deviations in grey levels of 255: of the signal-independent
@@ -155,7 +153,7 @@ def add_noise(image: Image, read: float, shot: float, seed: int) -> Image:
     return noisy
 
 
-def compress(image: Image, quality: int) -> Image:
+def compress(image: Picture, quality: int) -> Picture:
     """Compress to JPEG (quality 1 to 100) and back."""
     # The codec takes the channels as B, G, R; a swapped order would weigh red and blue wrongly.
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)

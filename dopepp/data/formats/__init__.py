@@ -45,11 +45,7 @@ class Writer(Protocol):
     """Items ``chunk·chunk_size … (chunk + 1)·chunk_size − 1`` are finalized together."""
 
     def prepare(self) -> None:
-        """Write what the whole data set shares (models, settings); idempotent.
-
-        Raises:
-            UserError: The folder holds something else.
-        """
+        """Write what all of a data set shares, idempotently; a UserError in another's folder."""
 
     def write(self, index: int, sample: Sample) -> None:
         """Write one item completely; on return it survives a crash."""

@@ -103,9 +103,7 @@ def rotation_problem(rotation: RotationMatrix) -> str | None:
 def translation_problem(translation: Vector, diameter: float | None) -> tuple[str, str] | None:
     """Say what is wrong with an object's place as (kind, message), None where nothing is.
 
-    Args:
-        translation: Camera frame, any unit.
-        diameter: Of the object, the same unit; None where it is not known.
+    ``translation`` is in the camera frame, in the unit of ``diameter``, which may not be known.
     """
     depth = float(translation[2])
     if depth <= 0:
@@ -143,13 +141,9 @@ def box_problem(
 ) -> str | None:
     """Hold what is seen of an object against where its pose puts it; None where they agree.
 
-    Args:
-        points_cam: Points whose hull contains the object, camera frame.
-        K: Camera matrix, pixels.
-        seen: Box of the visible pixels; None where nothing is seen.
-        visible_fraction: Visible share of the silhouette, None where it is not known.
-        shape: The image's (height, width), where that share does not count what the border cuts
-            off.
+    The hull of ``points_cam``, camera frame, contains the object; ``seen`` is the box of its
+    visible pixels, None where nothing is seen. ``shape`` is the image's (height, width), where
+    ``visible_fraction`` does not count what the border cuts off.
     """
     predicted = Box.of_points(project(points_cam, K))
     if predicted is None or seen is None:

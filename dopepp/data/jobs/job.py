@@ -129,11 +129,7 @@ def _find_writer(layout: str) -> Callable[[Path, Sequence[Part]], Writer]:
 
 
 def named_part(text: str, unit: str | None) -> Part:
-    """Load a part that is written as in :func:`make_job`.
-
-    Raises:
-        UserError: There is no such part, or the name cannot be one.
-    """
+    """Load a part that is written as in :func:`make_job`; a UserError where there is none such."""
     match = None if Path(text).exists() else _NAMED.fullmatch(text)
     if match is None:
         return load_part(text, unit)

@@ -55,11 +55,7 @@ def write_preview(job: Job, out: Path) -> Path:
 
 
 def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> Picture:
-    """Render a job's first images and draw, in a row each, the image and its labels.
-
-    Raises:
-        UserError: The preset cannot show the part.
-    """
+    """Render a job's first images and draw, in a row each, the image and its labels."""
     tiles: list[Tile] = []
     for index in range(num_scenes):
         tiles += scene_tiles(factory.render(0, index), f"image {index}")

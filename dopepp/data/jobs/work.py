@@ -33,11 +33,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """Read ``i/n``, i from 0 to n − 1.
-
-        Raises:
-            UserError: It is something else.
-        """
+        """Read ``i/n``, i from 0 to n − 1; anything else is a :class:`UserError`."""
         match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if match is None or int(match[1]) >= int(match[2]):
             raise UserError(

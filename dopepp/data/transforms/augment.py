@@ -16,7 +16,6 @@ from numpy.random import Generator
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.sensor import add_noise, compress, defocus
 
-Image = Picture
 Range = tuple[float, float]
 
 # BT.601 luma weights: grey keeps its brightness when saturation or hue changes.
@@ -75,7 +74,7 @@ class Photometric:
         self.noise_probability, self.noise_sigma = noise_probability, noise_sigma
         self.jpeg_probability, self.jpeg_quality = jpeg_probability, jpeg_quality
 
-    def __call__(self, image: Image, rng: Generator) -> Image:
+    def __call__(self, image: Picture, rng: Generator) -> Picture:
         """Return a changed copy of an RGB image."""
         image = cv2.transform(image, self._colour_matrix(rng))
         if rng.random() < self.blur_probability:

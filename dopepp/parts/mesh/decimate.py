@@ -43,13 +43,10 @@ def decimate(
     Float[np.ndarray, "fewer 2"] | None,
     float,
 ]:
-    """Replace triangles by at most ``max_faces`` larger ones.
+    """Replace triangles by at most ``max_faces`` larger ones; return the farthest move, too.
 
     All ``faces`` have an area. Vertices that share a position and a cell but no edge, such as those
     on both sides of a seam, keep texture coordinates of their own.
-
-    Returns:
-        Vertices, faces and uv, and the largest distance that a vertex was moved by.
 
     Raises:
         ValueError: No grid leaves a triangle, because all of them are tiny and apart.

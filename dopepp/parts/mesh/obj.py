@@ -52,11 +52,7 @@ class ObjFile:
     _material: str | None = None
 
     def add(self, line: str, number: int) -> None:
-        """Take in one line.
-
-        Raises:
-            ValueError: The line is damaged.
-        """
+        """Take in one line; a damaged one is a ValueError."""
         match line.split():
             case ["v", *words]:
                 self.positions.extend(_numbers(words, 3))

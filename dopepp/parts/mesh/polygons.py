@@ -59,13 +59,10 @@ def read_off(path: Path) -> RawMesh:
 def fans(
     vertices: Vertices, corners: Int[np.ndarray, " corners"], counts: Int[np.ndarray, " polygons"]
 ) -> Int[np.ndarray, "triangles 3"]:
-    """Cut polygons into fans of triangles around their first corners.
+    """Cut polygons into fans of triangles around their first corners, as places in ``corners``.
 
     ``corners`` has the vertex at each corner, one polygon behind the other; ``counts`` the corners
     of each.
-
-    Returns:
-        Triangles, each as three places in ``corners``.
 
     Raises:
         ValueError: A polygon has fewer than three corners or, as a :class:`FoldedPolygonError`, is

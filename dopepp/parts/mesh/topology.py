@@ -66,9 +66,6 @@ def opposed_faces(
     have less area. A surface with one side only, such as a Möbius strip, is left as it is. Where
     the surface is closed and faces inwards as a whole, everything is turned; so is then a single
     body that faces inwards, unless the box of another one holds it, as it does for a cavity.
-
-    Returns:
-        Whether each triangle is to be turned over.
     """
     turned = np.zeros(len(faces), bool)
     if topology.opposed.any():

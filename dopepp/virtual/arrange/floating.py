@@ -32,13 +32,10 @@ _CORE: Final = 0.6
 
 
 def arrange_floating(composition: Composition, targets: Sequence[Body], usual: Body) -> float:
-    """Place targets and distractors.
+    """Place targets and distractors, and return the targets' mean depth, metres.
 
     There are no targets if the first finds no place; ``usual`` is the body to take the depth from
     where there is no target.
-
-    Returns:
-        The targets' mean depth, metres.
     """
     for body in targets:
         if not _place_target(composition, body) and not composition.objects:

@@ -92,10 +92,8 @@ def random_scene(
 def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
     """Return by how much the world moves in the camera frame, metres.
 
-    Args:
-        objects: What is in the scene; without a target the camera stays where it is.
-        scale: How many times as large the targets are to appear: the distance from the camera to
-            the mean of their cuboids' centres is divided by it. Positive.
+    The distance from the camera to the mean of the targets' cuboids' centres is divided by the
+    positive ``scale``: as many times as large they appear. Without a target the camera stays.
     """
     centres = [
         transform(item.T_cam_obj, item.part.cuboid[CENTROID])

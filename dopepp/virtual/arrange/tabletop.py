@@ -56,12 +56,9 @@ _NEAR: Final = 0.25
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Choose a view and place targets and distractors.
+    """Choose a view, place targets and distractors, and return T_cam_table (plane z = 0, z up).
 
     They are added to an empty ``composition``; no target if none finds a place.
-
-    Returns:
-        T_cam_table, which maps the table's frame (z up, plane z = 0) to the camera's.
     """
     rng = composition.rng
     for _ in range(_VIEWS):
@@ -194,12 +191,9 @@ class HeightMap:
     def footprint(
         self, surface: Surface, rotation: RotationMatrix, lowest: float
     ) -> Footprint | None:
-        """See a turned object from below and above.
+        """See a turned object from below and above; None where it covers too many cells.
 
         ``lowest`` is the height of its lowest point relative to its origin, metres.
-
-        Returns:
-            None where the object covers too many cells.
         """
         # In cells; one contiguous row per coordinate.
         x, y, z = (rotation / self.cell) @ surface.vertices.T
@@ -227,12 +221,9 @@ class HeightMap:
         )
 
     def height(self, footprint: Footprint, place: tuple[int, int]) -> float | None:
-        """Return how high an object's lowest point would come to lie, metres.
+        """Return how high an object's lowest point would come to lie, metres; None beyond the map.
 
         ``place`` is x and y of its origin, in cells.
-
-        Returns:
-            None beyond the map.
         """
         window = self._window(footprint, place)
         if window is None:

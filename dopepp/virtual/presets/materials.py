@@ -67,13 +67,8 @@ class Materials:
     alike_share: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in (
-            "coloured_share",
-            "metal_share",
-            "brushed_share",
-            "print_share",
-            "alike_share",
-        ):
+        for kind in ("coloured", "metal", "brushed", "print", "alike"):
+            name = f"{kind}_share"
             check_number(name, getattr(self, name), 0.0, 1.0, "share", of=self)
         for name in ("albedo", "saturation", "specular", "metal_albedo", "noise"):
             check_range(name, getattr(self, name), 0.0, 1.0, "share", of=self)

@@ -59,12 +59,7 @@ class Placement(Protocol):
         """Return what to try after a place at which the object is not well in the frame.
 
         What a placement keeps of such a place has the distribution it was drawn from, however often
-        the camera does not see the object there.
-
-        ``place`` is the last place tried, metres.
-
-        Returns:
-            Another place for the same orientation; None to draw both anew.
+        the camera does not see the object there. None draws the orientation anew, too.
         """
         return None
 

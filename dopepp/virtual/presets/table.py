@@ -18,11 +18,8 @@ from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
 from dopepp.virtual.scene import Plane, triple
 
-Image = Picture
-
 _FARTHEST: Final = 8.0
 """The picture of the table ends at so many camera distances: there, another one begins."""
-
 
 _MIDDLE: Final = (0.35, 0.65)
 """Where in the picture the camera looks, in widths and heights."""
@@ -124,12 +121,12 @@ class TablePicture:
         surroundings: What is there instead, an image of the camera; None where the plane goes on.
     """
 
-    picture: Image
+    picture: Picture
     picture_table: Float[np.ndarray, "3 3"]
     end: float
-    surroundings: Image | None
+    surroundings: Picture | None
 
-    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Image:
+    def seen(self, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Picture:
         """Return what a camera sees where nothing lies on the plane."""
         # A point (x, y, 0) of the plane is seen at K [r1 r2 t] (x, y, 1).
         image_table = K @ T_cam_table[:3, [0, 1, 3]]

@@ -15,7 +15,6 @@ _MERGE_STEPS: Final = 2**21 - 1
 """Vertices of one cell of a grid so fine across the mesh are one (STL and UV seams split them);
 three such coordinates fit into one integer of 64 bits."""
 
-
 _MOST_CORNERS: Final = 1024
 """Normals around a vertex of more corners are not averaged: that takes the square of the number."""
 
@@ -107,10 +106,9 @@ def smooth_patches(
 ) -> Int[np.ndarray, "faces"]:
     """Number faces so that those connected by edges without a crease share a number.
 
-    Args:
-        corners: Vertex of every corner; where attributes differ, vertices must too.
-        normals: Normal of every corner; an edge is smooth where both its faces agree.
-        usable: False for faces without an area, which connect nothing.
+    ``corners`` are vertices; where attributes differ, vertices must too. An edge is smooth where
+    the normals of both its faces agree. ``usable`` is False for faces without an area, which
+    connect nothing.
     """
     count = int(corners.max()) + 1
     start, end = corners, corners[:, [1, 2, 0]]

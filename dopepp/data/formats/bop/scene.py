@@ -82,12 +82,9 @@ def scene_folders(split_dir: Path) -> list[Path]:
 
 
 def read_scene(folder: Path, wanted: set[int]) -> SceneFolder:
-    """Read a scene's annotation.
+    """Read a scene's annotation: ``scene_camera.json`` and, if there, its ground truth's files.
 
-    Args:
-        folder: It has ``scene_camera.json``; ``scene_gt.json`` and ``scene_gt_info.json`` may be
-            missing, as where a data set keeps its ground truth private.
-        wanted: Object numbers of interest; other objects are left out.
+    Objects that are not ``wanted`` are left out. Some data sets keep their ground truth private.
 
     Raises:
         UserError: A file is missing or damaged, or a record is impossible.

@@ -48,7 +48,6 @@ SCENE_FILES: Final = {
 """A scene's files and the field of a staged item that goes into each; the last one lists what is
 finalized, so it is written last."""
 
-
 Record = dict[str, Any]
 NO_BOX = [-1, -1, -1, -1]
 

@@ -84,7 +84,8 @@ def parse_object(
         problems.report(path, f"{field}.quaternion_xyzw", got, "a quaternion of norm 1")
         quaternion = np.full(4, np.nan)
     corners_px, cuboid = (
-        take(name, len(item[name]) if _has_centroid(item[name]) else 8, axes)[:8]
+        # A writer may have appended the centroid as the ninth point.
+        take(name, 9 if isinstance(item[name], list) and len(item[name]) == 9 else 8, axes)[:8]
         if item.get(name) not in (None, [])
         else None
         for name, axes in (("projected_cuboid", 2), ("cuboid", 3))
@@ -109,11 +110,6 @@ def parse_object(
         visibility,
         number if isinstance(number, int) and number > 0 else None,
     )
-
-
-def _has_centroid(points: object) -> bool:
-    """Tell whether a writer has appended the centroid as the ninth point."""
-    return isinstance(points, list) and len(points) == 9
 
 
 def intrinsics(

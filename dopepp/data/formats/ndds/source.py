@@ -148,12 +148,7 @@ class NddsSource:
         return len(self.items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an item; the epoch is ignored.
-
-        Raises:
-            UserError: A file is missing or damaged, K cannot belong to the image, or an instance
-                contradicts the data set's convention or stands behind the camera.
-        """
+        """Read an item; the epoch is ignored."""
         path = self.items[index]
         record, image_path = self._record(path), image_of(path)
         if image_path is None:

@@ -76,11 +76,7 @@ class NddsWriter:
         self._parts = {part.name: part for part in parts}
 
     def prepare(self) -> None:
-        """Write ``_object_settings.json``; idempotent.
-
-        Raises:
-            UserError: The folder holds something else.
-        """
+        """Write ``_object_settings.json``, idempotently; a UserError in another's folder."""
         path = self._root / OBJECT_SETTINGS
         settings = _encode(object_settings(list(self._parts.values())))
         if path.is_file():
@@ -98,11 +94,7 @@ class NddsWriter:
         return UserError(got, "an empty folder, or one begun with the same parts", "name another")
 
     def write(self, index: int, sample: Sample) -> None:
-        """Write an item's images and then its annotation, which marks it as complete.
-
-        Raises:
-            KeyError: An instance is of none of the parts.
-        """
+        """Write an item's images and then its annotation, which marks it as complete."""
         segmentation = segmentation_map(sample.instances, sample.image.shape[:2])
         record = {
             "conventions": CONVENTIONS,

@@ -207,13 +207,10 @@ def _check_keys(shards: Sequence[ShardIndex]) -> None:
     for shard in shards:
         twice = [key for key in shard.keys if key in owners]
         if twice:
-            raise _bad(
+            raise UserError(
                 f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, "
                 f"e.g. {twice[:_MAX_NAMED]}",
                 "each key in one shard",
+                "write or download the shard again",
             )
         owners |= dict.fromkeys(shard.keys, shard.path)
-
-
-def _bad(got: str, allowed: str) -> UserError:
-    return UserError(got, allowed, "write or download the shard again")

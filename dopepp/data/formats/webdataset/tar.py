@@ -66,11 +66,7 @@ class ShardIndex:
 
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
-    """Return a part of a file.
-
-    Raises:
-        UserError: The file has become shorter or has gone.
-    """
+    """Return a part of a file; a UserError where it has become shorter or has gone."""
     try:
         with path.open("rb") as file:
             file.seek(offset)

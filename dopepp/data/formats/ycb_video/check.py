@@ -31,11 +31,7 @@ _MAX_POINTS: Final = 100_000
 
 
 def check_ycb(report: CheckReport) -> None:
-    """Check the frames of ``data/`` and ``data_syn/``.
-
-    Raises:
-        UserError: The class list cannot be read.
-    """
+    """Check the frames of ``data/`` and ``data_syn/``; without a class list, it is a UserError."""
     classes = read_classes(report.root)
     if not classes or len(set(classes)) != len(classes):
         path = report.root / "image_sets" / "classes.txt"

@@ -66,7 +66,6 @@ _RADIANCE_OF_CODE: Final = np.interp(
 ).astype(np.float32)
 """The radiance that the tone curve shows as a code of 0–255."""
 
-
 _COVERAGE: Final = {"type": "depth"}
 """The fourth channel of any integrator is the share of rays that hit something."""
 
@@ -210,15 +209,10 @@ def denoise(
     albedo: Float32[np.ndarray, "height width 3"],
     normal: Float32[np.ndarray, "height width 3"],
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Return a picture in linear light without its noise.
+    """Return a picture in linear light without its noise; a RuntimeError where the library fails.
 
-    Args:
-        colour: Noisy radiance, any range.
-        albedo: Share of light that the surface scatters, [0, 1].
-        normal: Unit normal, any frame; 0 on the background.
-
-    Raises:
-        RuntimeError: The library reports an error.
+    ``albedo`` is the share of light that the surface scatters, in [0, 1]; ``normal`` a unit vector
+    in any frame, 0 on the background.
     """
     interface, device = _device()
     ffi, library = interface.oidn_ffi, interface.oidn_Capi

@@ -253,15 +253,10 @@ def split_light(
     alpha: Float32[np.ndarray, "height width"],
     unshadowed: Float[np.ndarray, "height width 3"],
 ) -> tuple[Float32[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
-    """Take a picture of objects on the disc apart.
+    """Return the objects' share of each pixel's radiance, and the share of light left on the disc.
 
-    Args:
-        light: Radiance of objects and disc together.
-        alpha: Share of each pixel that objects cover.
-        unshadowed: The disc's radiance without objects; 0 beside it.
-
-    Returns:
-        The objects' share of each pixel's radiance, and the share of light left on the disc.
+    ``light`` is the radiance of objects and disc together, ``alpha`` the share of each pixel that
+    objects cover, ``unshadowed`` the disc's radiance without objects, 0 beside it.
     """
     known = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
     kept = np.where(known[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)

@@ -78,11 +78,7 @@ def mitsuba() -> Any:
 
 
 def num_threads() -> int:
-    """Return the threads to render with.
-
-    Raises:
-        UserError: The environment variable is no positive number.
-    """
+    """Return the threads to render with; a UserError, if the environment states no such number."""
     setting = os.environ.get(THREADS_SETTING)
     if setting is not None:
         if not setting.isdecimal() or int(setting) < 1:

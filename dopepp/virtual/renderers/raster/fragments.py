@@ -54,12 +54,9 @@ class Fragments:
 def gather_fragments(
     item: SceneObject, seen: Projected, scene: Scene, samples: Samples, first_id: int
 ) -> Fragments | None:
-    """Collect an object's fragments.
+    """Collect an object's fragments, valid until the next object's are collected; None without any.
 
     ``first_id`` is the number of the object's first triangle in ``samples``.
-
-    Returns:
-        Fragments, which are valid until the next object's are collected; None if it has none.
     """
     box = seen.box(scene.size)
     if box is None:

@@ -133,12 +133,8 @@ def hidden_sky(
 ) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
     """Return the share of a plane's sky that objects hide; None if they are all below it.
 
-    Args:
-        frame: Maps camera-frame points to (x, y) on the plane and the height above it, metres.
-        objects: What may stand on the plane.
-
-    Returns:
-        (x, y) of the grid's first cell and a cell's side, metres; and the shares.
+    ``frame`` maps camera-frame points to (x, y) on the plane and the height above it, metres. First
+    come (x, y) of the grid's first cell and a cell's side, metres.
     """
     places = []
     for item in objects:

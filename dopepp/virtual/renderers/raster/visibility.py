@@ -103,12 +103,9 @@ class Samples:
 def draw_samples(
     scene: Scene, projected: Sequence[Projected], window: Box, offsets: Array
 ) -> Samples:
-    """Draw a scene's plane and objects into the samples of a window.
+    """Draw a scene's plane and objects into the samples of a window, valid until the next scene's.
 
     ``offsets`` are those of a pixel's samples from its centre, shape (S, 2).
-
-    Returns:
-        Samples, which are valid until the next scene's are drawn.
     """
     left, top, right, bottom = window
     shape = (bottom - top, right - left, len(offsets))
@@ -137,12 +134,9 @@ def first_ids(scene: Scene) -> Array:
 def draw_alone(
     item: SceneObject, hom: Array, box: Box
 ) -> tuple[Float32[np.ndarray, "height width"], Array]:
-    """Draw an object alone at the pixel centres of a box.
+    """Draw 1/m and triangles of an object alone at a box's pixel centres, also beyond the image.
 
-    ``box`` may reach beyond the image.
-
-    Returns:
-        1/m, 0 beside the object; and the object's triangles, of any value beside it.
+    Beside the object there is 0, and any triangle.
     """
     left, top, right, bottom = box
     canvas = np.zeros((max(bottom - top, 0), max(right - left, 0), 1), np.float32)
