@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
 from dopepp.cli.errors import report_errors
-
-_DEFECTS: Final = 1
 
 
 def check(
@@ -26,4 +24,4 @@ def check(
         report = check_dataset(folder)
     typer.echo("\n".join(report.lines(most)))
     if not report.ok:
-        raise typer.Exit(_DEFECTS)
+        raise typer.Exit(1)

@@ -11,7 +11,6 @@ import typer
 from dopepp.core.errors import UserError
 
 USERS_MISTAKE: Final = 2
-STOPPED: Final = 1
 
 
 @contextmanager
@@ -34,7 +33,7 @@ def resumable() -> Iterator[None]:
             yield
     except StoppedError as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(STOPPED) from error
+        raise typer.Exit(1) from error
     except Interruption as interruption:
         typer.echo(str(interruption), err=True)
         raise typer.Exit(interruption.exit_code) from interruption

@@ -26,7 +26,6 @@ class SourceRow:
     """A line of the start-up print.
 
     Attributes:
-        num_per_epoch: Images it gives to an epoch.
         num_instances: Instances per object; empty where counting is not cheap.
     """
 
@@ -46,7 +45,6 @@ class PoseDataModule(LightningDataModule):
     Args:
         val: Validation data (model selection, thresholds); its epoch is always 0.
         test: Test data; its epoch is always 0.
-        num_workers: Loader processes; 0 loads in the training process.
         backgrounds: Other pictures that masking may need; required with ``masking``.
 
     Raises:

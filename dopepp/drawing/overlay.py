@@ -57,7 +57,6 @@ class Wireframe:
 
     Attributes:
         keypoints: Its eight corners and centroid, pixels; NaN where there is none.
-        label: Its entry in the legend; empty for none.
     """
 
     keypoints: Float[np.ndarray, "9 2"]

@@ -52,9 +52,7 @@ class PlotLine:
     """One method's values over training, of one or several runs.
 
     Attributes:
-        name: Its entry in the legend.
         values: Of each run; NaN where there is none.
-        dashed: Whether it is what another line is compared with.
     """
 
     name: str

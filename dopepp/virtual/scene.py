@@ -59,7 +59,6 @@ class Material:
             at normal incidence.
         noise: Relative amplitude of the albedo's variation over the surface.
         noise_pitch: Size of that variation, metres.
-        grooves: Layer lines or brushing, or None.
     """
 
     colour: Triple = (0.6, 0.6, 0.6)
@@ -125,8 +124,6 @@ class Sensor:
         read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
         shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
             it falls with the square root of the signal.
-        jpeg_quality: 1 to 100; None for no compression.
-        noise_seed: Seed of the noise.
     """
 
     exposure_ev: float = 0.0
@@ -143,7 +140,6 @@ class SceneObject:
     """One posed object.
 
     Attributes:
-        T_cam_obj: Rigid transform from object to camera frame, metres.
         part: The part it is an instance of; None for a distractor.
     """
 
@@ -165,13 +161,7 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything one image shows.
-
-    Attributes:
-        K: Camera matrix, pixels.
-        background: RGB image that fills the frame; its size is the image's size.
-        ambient: Light from everywhere else.
-    """
+    """Everything one image shows."""
 
     K: CameraMatrix
     background: Picture
@@ -208,7 +198,6 @@ class Rendered:
         instances: Index into ``scene.objects`` at pixel centres, −1 on plane and background.
         visible_fractions: Per object, its visible pixels over those of its whole silhouette,
             alone and without the image's border: occlusion and truncation both count.
-        scene: What was rendered; poses, camera and keypoints are there.
     """
 
     image: Picture

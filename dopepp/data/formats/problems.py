@@ -80,10 +80,8 @@ STRICT: Final = Strict()
 class Defect:
     """One thing that is wrong.
 
-    Attributes:
-        path: The file, below the data set's folder; a tar's member as ``TAR/MEMBER``.
-        field: What in it, e.g. ``3[0].cam_R_m2c`` or ``size``.
-        message: What was found and what is allowed.
+    ``path`` is below the data set's folder, a tar's member as ``TAR/MEMBER``; ``field`` is what in
+    it, e.g. ``3[0].cam_R_m2c`` or ``size``.
     """
 
     path: str
@@ -99,10 +97,8 @@ class CheckReport:
     """Keeps all problems, as defects: what a check does.
 
     Attributes:
-        layout: Which layout was found, e.g. ``BOP``.
         defects: The first ``MAX_KEPT`` of them, in the order in which they were found.
         counts: Defects by kind, which is the field's last part.
-        notes: What is worth knowing and no defect.
     """
 
     root: Path
@@ -125,7 +121,10 @@ class CheckReport:
         self.counts[where.rpartition(".")[2]] += 1
         if len(self.defects) < MAX_KEPT:
             message = f"{got}; allowed: {allowed}" if allowed else got
-            self.defects.append(Defect(self._relative(path), where, message))
+            path = Path(path)
+            is_inside = self.root in path.parents
+            shown = path.relative_to(self.root).as_posix() if is_inside else str(path)
+            self.defects.append(Defect(shown, where, message))
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
         """Keep an error as a defect; it need not name the file again."""
@@ -143,10 +142,6 @@ class CheckReport:
         self.num_images += 1
         if self.num_images % _LOG_EVERY == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
-
-    def _relative(self, path: Path | str) -> str:
-        path = Path(path)
-        return path.relative_to(self.root).as_posix() if self.root in path.parents else str(path)
 
     def lines(self, most: int = 100) -> list[str]:
         """Return the notes, at most ``most`` defects, and a summary, a line each."""

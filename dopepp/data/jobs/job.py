@@ -50,7 +50,6 @@ class Job:
 
     Attributes:
         factory: Renders image (0, index).
-        layout: Key of :data:`WRITERS`.
         record: The settings as plain values; equal records give equal bytes.
     """
 

@@ -55,7 +55,6 @@ class HybridSource:
     Args:
         real: Real camera frames; without them the real share is 0.
         real_fraction: Share of ``real``, in [0, 1].
-        synthetic: A data set's own synthetic frames.
         synthetic_fraction: Share of ``synthetic`` in what is not real, in [0, 1].
 
     Raises:

@@ -38,7 +38,6 @@ class ObjFile:
         positions: x, y, z of each ``v`` line, one after the other.
         coordinates: u, v of each ``vt`` line.
         corners: Position and coordinate index of each corner of each ``f`` line.
-        counts: Corners of each ``f`` line.
         materials: Names of the materials that faces use; None for faces before any ``usemtl``.
     """
 

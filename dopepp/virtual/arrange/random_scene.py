@@ -26,7 +26,7 @@ from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.presets.table import plane_of
-from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject, triple
+from dopepp.virtual.scene import NEAR, Scene, SceneObject, triple
 
 
 def random_scene(
@@ -84,7 +84,10 @@ def random_scene(
             "check the mesh's unit, or replace the preset's distances or field of view",
         )
     objects = _moved_objects(composition.objects, shift)
-    lights = tuple(_moved_light(light, shift) for light in lights)
+    # How strongly a lamp lights the scene stays the same.
+    lights = tuple(
+        replace(light, position=triple(np.array(light.position) + shift)) for light in lights
+    )
     sensor = preset.sensors.draw(rng)
     return Scene(composition.K, background, objects, lights, ambient, plane, sensor)
 
@@ -111,11 +114,6 @@ def _moved_objects(objects: Iterable[SceneObject], shift: Vector) -> tuple[Scene
     return tuple(
         item for item in there if transform(item.T_cam_obj, item.surface.hull)[:, 2].min() > NEAR
     )
-
-
-def _moved_light(light: Light, shift: Vector) -> Light:
-    """Return a lamp after the move; how strongly it lights the scene stays the same."""
-    return replace(light, position=triple(np.array(light.position) + shift))
 
 
 def _moved(T_cam: Transform, shift: Vector) -> Transform:

@@ -36,7 +36,6 @@ class Surface:
         normals: Unit normal of every face's corner, object frame, float32.
         patches: Number of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
-        sky: Baked ambient occlusion.
         closed: Watertight with outward winding, so back faces can be dropped.
         hull: Extreme vertices that bound the mesh's image, object frame, metres.
         points: Points spread evenly over the surface, object frame, metres.

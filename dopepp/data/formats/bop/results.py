@@ -51,7 +51,6 @@ class PoseResult:
     """One estimated pose.
 
     Attributes:
-        T_cam_obj: Object-to-camera transform, metres.
         seconds: What the whole image took; −1 where unknown.
     """
 

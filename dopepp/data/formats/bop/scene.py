@@ -34,10 +34,7 @@ DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 class SceneRecords:
     """What a scene's JSON files hold, by image.
 
-    Attributes:
-        cameras: ``scene_camera.json``.
-        truths: ``scene_gt.json``: one record per object.
-        infos: ``scene_gt_info.json``: one for each of them, None where it is missing.
+    ``truths`` has one record per object, ``infos`` one for each of them, None where it is missing.
     """
 
     cameras: Mapping[int, object]
@@ -50,12 +47,10 @@ class SceneFolder:
     """A scene's images, in the order of their numbers.
 
     Attributes:
-        image_ids: BOP's ``im_id`` of every image.
         files: File of every image, relative to the folder; empty where it is not on disk.
         depth_scales: Millimetres a unit of its depth image; NaN where not stated.
         first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
         gt_ids: Each object's place in its image's list, which names its masks.
-        num_other: Objects that are none of the parts.
         num_behind: Objects of interest behind the camera, left out like the others.
     """
 
