@@ -50,10 +50,8 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     """Resolve the config once and run a job in Hydra's run folder.
 
     In a multirun a failing job leaves ``failed.json``, one that a search has stopped
-    ``pruned.json``, and the others run.
-
-    Returns:
-        A multirun's training: the objective, for Hydra's sweepers; None where there is none.
+    ``pruned.json``, and the others run. Returned is the objective of a multirun's training, for
+    Hydra's sweepers; None where there is none.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
@@ -62,9 +60,9 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             _remember(run_dir)
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
-            _exit(str(error), USERS_MISTAKE)
+            _exit(error, USERS_MISTAKE)
         except RunError as error:
-            _exit(str(error), FAILED)
+            _exit(error, FAILED)
         except OmegaConfBaseException as error:
             _exit(_explain(error, None), USERS_MISTAKE)
         except OSError as error:
@@ -140,8 +138,7 @@ def entry(
     os.environ["HYDRA_FULL_ERROR"] = "1"
     remote.configure_logging()
     try:
-        named = [_named(text, short_names or {}) for text in sys.argv[1:]]
-        arguments = [_opened(text, open_nodes) for text in named]
+        arguments = [_spelled_out(text, short_names or {}, open_nodes) for text in sys.argv[1:]]
         begun = slurm.begun_run(arguments)
         if begun is not None:
             arguments.append(f"resume={begun}")
@@ -161,32 +158,25 @@ def entry(
     except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
         if error.errno not in _REFUSALS:
             raise
-        mistake = UserError(
-            f"output folder {error.filename}: {error.strerror}",
-            "a folder that can be written",
-            "set output_dir=…, or make it writable",
-        )
-        _exit(str(mistake), USERS_MISTAKE)
+        allowed, fix = "a folder that can be written", "set output_dir=…, or make it writable"
+        got = f"output folder {error.filename}: {error.strerror}"
+        _exit(UserError(got, allowed, fix), USERS_MISTAKE)
     except UserError as error:  # of a sweeper or launcher; jobs deal with their own
-        _exit(str(error), USERS_MISTAKE)
+        _exit(error, USERS_MISTAKE)
 
 
-def _exit(line: str, code: int) -> None:
+def _exit(line: object, code: int) -> None:
     display.console.file.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)
 
 
-def _named(argument: str, short_names: Mapping[str, str]) -> str:
-    """Call an option by its name."""
+def _spelled_out(argument: str, short_names: Mapping[str, str], open_nodes: Sequence[str]) -> str:
+    """Call an option by its name, and let it add a key where that is allowed."""
     key, equals, value = argument.partition("=")
-    return f"{short_names[key]}{equals}{value}" if key in short_names else argument
-
-
-def _opened(argument: str, open_nodes: Sequence[str]) -> str:
-    """Let an override add a key where that is allowed."""
-    inside = argument.startswith(tuple(f"{node}." for node in open_nodes))
-    return f"++{argument}" if inside else argument
+    named = f"{short_names.get(key, key)}{equals}{value}"
+    inside = named.startswith(tuple(f"{node}." for node in open_nodes))
+    return f"++{named}" if inside else named
 
 
 def _refuse_used_folder(arguments: Sequence[str]) -> None:
@@ -219,30 +209,21 @@ def _resumed(arguments: list[str]) -> list[str]:
     return [*overrides, *arguments, f"hydra.run.dir={run}", "hydra.output_subdir=null"]
 
 
-def _explain(error: Exception, config_dir: Path | None) -> str:
+def _explain(error: Exception, config_dir: Path | None) -> UserError:
     """Turn Hydra's or OmegaConf's message into one line with got, allowed and fix."""
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
-    missing_key = re.search(r"Could not override '([^']+)'", text)
-    if missing_key:
-        key = missing_key.group(1)
-        return str(
-            UserError(
-                f"override {key!r}, which names no option",
-                "the options of `--cfg job`" + _nearest(key, config_dir),
-                "check the spelling",
-            )
-        )
-    choice = re.search(
-        r"Could not find '([^']+)' Available options in '([^']+)': (.*?) Config", text
-    )
-    if choice:
-        name, group, available = choice.groups()
-        return str(UserError(f"{group}={name.rpartition('/')[2]}", available, "choose one of them"))
-    missing = re.search(r"Missing mandatory value: (\S+)", text)
-    if missing:
-        key = missing.group(1)
-        return str(UserError(f"no {key}", f"{key}=… on the command line", f"add {key}=…"))
-    return str(UserError(text, "overrides as `key=value`", "see `--help`"))
+    if found := re.search(r"Could not override '([^']+)'", text):
+        key = found.group(1)
+        allowed = "the options of `--cfg job`" + _nearest(key, config_dir)
+        return UserError(f"override {key!r}, which names no option", allowed, "check the spelling")
+    choice = r"Could not find '([^']+)' Available options in '([^']+)': (.*?) Config"
+    if found := re.search(choice, text):
+        name, group, available = found.groups()
+        return UserError(f"{group}={name.rpartition('/')[2]}", available, "choose one of them")
+    if found := re.search(r"Missing mandatory value: (\S+)", text):
+        key = found.group(1)
+        return UserError(f"no {key}", f"{key}=… on the command line", f"add {key}=…")
+    return UserError(text, "overrides as `key=value`", "see `--help`")
 
 
 def _nearest(key: str, config_dir: Path | None) -> str:

@@ -32,7 +32,6 @@ from dopepp.drawing.curves import figure_image
 from dopepp.drawing.panels import PlotLine, lines_figure
 from dopepp.experiment.build.sources import build_parts, build_test_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
-from dopepp.experiment.config.data import DataConfig
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.tables import Row, csv_text
 from dopepp.experiment.runs import display, record
@@ -41,7 +40,6 @@ from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.network import PoseNetwork, network_cost
-from dopepp.parts.part import Part
 from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
@@ -165,13 +163,16 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
-    samples = _pictures(config.data, parts)
+    source = build_test_source(config.data, parts)
+    # Read or rendered now, so that no frame's time has that in it.
+    samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
     estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
     geometry = map_geometry(config.maps, network.stride)
     frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
+    convolutions = [one for one in network.backbone.modules() if isinstance(one, nn.Conv2d)]
     cost = NetworkCost(
         name=config.model.name,
-        backbone_weights=_num_weights(network.backbone),
+        backbone_weights=sum(one.weight.numel() for one in convolutions),
         parameters=parameters,
         gmacs=gmacs,
         input_size=description.input_size,
@@ -207,17 +208,11 @@ def time_frames(
 ) -> FrameTimes:
     """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
 
-    Args:
-        estimator: With any weights.
-        samples: Pictures with their truth, taken in turn.
-        geometry: Of the maps that a trained network would answer.
-        num_frames: How many are timed.
-        seed: Of the maps' noise.
+    Pictures are taken in turn. Geometry and seed are of the maps that a trained network would
+    answer and of their noise.
     """
     generator = torch.Generator().manual_seed(seed)
-    rehearsed = [
-        (one, likely_maps(one, estimator, geometry, generator=generator)) for one in samples
-    ]
+    rehearsed = [(one, likely_maps(one, estimator, geometry, generator)) for one in samples]
     rows = []
     for sample, estimator.answer in islice(cycle(rehearsed), WARM_UP + num_frames):
         began = time.perf_counter()
@@ -229,10 +224,7 @@ def time_frames(
 
 
 def likely_maps(
-    sample: Sample,
-    estimator: PoseEstimator,
-    geometry: MapGeometry,
-    generator: torch.Generator,
+    sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
 ) -> Maps:
     """Return the maps that a trained network would answer to a picture: the true ones, with noise.
 
@@ -266,23 +258,13 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
 
     One is from picture to poses, the dashed one what the network alone would reach.
     """
-    lines = [
-        PlotLine(
-            f"{name}, {what}", np.cumsum(times.seconds), 1 / seconds[None], f"C{number}", dashed
-        )
-        for number, (name, times) in enumerate(frames.items())
-        for what, seconds, dashed in (
-            ("picture to poses", times.seconds, False),
-            ("network alone", times.network_seconds, True),
-        )
-    ]
+    lines = []
+    for number, (name, times) in enumerate(frames.items()):
+        at, colour = np.cumsum(times.seconds), f"C{number}"
+        whole, alone = 1 / times.seconds[None], 1 / times.network_seconds[None]
+        lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
+        lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
-
-
-def _pictures(data: DataConfig, parts: Sequence[Part]) -> list[Sample]:
-    """Render or read the first test pictures, so that no frame's time has that in it."""
-    source = build_test_source(data, parts)
-    return [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
 
 
 def _frame_rows(frames: FrameTimes) -> list[Row]:
@@ -291,11 +273,6 @@ def _frame_rows(frames: FrameTimes) -> list[Row]:
         {"frame": str(number), **{name: f"{values[number]:.6f}" for name, values in columns}}
         for number in range(len(frames.seconds))
     ]
-
-
-def _num_weights(module: nn.Module) -> int:
-    convolutions = (layer for layer in module.modules() if isinstance(layer, nn.Conv2d))
-    return sum(layer.weight.numel() for layer in convolutions)
 
 
 @torch.inference_mode()

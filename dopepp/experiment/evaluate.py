@@ -14,11 +14,7 @@ from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.build.sources import (
-    build_parts,
-    build_scaled_test_source,
-    build_test_source,
-)
+from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports.breakdown import record_breakdown
@@ -46,12 +42,12 @@ from dopepp.experiment.runs.images import warn_of_other_images
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.parts.part import Part
+from dopepp.parts.part import Part, Parts
 
 
 def measure_and_record(
     estimators: Mapping[str, PoseEstimator],
-    parts: Sequence[Part],
+    parts: Parts,
     data: DataConfig,
     run_dir: Path,
     num_pictures: int,
@@ -64,23 +60,12 @@ def measure_and_record(
 ) -> list[Report]:
     """Measure methods on a test set; show and write tables, curves and pictures.
 
-    Args:
-        estimators: By name, the baseline first where there is one.
-        parts: The objects that are scored, as the test data have them.
-        data: Where the test images are from.
-        run_dir: Folder that everything is written to.
-        num_pictures: How many of the first images are drawn.
-        details: Further plain facts of the last report.
-        results: BOP challenge CSVs of other methods, by name.
-        bop_csv: Whether to write one of each method.
-        all_measures: Whether to print the symmetric measures of every object.
-        protocols: What else is measured; None for nothing.
+    Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
+    challenge CSVs of other methods. The parts are those that are scored, as the test data have
+    them; ``details`` are further plain facts of the last report. ``bop_csv`` writes the poses of
+    each method, ``all_measures`` prints the symmetric measures of every object.
 
-    Returns:
-        A report per estimator, then per file.
-
-    Raises:
-        UserError: The data or a file are wrong.
+    Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
     """
     protocols = protocols or Protocols()
     source = build_test_source(data, parts)
@@ -135,16 +120,12 @@ def measure_and_record(
 def tune_and_record(
     estimator: PoseEstimator,
     path: Path,
-    parts: Sequence[Part],
+    parts: Parts,
     data: DataConfig,
     run_dir: Path,
     target: FalsePositiveTarget,
 ) -> Path:
-    """Tune a checkpoint, write the tuned one beside it, say what came of it; returns its path.
-
-    Raises:
-        UserError: Validation images teach nothing, see :func:`~dopepp.experiment.tuning.tune`.
-    """
+    """Tune a checkpoint (:func:`tune`), write it beside the old one, tell; return its path."""
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     record.write_json(run_dir / "tuning.json", asdict(tuning))
@@ -198,10 +179,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     """Parse ``evaluate.py``'s composed config and measure what it names on a test set.
 
     That is a checkpoint, a file of another method's poses, or both; the test set is the
-    checkpoint's own one or another one.
-
-    Raises:
-        UserError: A checkpoint, an option, a file or the data are wrong.
+    checkpoint's own one or another one. A :class:`UserError` tells what of it is wrong.
     """
     asked = EvaluationConfig.of(config)
     if asked.ckpt_path is None and asked.results is None:
@@ -244,7 +222,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
 def _tune_only(
     asked: EvaluationConfig,
     loaded: Sequence[PoseEstimator],
-    parts: Sequence[Part],
+    parts: Parts,
     data: DataConfig,
     run_dir: Path,
 ) -> None:

@@ -48,13 +48,14 @@ _MIN_FALL: Final = 0.05
 """A loss that falls by less than this share in the whole sweep says nothing."""
 
 
+Steps = Float[np.ndarray, "steps"]
+
+
 @dataclass(frozen=True)
 class Suggestion:
-    """What a sweep says.
+    """What a sweep says: the rate at which the loss falls fastest, which is the one to begin with.
 
-    Attributes:
-        steepest: Rate at which the loss falls fastest: the one to begin with.
-        lowest: Rate at which the loss is lowest; it diverges somewhere above.
+    At ``lowest`` the loss is lowest; it diverges somewhere above.
     """
 
     steepest: float
@@ -64,11 +65,8 @@ class Suggestion:
 def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     """Train with a rate that grows from step to step; print, write and return what it suggests.
 
-    The chosen optimiser with its other settings; no schedule, no validation, no checkpoint.
-
-    Raises:
-        UserError: A choice is wrong.
-        RunError: The loss is not finite from the start.
+    The chosen optimiser with its other settings; no schedule, no validation, no checkpoint. A
+    :class:`UserError`: a choice is wrong; a ``RunError``: the loss is not finite from the start.
     """
     first, last = config.lr_finder.min_lr, config.lr_finder.max_lr
     if config.resume is not None:
@@ -121,7 +119,7 @@ def _sweep(
     first: float,
     last: float,
     num_steps: int,
-) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
+) -> tuple[Steps, Steps]:
     """Return rate and loss of every step up to where the loss diverges or is not finite."""
     passes: list[float] = []
 
@@ -148,15 +146,8 @@ def _sweep(
     return np.array(found.results["lr"][:count]), losses[:count]
 
 
-def suggest(
-    rates: Float[np.ndarray, "steps"], losses: Float[np.ndarray, "steps"]
-) -> Suggestion | None:
-    """Read a rate off a sweep; None where the loss did not fall.
-
-    Args:
-        rates: Ascending, positive.
-        losses: Finite, of the same steps.
-    """
+def suggest(rates: Steps, losses: Steps) -> Suggestion | None:
+    """Read a rate off a sweep: rates ascend, losses are finite; None if the loss did not fall."""
     first = int(_SKIPPED * len(rates))
     smoothed = smooth(losses)[first:]
     if len(smoothed) < 3:
@@ -170,7 +161,7 @@ def suggest(
     return Suggestion(float(rates[first + steepest]), float(rates[first + bottom]))
 
 
-def smooth(values: Float[np.ndarray, "steps"]) -> Float[np.ndarray, "steps"]:
+def smooth(values: Steps) -> Steps:
     """Return a Gaussian mean over neighbours, of what there is near the ends."""
     position = np.arange(len(values))
     width = max(1.0, _SMOOTHING * len(values))
@@ -178,9 +169,7 @@ def smooth(values: Float[np.ndarray, "steps"]) -> Float[np.ndarray, "steps"]:
     return np.asarray(weight @ values / weight.sum(axis=1))
 
 
-def _report(
-    rates: Float[np.ndarray, "steps"], losses: Float[np.ndarray, "steps"], run_dir: Path
-) -> Suggestion | None:
+def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
     """Write table and picture, and print the line that a person came for."""
     smoothed = smooth(losses)
     rows = [
@@ -199,14 +188,12 @@ def _report(
         axes.axvline(found.lowest, color="C7", linestyle=":", label=f"lowest: {found.lowest:.2g}")
         axes.legend()
     write_png(run_dir / PICTURE_FILE, figure_image(figure))
-    if found is None:
-        display.console.print(
-            "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or "
-            f"look at the data; {run_dir / PICTURE_FILE}"
-        )
-    else:
-        display.console.print(
-            f"suggested optimizer.lr={found.steepest:.2g}, where the loss falls fastest; it is "
-            f"lowest at {found.lowest:.2g}; {run_dir / PICTURE_FILE}"
-        )
+    text = (
+        "the loss does not fall anywhere in the sweep: widen lr_finder.min_lr … max_lr, or look at "
+        "the data"
+        if found is None
+        else f"suggested optimizer.lr={found.steepest:.2g}, where the loss falls fastest; it is "
+        f"lowest at {found.lowest:.2g}"
+    )
+    display.console.print(f"{text}; {run_dir / PICTURE_FILE}")
     return found

@@ -37,7 +37,7 @@ from dopepp.experiment.runs.images import describe_images
 from dopepp.experiment.runs.resume import ConfigDifference, check_resume, remember_overrides
 from dopepp.experiment.runs.tracking import log_report, tracked
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.parts.part import Part
+from dopepp.parts.part import Parts
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import FOLDER as PROFILE
 from dopepp.training.callbacks.throughput import profile_rows
@@ -56,8 +56,7 @@ QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickst
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
     """Parse ``train.py``'s composed config and do the job that it names.
 
-    Raises:
-        UserError: An option is wrong.
+    A :class:`UserError` tells which option is wrong.
     """
     parsed = RunConfig.of(config)
     if parsed.table is not None:
@@ -128,11 +127,9 @@ def _train(
     if config.protocols.shading:
         check_masks(datamodule.test_source)
     fingerprint = datamodule.fingerprint()
-    images = {
-        "train": describe_images(datamodule.train_source),
-        "val": describe_images(datamodule.val_source),
-        "test": describe_images(datamodule.test_source),
-    }
+    sources = {"train": datamodule.train_source, "val": datamodule.val_source}
+    sources["test"] = datamodule.test_source
+    images = {split: describe_images(source) for split, source in sources.items()}
     system = build_system(config, parts, fingerprint, images)
     resume_from, changes = _resume_path(config, system)
     # Whatever it refuses, nothing is written yet.
@@ -244,9 +241,7 @@ def _advice(run_dir: Path) -> str:
     return f"{saved}; go on with resume={run_dir}"
 
 
-def _measure_run(
-    config: RunConfig, parts: Sequence[Part], run_dir: Path, trainer: Trainer
-) -> Report:
+def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
     """Measure the best checkpoint of a finished run and write everything down."""
     checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
     path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
@@ -256,10 +251,9 @@ def _measure_run(
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
     if config.tune:
+        target = config.false_positives
         try:
-            path = tune_and_record(
-                estimator, path, parts, config.data, run_dir, config.false_positives
-            )
+            path = tune_and_record(estimator, path, parts, config.data, run_dir, target)
         except UserError as error:  # a network that learned little is measured as it is
             display.console.print(f"not tuned: {error}")
         else:

@@ -32,7 +32,7 @@ from dopepp.metrics.functional import add, add_s, expected_calibration_error
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.checkpoint.storage import write_atomic
-from dopepp.parts.part import Part
+from dopepp.parts.part import Part, Parts
 from dopepp.recovery.calibration import (
     FEATURES,
     PASSING,
@@ -63,13 +63,8 @@ class FalsePositiveTarget:
 class Scored:
     """The detections on a set of images.
 
-    Attributes:
-        features: Of every detection.
-        scores: What the estimator said.
-        correct: Whether it is right.
-        image: Number of its image.
-        num_images: Images in all.
-        num_instances: Instances that were to be found.
+    Of every detection its features, what the estimator said, whether it is right, and the number of
+    its image; then images in all, and instances that were to be found.
     """
 
     features: Float[np.ndarray, "n features"]
@@ -90,10 +85,8 @@ class Scored:
 class Figures:
     """How good scores and a threshold are.
 
-    Attributes:
-        calibration_error: Expected calibration error of the scores.
-        false_positive_rate: Share of images without objects on which something is found.
-        recall: Share of instances with a right pose above the threshold.
+    The scores' expected calibration error, the share of images without objects on which something
+    is found, and the share of instances with a right pose above the threshold.
     """
 
     calibration_error: float
@@ -103,13 +96,10 @@ class Figures:
 
 @dataclass(frozen=True)
 class Tuning:
-    """What tuning chose, and how good it is on images it was not chosen on.
+    """What tuning chose: recovery options to change, and how good it is on other images.
 
-    Attributes:
-        options: The recovery options to change.
-        before: Figures of the checkpoint as it was.
-        after: Figures with the new options.
-        num_images: Test images with objects, and without.
+    Figures are of the checkpoint as it was and with the new options; ``num_images`` counts the test
+    images with objects, and without.
     """
 
     options: dict[str, float]
@@ -119,15 +109,11 @@ class Tuning:
 
 
 def tune(
-    estimator: PoseEstimator,
-    data: DataConfig,
-    parts: Sequence[Part],
-    target: FalsePositiveTarget,
+    estimator: PoseEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
-    Raises:
-        UserError: The network finds nothing, or everything it finds is right or wrong.
+    A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
     """
     old = estimator.recovery
     validation = build_validation_source(data, parts)
@@ -159,15 +145,10 @@ def choose(
     empty: Scored,
     false_positive_rate: float = FalsePositiveTarget.false_positive_rate,
 ) -> dict[str, float]:
-    """Choose the weights and the threshold.
+    """Choose the weights and the threshold from detections on images with objects and without.
 
-    Args:
-        shown: Detections on images with objects.
-        empty: Detections on images without; each is wrong.
-        false_positive_rate: See :class:`FalsePositiveTarget`.
-
-    Raises:
-        UserError: There is nothing to learn from.
+    ``false_positive_rate`` is as in :class:`FalsePositiveTarget`. A :class:`UserError`: there is
+    nothing to learn from.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -189,7 +170,7 @@ def choose(
     return {"min_score": threshold} | {f"score_{name}": float(value) for name, value in named}
 
 
-def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source) -> Scored:
+def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scored:
     """Run an estimator over a source and judge every detection."""
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
@@ -210,7 +191,7 @@ def score_images(estimator: PoseEstimator, parts: Sequence[Part], source: Source
 
 
 def matched_poses(
-    estimator: PoseEstimator, parts: Sequence[Part], source: Source
+    estimator: PoseEstimator, parts: Parts, source: Source
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
     """Return the poses found on a source and, for each, that of the instance it found."""
     estimated, true = [np.empty((0, 4, 4))], [np.empty((0, 4, 4))]
@@ -223,7 +204,7 @@ def matched_poses(
 
 
 def _by_object(
-    estimator: PoseEstimator, parts: Sequence[Part], source: Source
+    estimator: PoseEstimator, parts: Parts, source: Source
 ) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
     """Run an estimator over a source; for every image and part what was found and what is there."""
     for number in range(len(source)):
@@ -271,9 +252,8 @@ def _judge(
 
 
 def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
-    error = expected_calibration_error(
-        torch.from_numpy(test.scores), torch.from_numpy(test.correct)
-    )
+    scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
+    error = expected_calibration_error(scores, correct)
     loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
     right = test.correct & (test.scores >= threshold)
     return Figures(error, float(loud.mean()), float(right.sum()) / max(test.num_instances, 1))

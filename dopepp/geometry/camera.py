@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.cuboid import Cuboid
 from dopepp.geometry.rotation import RotationMatrix, Vector
 
 Transform = Float[np.ndarray, "4 4"]
@@ -17,10 +18,11 @@ Transform = Float[np.ndarray, "4 4"]
 CameraMatrix = Float[np.ndarray, "3 3"]
 """K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
 
+Points = Float[np.ndarray, "*batch 3"]
+Pixels = Float[np.ndarray, "*batch 2"]
 
-def transform(
-    T_a_b: Transform, points_b: Float[np.ndarray, "*batch 3"]
-) -> Float[np.ndarray, "*batch 3"]:
+
+def transform(T_a_b: Transform, points_b: Points) -> Points:
     """Map points from frame b into frame a with a rigid 4×4 transform."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
@@ -38,9 +40,7 @@ def invert_transform(T_a_b: Transform) -> Transform:
     return make_transform(rotation, -rotation @ T_a_b[:3, 3])
 
 
-def project(
-    points_cam: Float[np.ndarray, "*batch 3"], K: CameraMatrix
-) -> Float[np.ndarray, "*batch 2"]:
+def project(points_cam: Points, K: CameraMatrix) -> Pixels:
     """Project camera-frame points (metres) to pixels; points at or behind the camera become NaN."""
     points_cam = np.asarray(points_cam, np.float64)
     depth = points_cam[..., 2:]
@@ -50,7 +50,7 @@ def project(
 
 
 def project_keypoints(
-    cuboid: Float[np.ndarray, "9 3"], T_cam_obj: Transform, K: CameraMatrix
+    cuboid: Cuboid, T_cam_obj: Transform, K: CameraMatrix
 ) -> Float[np.ndarray, "9 2"]:
     """Project an object's nine keypoints to pixels (NaN where one is behind the camera)."""
     return project(transform(T_cam_obj, cuboid), K)
@@ -71,9 +71,7 @@ def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatr
     return resized
 
 
-def resize_points(
-    points_px: Float[np.ndarray, "*batch 2"], scale_x: float, scale_y: float
-) -> Float[np.ndarray, "*batch 2"]:
+def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
     """Move pixel coordinates through the same resize as :func:`resize_camera`."""
     scale = np.array([scale_x, scale_y])
     return np.asarray(scale * (np.asarray(points_px) + 0.5) - 0.5)
@@ -121,13 +119,11 @@ class Letterbox:
         """Return K for the letterboxed image."""
         return resize_camera(K, self.scale_x, self.scale_y)
 
-    def points(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def points(self, points_px: Pixels) -> Pixels:
         """Move original pixel coordinates into the letterboxed image."""
         return resize_points(points_px, self.scale_x, self.scale_y)
 
-    def original_points(
-        self, points_px: Float[np.ndarray, "*batch 2"]
-    ) -> Float[np.ndarray, "*batch 2"]:
+    def original_points(self, points_px: Pixels) -> Pixels:
         """Move letterboxed pixel coordinates back into the original image."""
         return resize_points(points_px, 1 / self.scale_x, 1 / self.scale_y)
 
@@ -135,9 +131,8 @@ class Letterbox:
 def check_camera(K: CameraMatrix, image_size: tuple[int, int], source: str) -> CameraMatrix:
     """Return K as float64 after checking that it can belong to an image of (width, height).
 
-    Raises:
-        UserError: K is not a finite pinhole matrix, its principal point lies outside the image, or
-            its focal length gives a field of view outside 5° – 150°.
+    A :class:`UserError`: K is not a finite pinhole matrix, its principal point lies outside the
+    image, or its focal length gives a field of view outside 5° – 150°.
     """
     width, height = image_size
     pinhole = "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"

@@ -11,6 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from dopepp.geometry.rotation import Vector
+
+Cuboid = Float[np.ndarray, "9 3"]
+"""The nine keypoints of an object, metres, object frame."""
+
 NUM_CORNERS: Final = 8
 NUM_KEYPOINTS: Final = 9
 CENTROID: Final = 8
@@ -39,17 +44,10 @@ EDGES: Final[tuple[tuple[int, int], ...]] = tuple(
 """The cuboid's twelve edges as pairs of corner indices (they differ in one sign)."""
 
 
-def cuboid_keypoints(
-    lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "9 3"]:
-    """Return the eight corners and the centre of an axis-aligned box.
+def cuboid_keypoints(lower: Vector, upper: Vector) -> Cuboid:
+    """Return the eight corners and the centre of an axis-aligned box, metres, object frame.
 
-    Args:
-        lower: The box's smallest coordinates, metres, object frame.
-        upper: The box's largest coordinates, metres, object frame.
-
-    Raises:
-        ValueError: A bound is not finite, or ``lower`` exceeds ``upper``.
+    A ``ValueError``: a bound is not finite, or ``lower`` exceeds ``upper``.
     """
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):

@@ -50,10 +50,9 @@ def _spreads(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return how far points spread, for :func:`degenerate`.
 
-    Returns:
-        The object's largest extent, metres, and its two largest singular values over that; the
-        number of pixels more than a thousandth apart, and the pixels' two singular values;
-        their median deviation.
+    That is the object's largest extent, metres, and its two largest singular values over that; the
+    number of pixels more than a thousandth apart, and the pixels' two singular values; their median
+    deviation.
     """
     n = len(object_points)
     extent = 0.0

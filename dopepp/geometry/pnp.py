@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.degeneracy import MIN_POINTS, degenerate
 from dopepp.geometry.refine import (
     GATE,
@@ -30,6 +31,7 @@ from dopepp.geometry.refine import (
     refine_pose,
     reproject,
 )
+from dopepp.geometry.rotation import Vector
 
 MOST_LEFT_OUT: Final = 2
 """Outliers looked for by leaving points out; the robust cost bears more where these are mild."""
@@ -68,7 +70,7 @@ class PnPResult:
             covariances; None without a pose.
     """
 
-    T_cam_obj: Float[np.ndarray, "4 4"] | None
+    T_cam_obj: Transform | None
     reprojection_error_px: float
     inliers: Bool[np.ndarray, "n"]
     reason: str = ""
@@ -78,7 +80,7 @@ class PnPResult:
 def solve_pnp(
     object_points: Float[np.ndarray, "n 3"],
     image_points: Float[np.ndarray, "n 2"],
-    K: Float[np.ndarray, "3 3"],
+    K: CameraMatrix,
     sigma_px: Float[np.ndarray, "n"] | float = 1.0,
     covariance_px: Float[np.ndarray, "n 2 2"] | None = None,
 ) -> PnPResult:
@@ -93,12 +95,9 @@ def solve_pnp(
         covariance_px: Covariance of each pixel position, pixels²; where given it replaces
             ``sigma_px``. A point whose covariance is not finite and positive definite is missing.
 
-    Returns:
-        The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
-        mirror image for a plate and, where outliers show, SQPnP on all but one and all but two.
-
-    Raises:
-        ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
+    Returned is the pose with the smallest robust cost among the refined starts: SQPnP on all
+    points, its mirror image for a plate and, where outliers show, SQPnP on all but one and all but
+    two. A ``ValueError``: the arguments differ in length, or K is no invertible pinhole matrix.
     """
     object_points = np.asarray(object_points, np.float64).reshape(-1, 3)
     image_points = np.asarray(image_points, np.float64).reshape(-1, 2)
@@ -154,7 +153,7 @@ def _prepared(
     return rays, whitening, usable
 
 
-def _checked_pinhole(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _checked_pinhole(K: CameraMatrix) -> CameraMatrix:
     K = np.asarray(K, np.float64)
     proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and K[2].tolist() == [0, 0, 1]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -323,7 +322,7 @@ def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Pose
     return Poses(rotations, translations)
 
 
-def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Vector | None:
     """Return the unit normal of a plate; None for a thicker part, which has no second tilt."""
     extents, axes = _principal_axes(object_points)
     return np.asarray(axes[2]) if extents[2] < PLATE * extents[0] else None
@@ -341,7 +340,7 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
     return extents, axes
 
 
-def _mirrored(poses: Poses, normal: Float[np.ndarray, "3"]) -> Poses:
+def _mirrored(poses: Poses, normal: Vector) -> Poses:
     """Return the other tilt under which a plate looks almost the same.
 
     Seen from far away, a plate tilted by +θ and by −θ about the same axis have the same image. The

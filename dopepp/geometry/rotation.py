@@ -12,8 +12,7 @@ RotationMatrix = Float[np.ndarray, "3 3"]
 def quaternion_to_matrix(quaternion_wxyz: Float[np.ndarray, "4"]) -> RotationMatrix:
     """Turn a quaternion of any non-zero norm into a rotation matrix.
 
-    Raises:
-        ValueError: The quaternion is zero or not finite.
+    One that is zero or not finite is a ``ValueError``.
     """
     quaternion = np.asarray(quaternion_wxyz, np.float64)
     largest = np.abs(quaternion).max()

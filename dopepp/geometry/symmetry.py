@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.geometry.rotation import Vector, rotation_angle, rotation_vector_to_matrix
 
 MAX_FINITE: Final = 60
 """Rotations of the icosahedron: the largest finite group that is no n-fold axis with its flips."""
@@ -49,13 +49,9 @@ def symmetry_group(
     point maps onto itself. Steps of 0.01 would be ten million; so the steps are at least 0.2 rad,
     about 10,000 rotations.
 
-    Args:
-        discrete: BOP-style rigid transforms without the identity, metres; None for none.
-        continuous: BOP-style (axis, offset) pairs, metres.
-        max_step: Largest step in diameters.
-
-    Raises:
-        ValueError: ``max_step`` is not positive or an axis has no length.
+    ``discrete`` are BOP-style rigid transforms without the identity, ``continuous`` BOP-style
+    (axis, offset) pairs, metres. A ``ValueError``: ``max_step`` is not positive or an axis has no
+    length.
     """
     if not max_step > 0:
         raise ValueError(f"max_step must be positive, got {max_step}")
@@ -74,7 +70,7 @@ def symmetry_group(
     return np.asarray((turns[None] @ group[:, None]).reshape(-1, 4, 4))
 
 
-def _unit(axis: Sequence[float]) -> Float[np.ndarray, "3"]:
+def _unit(axis: Sequence[float]) -> Vector:
     length = float(np.linalg.norm(axis))
     if not 0 < length < math.inf:
         raise ValueError(f"an axis of symmetry must have a length, got {list(axis)}")
@@ -82,7 +78,7 @@ def _unit(axis: Sequence[float]) -> Float[np.ndarray, "3"]:
 
 
 def _with_centre(
-    rotations: Float[np.ndarray, "rotations 3 3"], centre: Float[np.ndarray, "3"]
+    rotations: Float[np.ndarray, "rotations 3 3"], centre: Vector
 ) -> Float[np.ndarray, "rotations 4 4"]:
     """Return rotations about a point as transforms, the first exactly the identity."""
     shifts = centre - rotations @ centre
@@ -115,11 +111,7 @@ def exact_group(
     g is replaced by the mean of ρ(gh)·ρ(h)⁻¹ over all h, made a rotation again, which turns an
     approximate homomorphism ρ into an exact one (Grove, Karcher, Ruh 1974).
 
-    Args:
-        rotations: Generators, each a few degrees off at most.
-
-    Returns:
-        The group, the identity first; None where it has more than 60 elements.
+    The group, of which the identity is the first, is None where it has more than 60 elements.
     """
     group = [np.eye(3)]
     generators = [np.asarray(rotation, np.float64) for rotation in rotations]

@@ -16,8 +16,10 @@ from jaxtyping import Float, UInt8
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, check_camera, project_keypoints
+from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference.refinement.depth import DepthRefiner
 from dopepp.inference.refinement.view import checked_depth, undistorted_depth
+from dopepp.inference.refinement.visible import Depth
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
@@ -25,6 +27,8 @@ from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 
 _log = logging.getLogger(__name__)
+
+Coefficients = Float[np.ndarray, "coefficients"]
 
 Decoded = TypeVar("Decoded")
 
@@ -41,9 +45,7 @@ class PoseEstimator:
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
         refine: ``depth`` refines poses with the depth that :meth:`predict` is given; None does not.
-
-    Raises:
-        UserError: There is no such refinement, or its extra is not installed.
+            Any other one, or a missing extra, is a :class:`UserError`.
     """
 
     def __init__(
@@ -68,9 +70,8 @@ class PoseEstimator:
     ) -> PoseEstimator:
         """Load a checkpoint written by training; see the class for the options.
 
-        Raises:
-            UserError: The file is missing, not a checkpoint, or not safe to load, or a refinement
-                is unknown or not installed.
+        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or a
+        refinement is unknown or not installed.
         """
         return cls(*load_network(Path(path)), device, refine)
 
@@ -83,8 +84,8 @@ class PoseEstimator:
         self,
         image: Picture,
         K: CameraMatrix,
-        distortion: Float[np.ndarray, "coefficients"] | None = None,
-        depth: Float[np.ndarray, "height width"] | None = None,
+        distortion: Coefficients | None = None,
+        depth: Depth | None = None,
     ) -> list[Detection]:
         """Find all known objects on one image.
 
@@ -123,8 +124,7 @@ class PoseEstimator:
     def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
         """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
 
-        Raises:
-            UserError: The image is no RGB picture, or K cannot belong to it.
+        An image or a K that :meth:`predict` refuses is a :class:`UserError`.
         """
         image, K = _checked(image, K)
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
@@ -154,17 +154,16 @@ class PoseEstimator:
 def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
     """Turn the thresholds of a config or a checkpoint into options.
 
-    Raises:
-        UserError: A name is none of the options', or a value is out of its range.
+    A :class:`UserError`: a name is none of the options', or a value is out of its range.
     """
     allowed = [entry.name for entry in fields(RecoveryOptions)]
     unknown = sorted(set(stored) - set(allowed))
     if unknown:
-        raise UserError(
+        got, fix = (
             f"recovery option {unknown[0]!r}",
-            ", ".join(allowed),
             "remove it; a checkpoint must be of this version",
         )
+        raise UserError(got, ", ".join(allowed), fix)
     return RecoveryOptions(**stored)  # type: ignore[arg-type]
 
 
@@ -190,9 +189,7 @@ def _checked(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMatrix]:
     return np.ascontiguousarray(image), check_camera(K, (image.shape[1], image.shape[0]), "predict")
 
 
-def _checked_distortion(
-    distortion: Float[np.ndarray, "coefficients"],
-) -> Float[np.ndarray, "coefficients"]:
+def _checked_distortion(distortion: Coefficients) -> Coefficients:
     """Check that the coefficients are those of one of OpenCV's lens models."""
     coefficients = np.asarray(distortion, np.float64).ravel()
     if coefficients.size not in (4, 5, 8, 12, 14) or not np.isfinite(coefficients).all():
@@ -205,11 +202,7 @@ def _checked_distortion(
 
 
 def _refined(
-    refiner: DepthRefiner,
-    detection: Detection,
-    cuboid: Float[np.ndarray, "9 3"],
-    depth: Float[np.ndarray, "height width"],
-    K: CameraMatrix,
+    refiner: DepthRefiner, detection: Detection, cuboid: Cuboid, depth: Depth, K: CameraMatrix
 ) -> Detection:
     """Refine a detection with depth, or keep it where depth is in doubt."""
     refined = refiner.refine(detection.object, detection.T_cam_obj, depth, K, detection.covariance)
@@ -225,7 +218,7 @@ def _refined(
 
 
 def _in_original(
-    detection: Detection, cuboid: Float[np.ndarray, "9 3"], letterbox: Letterbox, K: CameraMatrix
+    detection: Detection, cuboid: Cuboid, letterbox: Letterbox, K: CameraMatrix
 ) -> Detection:
     """Express a detection's pixels in the original image; the pose is the same in both."""
     return replace(

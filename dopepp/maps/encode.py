@@ -10,6 +10,9 @@ from torch import Tensor
 
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
 
+Beliefs = Float[Tensor, "batch beliefs height width"]
+Fields = Float[Tensor, "batch fields height width"]
+
 
 @dataclass(frozen=True)
 class MapGeometry:
@@ -37,19 +40,15 @@ def encode(
     num_objects: int,
     map_size: tuple[int, int],
     geometry: MapGeometry,
-) -> tuple[Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]]:
+) -> tuple[Beliefs, Fields]:
     """Draw the target maps of a batch.
 
     Beliefs are Gaussians of peak 1, their maximum taken over instances. A keypoint off the map or
     not finite is absent and leaves its channel as it is. Fields are unit vectors from a corner to
     its instance's centroid; where discs overlap, the nearest corner's vector stands.
 
-    Args:
-        keypoints: Corners and centroid in input pixels.
-        object_index: Which object each instance is; −1 marks padding.
-        num_objects: C; the result has 9·C belief and 16·C field channels.
-        map_size: (height, width) in cells.
-        geometry: Stride, peak width and disc radius.
+    Keypoints are input pixels; an object's index −1 marks padding. The map's size is (height,
+    width) in cells. The result has 9·C belief and 16·C field channels.
     """
     height, width = map_size
     batch, instances = object_index.shape

@@ -256,8 +256,7 @@ def _step(
 ) -> tuple[float, float, float]:
     """Take a Gauss–Newton step on b with a prior on the shape.
 
-    Returns:
-        Σ residual² before it, the number of cells, and the largest move of a parameter.
+    Returned are Σ residual² before it, the number of cells, and the largest move of a parameter.
     """
     side = len(window)
     half = side // 2
@@ -357,13 +356,7 @@ def _mode(window: Array, theta: Array) -> tuple[Array, bool]:
 
 @compiled()
 def _covariance(
-    theta: Array,
-    offset: Array,
-    sound: bool,
-    hessian: Array,
-    noise: float,
-    sigma: float,
-    out: Array,
+    theta: Array, offset: Array, sound: bool, hessian: Array, noise: float, sigma: float, out: Array
 ) -> None:
     """Write a position's covariance; see :func:`fit_peaks`.
 

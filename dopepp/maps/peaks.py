@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.encode import Fields, MapGeometry
 from dopepp.maps.gaussian import fit_peaks
 
 REACH: Final = 2.5
@@ -62,7 +62,7 @@ def find_peaks(
     geometry: MapGeometry,
     threshold: float = 0.05,
     max_peaks: int = 16,
-    field: Float[Tensor, "batch fields height width"] | None = None,
+    field: Fields | None = None,
 ) -> Peaks:
     """Find up to ``max_peaks`` local maxima above ``threshold`` in each channel.
 
@@ -70,12 +70,8 @@ def find_peaks(
     belief, it is the one with the highest neighbourhood, which is the middle one; if these are
     equal too, the first in raster order. Its position is that of a Gaussian fitted around it.
 
-    Args:
-        belief: Belief maps; with a field, nine of each object.
-        geometry: Stride, peak width and disc radius.
-        threshold: Belief below which a maximum is no peak; above 0.
-        max_peaks: Slots of a channel.
-        field: 16 channels of each object; without it, peaks have no vectors.
+    With a field, which has 16 channels of each object, the belief has nine of each; without it,
+    peaks have no vectors.
     """
     belief = belief.detach().float()
     height, width = belief.shape[-2:]
@@ -129,9 +125,7 @@ def _windows(
 
 
 def _field_windows(
-    field: Float[Tensor, "batch fields height width"],
-    index: Int[Tensor, "batch channels peaks"],
-    half: int,
+    field: Fields, index: Int[Tensor, "batch channels peaks"], half: int
 ) -> Float[Tensor, "batch channels peaks cells"]:
     """Read the vectors around each peak, all x before all y; zeros for a centroid."""
     batch, channels, count = index.shape

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dopepp.geometry.camera import transform
+from dopepp.geometry.camera import Transform, transform
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.metrics.functional import (
     add,
@@ -60,14 +60,9 @@ class PoseErrors:
         K: Float[Tensor, "n 3 3"],
         width: Float[Tensor, "n"],
     ) -> PoseErrors:
-        """Compute them.
+        """Compute them, of estimated poses (NaN for a miss) and true ones, metres.
 
-        Args:
-            part: The object.
-            T_est: Estimated poses, metres; NaN for a miss.
-            T_gt: True poses, metres.
-            K: Camera matrices, pixels; NaN where unknown.
-            width: Width of the images, pixels; NaN where unknown.
+        Camera matrices and the images' widths are pixels, NaN where unknown.
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
@@ -111,7 +106,7 @@ class PredictedPose(Protocol):
         """Confidence; a better one is matched first."""
 
     @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+    def T_cam_obj(self) -> Transform:  # noqa: N802
         """Estimated pose, metres."""
 
 
@@ -123,7 +118,7 @@ class TruePose(Protocol):
         """Name of the part."""
 
     @property
-    def T_cam_obj(self) -> Float[np.ndarray, "4 4"]:  # noqa: N802
+    def T_cam_obj(self) -> Transform:  # noqa: N802
         """True pose, metres."""
 
     @property
@@ -161,19 +156,14 @@ def assign(
     Instances that count are matched first; predictions left over may then explain themselves by
     instances that do not, and are ignored; the rest are false positives.
 
-    Args:
-        centre: Of the object's cuboid, object frame, metres.
-        detections: Of this object.
-        instances: Of this object.
-        min_visible_fraction: Visible share of the silhouette from which an instance counts.
+    Detections and instances are of this object, the centre of its cuboid (object frame, metres).
     """
     counted = [i for i in instances if i.visible_fraction >= min_visible_fraction]
     hidden = [i for i in instances if not i.visible_fraction >= min_visible_fraction]
     T_est, scores = np.full((len(counted), 4, 4), np.nan), np.full(len(counted), np.nan)
     left = []
-    for detection, index in zip(
-        detections, match_by_centre(centre, detections, counted), strict=True
-    ):
+    matches = match_by_centre(centre, detections, counted)
+    for detection, index in zip(detections, matches, strict=True):
         if index < 0:
             left.append(detection)
         else:
@@ -190,11 +180,7 @@ def match_by_centre(
     detections: Sequence[PredictedPose],
     instances: Sequence[TruePose],
 ) -> Int[Tensor, "detections"]:
-    """Match by the distance between the centres of the objects' cuboids.
-
-    Returns:
-        The instance of each detection, −1 where it has none; see :func:`match`.
-    """
+    """Match by the distance between the centres of the objects' cuboids; see :func:`match`."""
     # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
     estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
     predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]

@@ -22,6 +22,13 @@ from scipy.stats import norm, t
 
 from dopepp.core.errors import UserError
 
+Numbers = Sequence[Float[np.ndarray, "_ instances"]]
+"""Of each object a number per seed and instance."""
+
+Resamples = Float[np.ndarray, "resamples"]
+Draws = Float[np.ndarray, "resamples seeds"]
+"""How often each resample draws each seed, as a share."""
+
 StatisticName = Literal["mean", "median"]
 
 _BLOCK: Final = 4_000_000
@@ -57,8 +64,8 @@ class Difference:
 
 
 def paired_difference(
-    mine: Sequence[Float[np.ndarray, "seeds instances"]],
-    baseline: Sequence[Float[np.ndarray, "baseline_seeds instances"]],
+    mine: Numbers,
+    baseline: Numbers,
     statistic: StatisticName = "mean",
     *,
     same_seeds: bool = True,
@@ -125,24 +132,15 @@ def paired_difference(
     return Difference(value, float(low), float(high), num_differing, fewest, needed)
 
 
-def seeds_to_tell(
-    mine: Sequence[Float[np.ndarray, "seeds instances"]],
-    baseline: Sequence[Float[np.ndarray, "seeds instances"]],
-    confidence: float = 0.95,
-) -> float:
+def seeds_to_tell(mine: Numbers, baseline: Numbers, confidence: float = 0.95) -> float:
     """Return about how many paired seeds would tell a difference in means from chance.
 
     With S seeds the interval reaches √(z² · V + t₍S₋₁₎² · W / S) to both sides: V is the variance
     of the mean over instances, W that of the difference over seeds, both estimated from the seeds
     there are.
 
-    Args:
-        mine: Of each object a number per seed and instance; two seeds or more.
-        baseline: Likewise, row by row of the same seeds.
-        confidence: Of the interval.
-
-    Returns:
-        S, more than there are; infinite where these instances are too few for any number of seeds.
+    Returned is S, more than there are of these paired rows; infinite where the instances are too
+    few for any number of seeds.
     """
     differences = [one - other for one, other in zip(mine, baseline, strict=True)]
     if min(one.shape[1] for one in differences) < 2:
@@ -157,12 +155,8 @@ def seeds_to_tell(
     over_seeds = effects.var(ddof=1)
     # Student's t is above z, so no fewer than these; and it comes down to z soon.
     fewest = max(len(effects) + 1, math.ceil(z**2 * over_seeds / room))
-    reached = (
-        num
-        for num in itertools.count(fewest)
-        if t.ppf(level, num - 1) ** 2 * over_seeds < room * num
-    )
-    return float(next(reached))
+    spread = ((num, t.ppf(level, num - 1) ** 2 * over_seeds) for num in itertools.count(fewest))
+    return float(next(num for num, reached in spread if reached < room * num))
 
 
 def fewest_differing(confidence: float) -> int:
@@ -170,10 +164,8 @@ def fewest_differing(confidence: float) -> int:
 
     If both are equally good, either wins a differing instance with probability ½; so all of k go
     to the same one with probability 2 · ½ᵏ (sign test). Below that the bootstrap is overconfident:
-    of one or two instances every resample looks alike.
-
-    Raises:
-        UserError: The confidence is not in (0, 1).
+    of one or two instances every resample looks alike. A confidence outside (0, 1) is a
+    :class:`UserError`.
     """
     if not 0 < confidence < 1:
         raise UserError(f"confidence={confidence}", "a share in (0, 1)", "e.g. 0.95")
@@ -200,12 +192,7 @@ STATISTICS: Final = {"mean": _mean, "median": _finite_median}
 _Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 
 
-def _check(
-    mine: Sequence[Float[np.ndarray, "seeds instances"]],
-    baseline: Sequence[Float[np.ndarray, "seeds instances"]],
-    statistic: str,
-    same_seeds: bool,
-) -> None:
+def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
     """Refuse what cannot be paired."""
     if statistic not in STATISTICS:
         raise UserError(f"statistic {statistic!r}", ", ".join(STATISTICS), "choose one of them")
@@ -231,21 +218,19 @@ def _check(
         )  # fmt: skip
 
 
-def _drawn_seeds(
-    rng: np.random.Generator, num_resamples: int, num_seeds: int
-) -> Float[np.ndarray, "resamples seeds"]:
+def _drawn_seeds(rng: np.random.Generator, num_resamples: int, num_seeds: int) -> Draws:
     """Return how often each resample draws each seed, as a share."""
     chances = np.full(num_seeds, 1 / num_seeds)
     return rng.multinomial(num_seeds, chances, num_resamples) / num_seeds
 
 
 def _resampled_difference(
-    mine: Sequence[Float[np.ndarray, "seeds instances"]],
-    baseline: Sequence[Float[np.ndarray, "baseline_seeds instances"]],
+    mine: Numbers,
+    baseline: Numbers,
     compute: _Statistic,
-    draws: Sequence[Float[np.ndarray, "resamples seeds"]],
+    draws: Sequence[Draws],
     rng: np.random.Generator,
-) -> Float[np.ndarray, "resamples"]:
+) -> Resamples:
     """Return the difference in each resample, averaged over objects."""
     total = np.zeros(len(draws[0]))
     for one, other in zip(mine, baseline, strict=True):
@@ -264,10 +249,10 @@ def _resampled_difference(
 
 def _stretching(
     figures: Sequence[Float[np.ndarray, "seeds"]],
-    draws: Sequence[Float[np.ndarray, "resamples seeds"]],
+    draws: Sequence[Draws],
     same_seeds: bool,
     confidence: float,
-) -> Float[np.ndarray, "resamples"]:
+) -> Resamples:
     """Return what is added to each resample so that few seeds spread as much as they should."""
     if same_seeds:
         effects, weights = [figures[0] - figures[1]], [draws[0]]
@@ -283,10 +268,7 @@ def _stretching(
     return added
 
 
-def _num_differing(
-    mine: Sequence[Float[np.ndarray, "seeds instances"]],
-    baseline: Sequence[Float[np.ndarray, "baseline_seeds instances"]],
-) -> int:
+def _num_differing(mine: Numbers, baseline: Numbers) -> int:
     """Count instances whose numbers, as a list over seeds, differ between the methods."""
     count = 0
     for one, other in zip(mine, baseline, strict=True):

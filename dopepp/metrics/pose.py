@@ -20,6 +20,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.curves import accuracy_figure
+from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.metrics.assignment import (
     Assignment,
@@ -54,13 +55,10 @@ class PoseMetrics(Metric):
     """Accumulates detections against ground truth, image by image; sums up per object.
 
     Args:
-        parts: The objects that are scored. Instances of other objects are not ground truth here;
-            detections of other objects are an error.
+        parts: The objects that are scored, one or more, of different names. Instances of other
+            objects are not ground truth here; detections of other objects are an error.
         method: Name of what produces the poses, shown in the rows.
         **kwargs: As of :class:`torchmetrics.Metric`.
-
-    Raises:
-        UserError: There are no parts, or two share a name.
     """
 
     is_differentiable = False
@@ -74,9 +72,8 @@ class PoseMetrics(Metric):
         super().__init__(**kwargs)
         names = [part.name for part in parts]
         if not names or len(set(names)) < len(names) or MEAN in names:
-            raise UserError(
-                f"parts {names}", f"one or more parts of different names, none {MEAN!r}", "rename"
-            )
+            allowed = f"one or more parts of different names, none {MEAN!r}"
+            raise UserError(f"parts {names}", allowed, "rename")
         self.parts = {part.name: part for part in parts}
         self.method = method
         self.set_dtype(torch.float64)
@@ -90,20 +87,14 @@ class PoseMetrics(Metric):
         self,
         detections: Sequence[PredictedPose],
         instances: Sequence[TruePose],
-        K: Float[np.ndarray, "3 3"] | None = None,
+        K: CameraMatrix | None = None,
         width: float | None = None,
     ) -> None:
-        """Add one image.
+        """Add one image: detections of the scored parts, and ground truth.
 
-        Args:
-            detections: Of the scored parts.
-            instances: Ground truth.
-            K: The image's camera matrix, pixels; MSPD needs it of every image, and the width.
-            width: Width of the image, pixels.
-
-        Raises:
-            UserError: A detection's object is none of the parts.
-            ValueError: Only one of K and width is given, or one is impossible.
+        MSPD needs of every image its camera matrix and width, pixels. A detection of another object
+        is a :class:`UserError`; a ``ValueError``: only one of K and width is given, or one is
+        impossible.
         """
         for detection in detections:
             if detection.object not in self.parts:
@@ -147,13 +138,9 @@ class PoseMetrics(Metric):
         poses, false_positives = _table(self.poses, _WIDTH), _table(self.false_positives, 2)
         rows = {}
         for index, (name, part) in enumerate(self.parts.items()):
-            gathered = Gathered(
-                part,
-                poses[poses[:, 0] == index, 1:],
-                false_positives[false_positives[:, 0] == index, 1],
-            )
-            self._gathered[name] = gathered
-            rows[name] = gathered.row(part, self.method)
+            false = false_positives[false_positives[:, 0] == index, 1]
+            self._gathered[name] = Gathered(part, poses[poses[:, 0] == index, 1:], false)
+            rows[name] = self._gathered[name].row(part, self.method)
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
 
@@ -172,15 +159,14 @@ class PoseMetrics(Metric):
         All ranks must call it, as :meth:`errors`.
         """
         self.compute()
-        by_part = [
-            reference_rows(part, self._gathered[name].T_gt.numpy(), seed)
+        by_part = {
+            name: reference_rows(part, self._gathered[name].T_gt.numpy(), seed)
             for name, part in self.parts.items()
-        ]
+        }
         table = {}
         for reference in REFERENCES:
-            rows = [rows[reference] for rows in by_part]
-            table[reference] = {row.object: row for row in rows}
-            table[reference][MEAN] = mean_row(rows, reference)
+            table[reference] = {name: rows[reference] for name, rows in by_part.items()}
+            table[reference][MEAN] = mean_row(list(table[reference].values()), reference)
         return table
 
     def instances(self, name: str) -> Gathered:
@@ -227,10 +213,9 @@ class Gathered:
         """Sum up; only the false positives of an object without ground truth mean anything."""
         errors, num_false = self.errors, len(self.false_positives)
         num_symmetries = len(symmetries(part))
+        counts: dict[str, Any] = {"false_positives": num_false, "num_symmetries": num_symmetries}
         if len(errors.add) == 0:
-            return PoseRow(
-                part.name, method, 0, false_positives=num_false, num_symmetries=num_symmetries
-            )
+            return PoseRow(part.name, method, 0, **counts)
         row = summarise(
             part.name, method, part.diameter, errors.add, errors.add_s, errors.mssd,
             errors.rotation_deg, errors.rotation_s_deg, num_symmetries,
@@ -263,7 +248,7 @@ def _table(state: list[Tensor], width: int) -> Float[Tensor, "rows columns"]:
     return flat.detach().cpu().double().reshape(-1, width)
 
 
-def _camera(K: Float[np.ndarray, "3 3"] | None, width: float | None) -> Float[np.ndarray, "10"]:
+def _camera(K: CameraMatrix | None, width: float | None) -> Float[np.ndarray, "10"]:
     """Return K and the width in a row, NaN where they are not given."""
     if K is None and width is None:
         return np.full(10, np.nan)

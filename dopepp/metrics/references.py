@@ -48,10 +48,7 @@ def reference_rows(
 ) -> dict[str, PoseRow]:
     """Compute the three reference rows of one part on one test set.
 
-    Args:
-        part: The part.
-        T_cam_obj: True poses of its instances that count.
-        seed: Seed of the draws; the same seed gives the same rows.
+    The true poses are of its instances that count. The same seed gives the same draws.
 
     Returns:
         The rows by name, in the order of :data:`REFERENCES`. Without instances their measures are

@@ -148,16 +148,8 @@ def summarise(
 ) -> PoseRow:
     """Fill the measures that follow from the errors of N >= 1 poses alone.
 
-    Args:
-        name: The part's name.
-        method: What produced the poses.
-        diameter: The part's diameter, metres.
-        add: ADD of each pose, metres, infinite for a miss.
-        add_s: ADD-S, likewise.
-        mssd: MSSD, likewise.
-        rotation_deg: Rotation error of each pose, degrees, infinite for a miss.
-        rotation_s_deg: That to the nearest symmetry, likewise.
-        num_symmetries: Transforms that map the part onto itself, the identity among them.
+    The errors are of each pose, infinite for a miss: metres and degrees. ``rotation_s_deg`` is to
+    the nearest symmetry; symmetries count with the identity.
     """
     return PoseRow(
         object=name,

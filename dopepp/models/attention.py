@@ -9,21 +9,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
-from dopepp.models.layers import initialise
+from dopepp.models.layers import Features, initialise
 
 
 class Attention(nn.Module, ABC):
     """A module that re-weights feature maps without changing their shape."""
 
     @abstractmethod
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch channels height width"]:
+    def forward(self, features: Features) -> Features:
         """Return the re-weighted features."""
 
 
@@ -33,9 +30,7 @@ class Identity(Attention):
     def __init__(self, channels: int) -> None:
         super().__init__()
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch channels height width"]:
+    def forward(self, features: Features) -> Features:
         """Return the features."""
         return features
 
@@ -43,12 +38,8 @@ class Identity(Attention):
 class SE(Attention):
     """Squeeze-and-excitation (Hu et al. 2018): features · σ(MLP(mean over the map)).
 
-    Args:
-        channels: Channels of the features.
-        reduction: Factor by which the MLP's hidden layer is narrower.
-
-    Raises:
-        UserError: ``reduction`` is out of range.
+    The MLP's hidden layer is narrower by the factor ``reduction``; one that is out of range is a
+    :class:`UserError`.
     """
 
     def __init__(self, channels: int, reduction: int = 16) -> None:
@@ -56,9 +47,7 @@ class SE(Attention):
         self.mlp = _bottleneck(channels, reduction)
         initialise(self)
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch channels height width"]:
+    def forward(self, features: Features) -> Features:
         """Return the features weighted by channel."""
         weights: Tensor = self.mlp(features.mean(dim=(2, 3))).sigmoid()
         return features * weights[:, :, None, None]
@@ -70,13 +59,8 @@ class CBAM(Attention):
     Channel: features · σ(MLP(mean) + MLP(maximum)) over the map, one MLP for both (Eq. 5). Place:
     features · σ(conv([mean; maximum])) over the channels (Eq. 6).
 
-    Args:
-        channels: Channels of the features.
-        reduction: Factor by which the MLP's hidden layer is narrower.
-        kernel_size: Side of the spatial convolution, odd; the paper's is 3.
-
-    Raises:
-        UserError: An argument is out of range.
+    The MLP's hidden layer is narrower by the factor ``reduction``; the side of the spatial
+    convolution is odd, the paper's is 3. What is out of range is a :class:`UserError`.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:
@@ -87,9 +71,7 @@ class CBAM(Attention):
         self.spatial = nn.Conv2d(2, 1, kernel_size, padding=kernel_size // 2, bias=False)
         initialise(self)
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch channels height width"]:
+    def forward(self, features: Features) -> Features:
         """Return the features weighted by channel and by place."""
         squeezed = self.mlp(features.mean(dim=(2, 3))) + self.mlp(features.amax(dim=(2, 3)))
         features = features * squeezed.sigmoid()[:, :, None, None]

@@ -18,6 +18,8 @@ from dopepp.core.errors import UserError
 from dopepp.models.checkpoint.storage import read_mapping
 from dopepp.models.layers import conv_block, initialise, scaled_channels
 
+Images = Float[Tensor, "batch 3 height width"]
+
 POOL: Final = "pool"
 
 
@@ -33,9 +35,7 @@ class Backbone(nn.Module, ABC):
     stride: int = 8
 
     @abstractmethod
-    def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
-    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
         """Return the feature maps of normalised images."""
 
 
@@ -47,10 +47,8 @@ class VGG19(Backbone):
         batch_norm: Put batch norm behind every convolution, in place of its bias.
         weights_path: A ``state_dict`` of torchvision's ``vgg19`` (keys ``features.N.weight`` and
             ``features.N.bias``) to start the VGG layers from. It is where training starts, not part
-            of the architecture, so checkpoints do not repeat it.
-
-    Raises:
-        UserError: An argument is out of range, or the weights do not fit.
+            of the architecture, so checkpoints do not repeat it. What does not fit is a
+            :class:`UserError`.
     """
 
     plan: ClassVar[tuple[int | str, ...]] = (
@@ -87,9 +85,7 @@ class VGG19(Backbone):
                 )
             self._load_pretrained(weights_path)
 
-    def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
-    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
         """Return the feature maps of normalised images."""
         return self.layers(images)  # type: ignore[no-any-return]
 
@@ -128,12 +124,8 @@ class DSC(Backbone):
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
     each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels.
 
-    Args:
-        width: Factor on every channel count; 1 is the paper's.
-        batch_norm: Put batch norm behind every convolution, in place of its bias.
-
-    Raises:
-        UserError: An argument is out of range.
+    ``width`` is a factor on every channel count, 1 is the paper's; batch norm stands behind every
+    convolution, in place of its bias. What is out of range is a :class:`UserError`.
     """
 
     plan: ClassVar[tuple[int | str, ...]] = (
@@ -160,8 +152,6 @@ class DSC(Backbone):
         self.out_channels = channels
         initialise(self)
 
-    def forward(
-        self, images: Float[Tensor, "batch 3 height width"]
-    ) -> Float[Tensor, "batch channels height/8 width/8"]:
+    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
         """Return the feature maps of normalised images."""
         return self.layers(images)  # type: ignore[no-any-return]

@@ -17,11 +17,11 @@ from torch.nn import functional
 from dopepp.core.checks import check_flag, check_integer
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.models.layers import conv_block, find_activation, initialise, scaled_channels
+from dopepp.models.layers import Features, conv_block, find_activation, initialise, scaled_channels
 
-Stage: TypeAlias = tuple[
-    Float[Tensor, "batch 9*objects height width"], Float[Tensor, "batch 16*objects height width"]
-]
+BeliefMaps = Float[Tensor, "batch 9*objects height width"]
+FieldMaps = Float[Tensor, "batch 16*objects height width"]
+Stage: TypeAlias = tuple[BeliefMaps, FieldMaps]
 """Belief logits and vector field of one stage."""
 
 MAX_STAGES: Final = 12
@@ -41,9 +41,7 @@ class Branch(nn.Module, ABC):
         """The convolutions that answer maps."""
 
     @abstractmethod
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> list[Float[Tensor, "batch out_channels height width"]]:
+    def forward(self, features: Features) -> list[Features]:
         """Return the branch's maps as the last; before them, what else is to be learned from."""
 
 
@@ -57,14 +55,11 @@ class Head(nn.Module):
         in_channels: Channels of the features.
         num_objects: Number of objects C; 9·C belief and 16·C field channels.
         activation: Name of the belief activation.
-        stages: Number of stages.
+        stages: Number of stages; one out of range is a :class:`UserError`, like the other numbers.
         make_branch: Called with input channels, output channels and the stage's number (from 0).
 
     Attributes:
         cell_multiple: The feature map's height and width must be multiples of this.
-
-    Raises:
-        UserError: An argument is out of range.
     """
 
     cell_multiple: int = 1
@@ -98,7 +93,7 @@ class Head(nn.Module):
                 nn.init.normal_(output.weight, std=_OUTPUT_STD)
                 nn.init.constant_(cast(Tensor, output.bias), bias)
 
-    def forward(self, features: Float[Tensor, "batch channels height width"]) -> list[Stage]:
+    def forward(self, features: Features) -> list[Stage]:
         """Return every stage's belief logits and vector field, the head's answer as the last."""
         stages: list[Stage] = []
         for belief_branch, field_branch in zip(
@@ -119,16 +114,9 @@ class Cascade(Head):
     Stage 1: three 3×3 convolutions (128), 1×1 to 512, 1×1 to the maps. Later stages: five 7×7
     (128), 1×1 (128), 1×1 to the maps. ReLU after all but the last.
 
-    Args:
-        in_channels: Channels of the features.
-        num_objects: Number of objects.
-        activation: Name of the belief activation.
-        stages: Number of stages, 1–12; DOPE's are 6.
-        width: Factor on the channel counts; 1 is the paper's.
-        batch_norm: Put batch norm behind every convolution but the last, in place of its bias.
-
-    Raises:
-        UserError: An argument is out of range.
+    ``stages`` are 1–12, DOPE's are 6; ``width`` is a factor on the channel counts, 1 is the
+    paper's; batch norm stands behind every convolution but the last, in place of its bias. What is
+    out of range is a :class:`UserError`.
     """
 
     def __init__(
@@ -162,9 +150,7 @@ class CascadeBranch(nn.Sequential, Branch):
         """The last layer."""
         return [cast(nn.Conv2d, self[-1])]
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> list[Float[Tensor, "batch out_channels height width"]]:
+    def forward(self, features: Features) -> list[Features]:
         """Return the maps."""
         return [super().forward(features)]  # type: ignore[no-untyped-call]
 
@@ -182,9 +168,6 @@ class MultiScale(Head):
         maps: What the three scales hand to the fusion: ``plain`` for maps of 9 or 16 channels each,
             as §3.3 has them; ``learned`` for the same, and each scale's maps are answers of their
             own, before the fused ones, that the loss sees as well; None for features.
-
-    Raises:
-        UserError: An argument is out of range.
     """
 
     cell_multiple = 4
@@ -217,23 +200,11 @@ class MultiScaleBranch(Branch):
     of the three with stride 2). Up: convset at a quarter, 1×1, ×2 nearest, concatenated with the
     half scale; the same again into full scale; convset; 1×1 to the maps. ReLU after every
     convolution but those of maps: without one between them a convset's five would be one linear
-    map.
-
-    Args:
-        in_channels: Channels in.
-        channels: Channels inside.
-        out_channels: Channels of the maps.
-        batch_norm: As in :class:`MultiScale`.
-        maps: Likewise.
+    map. Maps and batch norm are as in :class:`MultiScale`.
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        channels: int,
-        out_channels: int,
-        batch_norm: bool,
-        maps: str | None,
+        self, in_channels: int, channels: int, out_channels: int, batch_norm: bool, maps: str | None
     ) -> None:
         super().__init__()
         self.learned = maps == "learned"
@@ -274,9 +245,7 @@ class MultiScaleBranch(Branch):
         scales = [self.down_quarter, self.down_half, self.down_full] if self.learned else []
         return [*(cast(nn.Conv2d, one[-1]) for one in scales), self.output]
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> list[Float[Tensor, "batch out_channels height width"]]:
+    def forward(self, features: Features) -> list[Features]:
         """Return the maps; height and width must be multiples of 4."""
         full = self.down_full(features)
         half = self.down_half(full)

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
 
+Features = Float[Tensor, "batch channels height width"]
+
 MIN_WIDTH: Final = 1 / 64
 MAX_WIDTH: Final = 4.0
 """Bounds of the width factor, so that a hostile spec cannot ask for unlimited memory."""
@@ -26,11 +28,7 @@ _CHANNEL_STEP: Final = 8
 
 
 def scaled_channels(channels: int, width: float) -> int:
-    """Scale a channel count by a width factor, rounded to a multiple of 8 and at least 8.
-
-    Raises:
-        UserError: The factor lies outside (0, 4].
-    """
+    """Scale a channel count by a factor in (0, 4], rounded to a multiple of 8 and at least 8."""
     width = check_number("width", width, MIN_WIDTH, MAX_WIDTH)
     return max(_CHANNEL_STEP, round(channels * width / _CHANNEL_STEP) * _CHANNEL_STEP)
 
@@ -81,19 +79,12 @@ def _exp(logits: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Activation:
-    """A belief activation.
-
-    Attributes:
-        function: Maps logits to beliefs, elementwise.
-        initial_logit: Bias that an untrained head starts from.
-    """
+    """A belief activation: elementwise, and the bias that an untrained head starts from."""
 
     function: Callable[[Tensor], Tensor]
     initial_logit: float
 
-    def __call__(
-        self, logits: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch channels height width"]:
+    def __call__(self, logits: Features) -> Features:
         """Turn belief logits into belief maps."""
         return self.function(logits)
 
@@ -109,13 +100,8 @@ ACTIVATIONS: Final[Mapping[str, Activation]] = {
 
 
 def find_activation(name: object) -> Activation:
-    """Return an activation by name.
-
-    Raises:
-        UserError: There is none of that name.
-    """
+    """Return an activation by name; a :class:`UserError` if there is none of that name."""
     if not isinstance(name, str) or name not in ACTIVATIONS:
-        raise UserError(
-            f"activation {name!r:.100}", ", ".join(ACTIVATIONS), "use the one your loss publishes"
-        )
+        fix = "use the one your loss publishes"
+        raise UserError(f"activation {name!r:.100}", ", ".join(ACTIVATIONS), fix)
     return ACTIVATIONS[name]

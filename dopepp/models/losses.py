@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dopepp.core.checks import check_number
-from dopepp.models.heads import Stage
+from dopepp.models.heads import BeliefMaps, FieldMaps, Stage
 
 
 class MapLoss(nn.Module, ABC):
@@ -31,47 +31,36 @@ class MapLoss(nn.Module, ABC):
     @abstractmethod
     def parts(
         self,
-        logits: Float[Tensor, "batch 9*objects height width"],
-        field: Float[Tensor, "batch 16*objects height width"],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        logits: BeliefMaps,
+        field: FieldMaps,
+        belief_target: BeliefMaps,
+        field_target: FieldMaps,
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's weighted terms of each image; the loss is the mean of their sums."""
 
     def forward(
-        self,
-        stages: Sequence[Stage],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
     ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
         """Return the loss and its terms, detached; each is summed over the stages.
 
         The terms are computed in float32 also under autocast: sums over exponentials lose their
         digits in 16 bits.
         """
-        terms = {
-            name: value.mean()
-            for name, value in self._summed(stages, belief_target, field_target).items()
-        }
+        summed = self._summed(stages, belief_target, field_target)
+        terms = {name: value.mean() for name, value in summed.items()}
         total = torch.stack(list(terms.values())).sum()
         return total, {name: value.detach() for name, value in terms.items()}
 
     @torch.no_grad()
     def per_image(
-        self,
-        stages: Sequence[Stage],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
     ) -> Float[Tensor, "batch"]:
         """Return each image's loss, to choose among targets that are equally right."""
         terms = self._summed(stages, belief_target, field_target)
         return torch.stack(list(terms.values())).sum(dim=0)
 
     def _summed(
-        self,
-        stages: Sequence[Stage],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return the terms of each image, summed over the stages."""
         terms: dict[str, Tensor] = {}
@@ -92,10 +81,10 @@ class MapMSE(MapLoss):
 
     def parts(
         self,
-        logits: Float[Tensor, "batch 9*objects height width"],
-        field: Float[Tensor, "batch 16*objects height width"],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        logits: BeliefMaps,
+        field: FieldMaps,
+        belief_target: BeliefMaps,
+        field_target: FieldMaps,
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's ``belief`` and ``field`` terms of each image."""
         return {
@@ -123,14 +112,10 @@ class SpatialCrossEntropy(MapLoss):
     plateau: an all-zero map is nearly as good as any. The *where* term does not see how large the
     beliefs are, only which cells have them, so it pulls from the first step on.
 
-    Args:
-        sigma: Standard deviation of the target's Gaussians, cells.
-        count_weight: Weight of the *how much* term.
-        field_weight: Weight of the field term: smooth L1 per cell inside the keypoints' discs,
-            the only place where the field is defined and read.
-
-    Raises:
-        UserError: An argument is out of range.
+    ``sigma`` is the standard deviation of the target's Gaussians, cells. ``count_weight`` is of the
+    *how much* term, ``field_weight`` of the field's: smooth L1 per cell inside the keypoints'
+    discs, the only place where the field is defined and read. What is out of range is a
+    :class:`UserError`.
     """
 
     activation = "exp"
@@ -144,10 +129,10 @@ class SpatialCrossEntropy(MapLoss):
 
     def parts(
         self,
-        logits: Float[Tensor, "batch 9*objects height width"],
-        field: Float[Tensor, "batch 16*objects height width"],
-        belief_target: Float[Tensor, "batch 9*objects height width"],
-        field_target: Float[Tensor, "batch 16*objects height width"],
+        logits: BeliefMaps,
+        field: FieldMaps,
+        belief_target: BeliefMaps,
+        field_target: FieldMaps,
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's ``where``, ``count`` and ``field`` terms of each image."""
         z, g = logits.flatten(2), belief_target.flatten(2)

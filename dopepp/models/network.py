@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 import torch
-from jaxtyping import Float, Num
+from jaxtyping import Num
 from torch import Tensor, nn
 from torch.func import functional_call
 from torch.utils.flop_counter import FlopCounterMode
@@ -19,6 +19,8 @@ from dopepp.models.attention import Attention
 from dopepp.models.backbones import Backbone
 from dopepp.models.heads import Head, Stage
 from dopepp.models.layers import find_activation
+
+Images = Num[Tensor, "batch 3 height width"]
 
 # ImageNet's statistics, which torchvision's weights expect, on the 0–255 scale.
 _MEAN: Final = tuple(255 * value for value in (0.485, 0.456, 0.406))
@@ -64,14 +66,11 @@ class PoseNetwork(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, images: Num[Tensor, "batch 3 height width"]) -> list[Stage]:
+    def forward(self, images: Images) -> list[Stage]:
         """Return the belief logits and vector field of every stage.
 
-        Args:
-            images: RGB, 0–255, uint8 or floating point.
-
-        Raises:
-            UserError: The images' shape does not fit the network.
+        Images are RGB, 0–255, uint8 or floating point; of a shape that does not fit the network
+        they are a :class:`UserError`.
         """
         height, width = images.shape[-2:]
         fits = images.ndim == 4 and images.shape[1] == 3
@@ -84,12 +83,7 @@ class PoseNetwork(nn.Module):
         normalised = (images.to(self.mean.dtype) - self.mean) / self.std
         return self.head(self.attention(self.backbone(normalised)))  # type: ignore[no-any-return]
 
-    def maps(
-        self, images: Num[Tensor, "batch 3 height width"]
-    ) -> tuple[
-        Float[Tensor, "batch 9*objects height/8 width/8"],
-        Float[Tensor, "batch 16*objects height/8 width/8"],
-    ]:
+    def maps(self, images: Images) -> Stage:
         """Return the last stage's belief maps (after the activation) and vector field."""
         logits, field = self(images)[-1]
         return self.activate(logits), field
@@ -102,12 +96,8 @@ def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, 
     takes milliseconds and leaves the network and its batch-norm statistics alone. Convolutions and
     matrix products are counted; what is done per element (normalisation, activation) is not.
 
-    Args:
-        network: A network that takes images (1, 3, height, width).
-        input_size: Image (width, height), pixels.
-
-    Returns:
-        Number of parameters, and GMACs (10⁹ multiply–accumulates, half the GFLOPs).
+    Returns the number of parameters, and GMACs (10⁹ multiply–accumulates, half the GFLOPs) of an
+    image of (width, height) pixels.
     """
     tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
     shapes = {name: tensor.to("meta") for name, tensor in tensors.items()}

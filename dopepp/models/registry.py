@@ -39,19 +39,13 @@ class Registry(Generic[T]):
     @classmethod
     def of_module(cls, kind: str, base: type[T], module: ModuleType) -> Registry[T]:
         """Allow the public classes that ``module`` itself defines below ``base``."""
-        return cls(
-            kind,
-            base,
-            (
-                f"{module.__name__}.{name}"
-                for name, value in vars(module).items()
-                if inspect.isclass(value)
-                and issubclass(value, base)
-                and value is not base
-                and value.__module__ == module.__name__
-                and not name.startswith("_")
-            ),
-        )
+        own = {
+            name: value
+            for name, value in vars(module).items()
+            if inspect.isclass(value) and value.__module__ == module.__name__ and name[0] != "_"
+        }
+        allowed = (name for name, one in own.items() if issubclass(one, base) and one is not base)
+        return cls(kind, base, (f"{module.__name__}.{name}" for name in allowed))
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -61,8 +55,7 @@ class Registry(Generic[T]):
     def register(self, dotted: str) -> None:
         """Allow one more class; it is checked now, so a wrong name fails where it was written.
 
-        Raises:
-            UserError: The name does not lead to a class of this registry's kind.
+        A name that does not lead to a class of this registry's kind is a :class:`UserError`.
         """
         self._load(dotted)
         self._targets.add(dotted)
@@ -70,9 +63,8 @@ class Registry(Generic[T]):
     def resolve(self, dotted: object) -> type[T]:
         """Return the class that an allowed name stands for.
 
-        Raises:
-            UserError: The name is not text or not in the allow-list, or it leads to something other
-                than the class that the allow-list names.
+        A :class:`UserError`: the name is not text or not in the allow-list, or it leads to
+        something other than the class that the allow-list names.
         """
         if not isinstance(dotted, str) or dotted not in self._targets:
             raise UserError(
@@ -85,13 +77,9 @@ class Registry(Generic[T]):
     def build(self, node: object, **provided: Any) -> T:
         """Build a node's object.
 
-        Args:
-            node: ``{"_target_": dotted name, argument: plain value, …}``.
-            **provided: Arguments that the caller sets; the node may not repeat them.
-
-        Raises:
-            UserError: The target is refused, an argument is unknown, missing, nested or provided
-                twice, or the class refuses a value.
+        The node is ``{"_target_": dotted name, argument: plain value, …}``; it may not repeat what
+        the caller provides. A :class:`UserError`: the target is refused, an argument is unknown,
+        missing, nested or provided twice, or the class refuses a value.
         """
         if not isinstance(node, Mapping):
             raise UserError(
@@ -158,17 +146,13 @@ class Registry(Generic[T]):
         for key, value in arguments.items():
             unknown = key not in free and (not open_ended or key in provided)
             if not isinstance(key, str) or key.startswith("_") or unknown:
-                raise UserError(
-                    f"argument {key!r:.100} of {dotted}", allowed, "remove or rename it"
-                )
+                got = f"argument {key!r:.100} of {dotted}"
+                raise UserError(got, allowed, "remove or rename it")
             _check_plain(value, f"{dotted}, argument {key}")
-        missing = [
-            name for name in free if name not in arguments and named[name].default is inspect._empty
-        ]
-        if missing:
-            raise UserError(
-                f"{dotted} without {', '.join(missing)}", allowed, f"give {', '.join(missing)}"
-            )
+        empty = inspect.Parameter.empty
+        needed = [name for name in free if named[name].default is empty]
+        if missing := ", ".join(name for name in needed if name not in arguments):
+            raise UserError(f"{dotted} without {missing}", allowed, f"give {missing}")
 
 
 def _check_plain(value: object, where: str) -> None:
@@ -176,9 +160,8 @@ def _check_plain(value: object, where: str) -> None:
     if isinstance(value, Mapping):
         for key, item in value.items():
             if not isinstance(key, str) or key.startswith("_"):
-                raise UserError(
-                    f"key {key!r:.100} in {where}", "plain values", "nested targets are not built"
-                )
+                got = f"key {key!r:.100} in {where}"
+                raise UserError(got, "plain values", "nested targets are not built")
             _check_plain(item, where)
     elif isinstance(value, (list, tuple)):
         for item in value:

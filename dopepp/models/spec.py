@@ -27,20 +27,14 @@ SPEC_KEYS = ("backbone", "attention", "head", "activation", "num_objects")
 
 
 def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
-    """Build the network that a spec describes.
+    """Build the network that a spec describes (:mod:`dopepp.models.registry` for its nodes).
 
-    Args:
-        spec: ``{"backbone": node, "attention": node, "head": node, "activation": name,
-            "num_objects": C}``; see :mod:`dopepp.models.registry` for nodes.
-
-    Raises:
-        UserError: A key is missing or unknown, a target is not allowed, or an argument is.
+    A :class:`UserError`: a key is missing or unknown, a target is not allowed, or an argument is.
     """
     if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
         got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
-        raise UserError(
-            f"a model spec with {got}", f"exactly {', '.join(SPEC_KEYS)}", "add or remove keys"
-        )
+        keys = f"exactly {', '.join(SPEC_KEYS)}"
+        raise UserError(f"a model spec with {got}", keys, "add or remove keys")
     activation, num_objects = spec["activation"], spec["num_objects"]
     find_activation(activation)
     check_integer("num_objects", num_objects, 1, heads.MAX_OBJECTS)

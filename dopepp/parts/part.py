@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
@@ -128,6 +129,9 @@ class Part:
 
 FIELDS: Final = tuple(field.name for field in fields(Part) if field.name != "mesh")
 """Of a part's record: all but the mesh."""
+
+
+Parts = Sequence[Part]
 
 
 def make_part(

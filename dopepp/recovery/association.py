@@ -70,13 +70,9 @@ def direction_evidence(
     The angle's likelihood is taken over that of any angle, so that a vector without a direction
     speaks for nobody. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
 
-    Args:
-        peaks: Of one object.
-        max_angle: Largest angle at which a corner may belong to a centroid, radians.
-        coincident_px: A corner this close to the centroid has no direction; any angle will do.
-
-    Returns:
-        Log-likelihood ratios; −∞ where a pair is not allowed.
+    At most ``max_angle`` (radians) may lie between them for a corner to belong to a centroid; one
+    within ``coincident_px`` of it has no direction, and any angle will do. Returned are
+    log-likelihood ratios; −∞ where a pair is not allowed.
     """
     evidence = np.empty((len(peaks.centroid), *peaks.score.shape))
     _direction_evidence(
@@ -159,11 +155,8 @@ def associate(
     belief and direction, and that of the distance from where the instance's other corners put it.
     The latter binds the corners together. A peak that nothing speaks for stays alone.
 
-    Args:
-        peaks: Of one object.
-        evidence: From :func:`direction_evidence`.
-        expected: Where poses found before put the corners, pixels; NaN for an instance without
-            a pose. Before there are any, triples of corners predict the others.
+    ``expected`` is where poses found before put the corners, pixels; NaN for an instance without a
+    pose. Before there are any, triples of corners predict the others.
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:

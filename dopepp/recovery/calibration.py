@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dopepp.geometry.camera import project, project_keypoints, transform
-from dopepp.geometry.cuboid import NUM_CORNERS
+from dopepp.geometry.camera import CameraMatrix, project, project_keypoints, transform
+from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.options import DISTANCE_FACTORS, FEATURES, RecoveryOptions
 
@@ -50,10 +50,7 @@ _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
 
 
 def calibrated(
-    detection: Detection,
-    cuboid: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
-    options: RecoveryOptions,
+    detection: Detection, cuboid: Cuboid, K: CameraMatrix, options: RecoveryOptions
 ) -> Detection:
     """Return a detection at its corrected distance, with its score.
 
@@ -76,9 +73,7 @@ def fit_distance_factor(
 ) -> float:
     """Return the median ratio of true to estimated distance; 1 where there are no poses.
 
-    Args:
-        estimated: Object-to-camera transforms found with a factor of 1.
-        true: Those of the instances that they found.
+    The estimated object-to-camera transforms were found with a factor of 1.
     """
     if not len(estimated):
         return 1.0
@@ -87,15 +82,9 @@ def fit_distance_factor(
 
 
 def detection_features(
-    detection: Detection, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
+    detection: Detection, cuboid: Cuboid, K: CameraMatrix
 ) -> Float[np.ndarray, "features"]:
-    """Return the features of one detection.
-
-    Args:
-        detection: Anything but its score is read.
-        cuboid: The object's nine keypoints, metres.
-        K: Camera matrix of the image that the detection's pixels belong to.
-    """
+    """Return the features of one detection, of which anything but the score is read."""
     T, corners = detection.T_cam_obj, cuboid[:NUM_CORNERS]
     size = float(np.linalg.norm(np.ptp(corners, axis=0)))
     pixels = project(transform(T, corners), K)
@@ -127,12 +116,8 @@ def fit_weights(
 ) -> Float[np.ndarray, "features"]:
     """Fit the weights by maximum likelihood (Newton's method), slightly held back.
 
-    Args:
-        features: One row per detection.
-        correct: Whether it is right; one without an instance is not.
-
-    Raises:
-        ValueError: There are no detections, or none of them is right, or all are.
+    A detection without an instance is not correct. A ``ValueError``: there are no detections, or
+    none of them is right, or all are.
     """
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():

@@ -47,16 +47,12 @@ def predict(
 ) -> tuple[Float[np.ndarray, "instances 8 2"], Float[np.ndarray, "instances"]]:
     """Find for each centroid the corners that the most and likeliest peaks agree on.
 
-    Args:
-        position: Peaks of each corner, pixels.
-        evidence: Log-likelihood ratio of each peak to belong to each centroid; −∞ if it cannot.
-        centroids: Their positions, pixels.
-        deviation_px: Of a peak from where it should be, besides perspective.
-        area_px: Where a peak that belongs to nobody may lie.
+    Evidence is the log-likelihood ratio of each peak to belong to each centroid, −∞ if it cannot.
+    ``deviation_px`` is of a peak from where it should be, besides perspective; one that belongs to
+    nobody may lie anywhere on ``area_px``.
 
-    Returns:
-        The corners' expected positions, NaN where no three peaks have a say, and the standard
-        deviation from them, pixels.
+    Returned are the corners' expected positions, NaN where no three peaks have a say, and the
+    standard deviation from them, pixels.
     """
     order = np.argsort(-evidence, axis=-1)[..., :CANDIDATES]
     likeliest = np.take_along_axis(evidence, order, axis=-1)

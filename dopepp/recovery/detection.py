@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.camera import project_keypoints
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
@@ -57,7 +57,7 @@ class Detection:
     object: str
     score: float
     belief: float
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     keypoints: Float[np.ndarray, "9 2"]
     peaks: Float[np.ndarray, "9 2"]
     reprojection_error_px: float
@@ -69,13 +69,8 @@ def peaks_of_object(
 ) -> ObjectPeaks:
     """Pick the peaks of one object on one image; those at the border are less certain.
 
-    Args:
-        peaks: Of a batch of images.
-        image: Which image.
-        number: Which object.
-        threshold: Belief below which a centroid is no instance.
-        cells: Width and height of the maps.
-        stride: Input pixels per cell.
+    Below the belief ``threshold`` a centroid is no instance; ``cells`` are the maps' width and
+    height.
     """
     first = number * NUM_KEYPOINTS
     corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
@@ -107,8 +102,8 @@ def _covariance_px(
 
 def pose_instances(
     peaks: ObjectPeaks,
-    cuboid: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
+    cuboid: Cuboid,
+    K: CameraMatrix,
     options: RecoveryOptions,
     coincident_px: float,
 ) -> list[tuple[KeypointGroup, PnPResult]]:
@@ -138,9 +133,7 @@ def pose_instances(
     return list(zip(groups, results, strict=True))
 
 
-def solve_group(
-    group: KeypointGroup, cuboid: Float[np.ndarray, "9 3"], K: Float[np.ndarray, "3 3"]
-) -> PnPResult:
+def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPResult:
     """Solve PnP with each keypoint weighted by its own covariance.
 
     A covariance is averaged over its directions. How wide a network's peak is tells how far it is
@@ -149,11 +142,6 @@ def solve_group(
 
     A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
     agree on a pose, the deviations are widened and the pose solved again.
-
-    Args:
-        group: The instance's keypoints.
-        cuboid: The object's nine keypoints, metres.
-        K: Camera matrix of the network's input, pixels.
     """
     covariance = _averaged(group.covariance_px)
     found = int(np.isfinite(group.position[:, 0]).sum())
@@ -175,11 +163,7 @@ def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 
 
 
 def make_detection(
-    group: KeypointGroup,
-    result: PnPResult,
-    cuboid: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
-    name: str,
+    group: KeypointGroup, result: PnPResult, cuboid: Cuboid, K: CameraMatrix, name: str
 ) -> Detection | None:
     """Turn one group into a detection where PnP finds a pose."""
     if result.T_cam_obj is None or result.covariance is None:

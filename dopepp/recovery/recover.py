@@ -8,22 +8,28 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.maps.encode import MapGeometry
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.maps.encode import Beliefs, Fields, MapGeometry
 from dopepp.maps.peaks import find_peaks
 from dopepp.recovery.association import ObjectPeaks
 from dopepp.recovery.calibration import calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
 from dopepp.recovery.options import RecoveryOptions
 
+Cuboids = Float[np.ndarray, "objects 9 3"]
+Cameras = Float[np.ndarray, "batch 3 3"]
+Belief = Float[Tensor, "beliefs height width"]
+Field = Float[Tensor, "fields height width"]
+
 __all__ = ["RecoveryOptions", "explain", "recover", "recover_batch"]
 
 
 def recover(
-    belief: Float[Tensor, "beliefs height width"],
-    field: Float[Tensor, "fields height width"],
-    cuboids: Float[np.ndarray, "objects 9 3"],
-    K: Float[np.ndarray, "3 3"],
+    belief: Belief,
+    field: Field,
+    cuboids: Cuboids,
+    K: CameraMatrix,
     stride: int = 8,
     names: Sequence[str] | None = None,
     **options: float,
@@ -39,8 +45,7 @@ def recover(
         names: The objects' names; their indices where not given.
         **options: Fields of :class:`RecoveryOptions`.
 
-    Returns:
-        Detections of all objects, best score first.
+    Returns the detections of all objects, best score first.
     """
     return recover_batch(
         belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, **options
@@ -48,32 +53,30 @@ def recover(
 
 
 def recover_batch(
-    belief: Float[Tensor, "batch beliefs height width"],
-    field: Float[Tensor, "batch fields height width"],
-    cuboids: Float[np.ndarray, "objects 9 3"],
-    K: Float[np.ndarray, "batch 3 3"],
+    belief: Beliefs,
+    field: Fields,
+    cuboids: Cuboids,
+    K: Cameras,
     stride: int = 8,
     names: Sequence[str] | None = None,
     **options: float,
 ) -> list[list[Detection]]:
     """Recover the poses on every image of a batch; see :func:`recover`.
 
-    Peaks are found and read on the maps' device; only they come to the host.
-
-    Raises:
-        ValueError: The channels do not match the number of cuboids, maps differ in size or have no
-            cells, or there are not as many cameras as images or names as objects.
-        UserError: An option is out of range.
+    Peaks are found and read on the maps' device; only they come to the host. A ``ValueError``: the
+    channels do not match the number of cuboids, maps differ in size or have no cells, or there are
+    not as many cameras as images or names as objects. A :class:`UserError`: an option is out of
+    range.
     """
     decoded = _decode(belief, field, cuboids, K, stride, names, options)
     return [detections for detections, _ in decoded]
 
 
 def explain(
-    belief: Float[Tensor, "beliefs height width"],
-    field: Float[Tensor, "fields height width"],
-    cuboids: Float[np.ndarray, "objects 9 3"],
-    K: Float[np.ndarray, "3 3"],
+    belief: Belief,
+    field: Field,
+    cuboids: Cuboids,
+    K: CameraMatrix,
     stride: int = 8,
     names: Sequence[str] | None = None,
     **options: float,
@@ -85,10 +88,10 @@ def explain(
 
 
 def _decode(
-    belief: Float[Tensor, "batch beliefs height width"],
-    field: Float[Tensor, "batch fields height width"],
-    cuboids: Float[np.ndarray, "objects 9 3"],
-    K: Float[np.ndarray, "batch 3 3"],
+    belief: Beliefs,
+    field: Fields,
+    cuboids: Cuboids,
+    K: Cameras,
     stride: int,
     names: Sequence[str] | None,
     options: Mapping[str, float],
@@ -120,8 +123,8 @@ def _decode(
 
 def _recover_object(
     peaks: ObjectPeaks,
-    cuboid: Float[np.ndarray, "9 3"],
-    K: Float[np.ndarray, "3 3"],
+    cuboid: Cuboid,
+    K: CameraMatrix,
     name: str,
     options: RecoveryOptions,
     stride: int,
@@ -148,12 +151,7 @@ def _recover_object(
     return detections, reasons
 
 
-def _check_shapes(
-    belief: Float[Tensor, "batch beliefs height width"],
-    field: Float[Tensor, "batch fields height width"],
-    num_objects: int,
-    K: Float[np.ndarray, "batch 3 3"],
-) -> None:
+def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:
     expected = (num_objects * NUM_KEYPOINTS, num_objects * NUM_CORNERS * 2)
     if belief.ndim != 4 or field.ndim != 4 or 0 in belief.shape[2:]:
         raise ValueError(

@@ -81,11 +81,7 @@ class MetricsTable(Logger):
 
     @rank_zero_only
     def write(self) -> None:
-        """Write the file.
-
-        Raises:
-            OSError: It cannot be written.
-        """
+        """Write the file; an ``OSError`` if it cannot be written."""
         if not self._rows:
             return
         columns = sorted({name for row in self._rows.values() for name in row})
@@ -172,10 +168,7 @@ class GuardedLogger(Logger):
     def log_table(self, name: str, rows: Sequence[Mapping[str, str]], text: str) -> None:
         """Hand a table over: its rows to Weights & Biases, its Markdown text to TensorBoard.
 
-        Args:
-            name: What it is called there.
-            rows: Heading to text; the first one has all headings.
-            text: The same as Markdown.
+        The first row has all headings.
         """
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
@@ -194,11 +187,7 @@ class GuardedLogger(Logger):
             self.log_metrics(dict(figures))
 
     def close(self, failed: bool) -> None:
-        """End the run there: what is logged after this would be another one's.
-
-        Args:
-            failed: How the run ended.
-        """
+        """End the run there: what is logged after this would be another one's."""
         if isinstance(self.inner, WandbLogger):
             self._failed = False  # a run that failed midway has to end as well
             self.guard(lambda: _finish_wandb(failed))
@@ -210,9 +199,6 @@ def _finish_wandb(failed: bool) -> None:
     """End the run of Weights & Biases that is open; without one, do nothing.
 
     Where its service has died, so has the run; the next one starts a service of its own.
-
-    Raises:
-        OSError: The service has died.
     """
     import wandb  # takes a second, and few runs need it
 

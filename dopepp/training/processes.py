@@ -92,8 +92,7 @@ class WatchedLauncher(_SubprocessScriptLauncher):
     ) -> Any:
         """Start the other processes, then call the function.
 
-        Raises:
-            ProcessDiedError: Another process has died, so that the function has failed.
+        If that fails because another process has died, it is a :class:`ProcessDiedError`.
         """
         self.cluster_environment.validate_settings(self.num_processes, self.num_nodes)
         started_by = os.environ.pop(_STARTED_BY, None)

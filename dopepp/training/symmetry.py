@@ -39,9 +39,6 @@ class SymmetryOptions:
         canonical: Whether keypoints are those of the equivalent pose nearest the reference.
         border_deg: Equivalent poses whose angle to the reference is larger than the nearest's by
             less than this, degrees, are as good: the one with the least loss is learnt. 0: never.
-
-    Raises:
-        UserError: A value is out of range, or a border is given without ``canonical``.
     """
 
     canonical: bool = True

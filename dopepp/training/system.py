@@ -21,7 +21,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.data.batch import Batch
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.encode import Beliefs, Fields, MapGeometry
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
@@ -52,8 +52,8 @@ class ValidationOutput:
     """
 
     loss: Float[Tensor, ""]
-    belief: Float[Tensor, "batch beliefs height width"]
-    field: Float[Tensor, "batch fields height width"]
+    belief: Beliefs
+    field: Fields
 
 
 class PoseSystem(LightningModule):
@@ -114,12 +114,7 @@ class PoseSystem(LightningModule):
         An instance that is too little visible for a metric to count is left out. A symmetric part
         looks the same in several poses: the maps are of the one nearest a reference orientation
         (:mod:`~dopepp.training.symmetry`), or, where two are as good, of the one that the network
-        itself tends to.
-
-        Args:
-            batch: Images and poses.
-            stages: The network's answer to the images, which shows what it tends to; without it
-                the first of equally good poses is taken.
+        itself tends to, as its answer to the images shows (``stages``; without it, the first).
         """
         keypoints = batch.keypoints
         if self.symmetry.active:
@@ -135,9 +130,7 @@ class PoseSystem(LightningModule):
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         return loss  # type: ignore[no-any-return]
 
-    def validation_step(  # type: ignore[override]
-        self, batch: Batch, batch_idx: int
-    ) -> ValidationOutput:
+    def validation_step(self, batch: Batch, batch_idx: int) -> ValidationOutput:  # type: ignore[override]
         """Log the loss and hand the maps to the callbacks."""
         stages = self(batch.images)
         loss, _ = self.loss(stages, *self.targets(batch, stages))
@@ -163,10 +156,8 @@ class PoseSystem(LightningModule):
         configured: OptimizerLRScheduler = optimizer
         if self.make_scheduler is not None:
             scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
-            configured = {
-                "optimizer": optimizer,
-                "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-            }
+            schedule: Any = {"scheduler": scheduler, "interval": "step"}
+            configured = {"optimizer": optimizer, "lr_scheduler": schedule}
         # Only now: a schedule adds settings of its own.
         self._settings = [dict(group) for group in optimizer.param_groups]
         return configured
@@ -207,16 +198,14 @@ class PoseSystem(LightningModule):
         scheduled = {"lr"} if self.trainer.lr_scheduler_configs else set()
         for optimizer in self.trainer.optimizers:
             for group, settings in zip(optimizer.param_groups, self._settings, strict=True):
-                cycled = {"momentum", "betas"} if "max_momentum" in settings else set()
-                group.update(
-                    {k: v for k, v in settings.items() if k not in {"params", *scheduled, *cycled}}
-                )
+                kept = {"params", *scheduled}
+                kept |= {"momentum", "betas"} if "max_momentum" in settings else set()
+                group.update({k: v for k, v in settings.items() if k not in kept})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Make the file self-describing: anybody can load it without this module or a config.
 
-        Raises:
-            RunError: The weights are not finite: no file gets them.
+        If the weights are not finite, no file gets them: a ``RunError``.
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload

@@ -9,15 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.data.batch import PADDING, Batch
-from dopepp.maps.encode import MapGeometry, encode
+from dopepp.maps.encode import Beliefs, Fields, MapGeometry, encode
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.training.symmetry import SymmetryHandling
 
-Targets = tuple[
-    Float[Tensor, "batch beliefs height width"], Float[Tensor, "batch fields height width"]
-]
+Targets = tuple[Beliefs, Fields]
 """Belief maps and vector fields as the network should give them."""
 
 
@@ -29,11 +27,7 @@ def draw_maps(
 ) -> Targets:
     """Draw the maps of the instances that are visible enough for a metric to count them.
 
-    Args:
-        batch: Images and how much of each instance is visible.
-        keypoints: Of the instances, pixels; those of the batch, or of poses that look alike.
-        num_objects: Number of objects.
-        geometry: Stride, peak width and disc radius of the maps.
+    Their keypoints, pixels, are those of the batch, or of poses that look alike.
     """
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
@@ -52,14 +46,8 @@ def choose_keypoints(
     """Return each instance's keypoints in the one of its look-alike poses that is to be learnt.
 
     That is the pose nearest the reference orientation. Where another one is as good, it is the one
-    whose maps the network's answer has the lower loss to; one instance is decided after the other.
-
-    Args:
-        batch: Images and poses.
-        stages: The network's answer; None for the nearest pose always.
-        symmetry: Which poses look alike.
-        loss: Compares the answer with maps.
-        geometry: Stride, peak width and disc radius of the maps.
+    whose maps the network's answer (``stages``) has the lower loss to; one instance is decided
+    after the other. Without an answer it is always the nearest.
     """
     found = symmetry.equivalents(batch)
     keypoints = found.keypoints[:, :, 0].clone()

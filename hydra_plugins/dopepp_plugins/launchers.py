@@ -15,10 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 class _RemoteLauncher(Launcher):
     """Hands jobs to :func:`dopepp.experiment.launch.jobs.launch`.
 
-    Args:
-        module: Of ``dopepp.experiment.launch``.
-        function: Its function that returns the runner.
-        *options: The function's arguments.
+    The function of the module, one of ``dopepp.experiment.launch``, returns the runner.
     """
 
     def __init__(self, module: str, function: str, *options: object) -> None:
@@ -60,8 +57,6 @@ class SlurmLauncher(_RemoteLauncher):
     """Jobs as a SLURM job array."""
 
     def __init__(self, folder: str, cluster: str, max_num_timeout: int, **sbatch: Any) -> None:
-        plain = {
-            key: OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-            for key, value in sbatch.items()
-        }
-        super().__init__("slurm", "on_slurm", folder, cluster, max_num_timeout, plain)
+        is_config, plain = OmegaConf.is_config, OmegaConf.to_container
+        given = {key: plain(one) if is_config(one) else one for key, one in sbatch.items()}
+        super().__init__("slurm", "on_slurm", folder, cluster, max_num_timeout, given)

@@ -27,10 +27,7 @@ OPTIMIZERS: Registry[Optimizer] = Registry(
 SCHEDULERS: Registry[LRScheduler] = Registry(
     "scheduler",
     LRScheduler,
-    (
-        f"torch.optim.lr_scheduler.{name}"
-        for name in ("CosineAnnealingLR", "LinearLR", "OneCycleLR")
-    ),
+    (f"torch.optim.lr_scheduler.{one}LR" for one in ("CosineAnnealing", "Linear", "OneCycle")),
 )
 MASKINGS: Registry[RandomMask] = Registry(
     "masking", RandomMask, ["dopepp.data.transforms.masking.RandomMask"]

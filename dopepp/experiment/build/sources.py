@@ -19,7 +19,6 @@ from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import Split
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
 from dopepp.experiment.build.splits import (
-    choose_backgrounds,
     held_out_renders,
     kept,
     labelled_images,
@@ -29,8 +28,8 @@ from dopepp.experiment.build.splits import (
 from dopepp.experiment.config.data import DataConfig
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ycb_part
-from dopepp.parts.part import Part
-from dopepp.virtual.backgrounds import Backgrounds
+from dopepp.parts.part import Part, Parts
+from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 
 _log = logging.getLogger(__name__)
 
@@ -47,11 +46,8 @@ PAPER_OBJECTS: Final = (
 def build_parts(data: DataConfig) -> list[Part]:
     """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
 
-    They have the symmetries that ``data.symmetries`` says.
-
-    Raises:
-        UserError: The root, an object or a part is wrong, or real frames are asked for without a
-            root.
+    They have the symmetries that ``data.symmetries`` says. A :class:`UserError` tells what is wrong
+    with root, objects or parts, or that real frames were asked for without a root.
     """
     return choose_symmetries(_read_parts(data), data.symmetries)
 
@@ -77,21 +73,18 @@ def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
     names = PAPER_OBJECTS if objects is None else objects
     unknown = [name for name in names if name not in classes]
     if unknown:
-        raise UserError(
-            f"data.objects with {unknown[0]!r}", ", ".join(classes), "choose from this list"
-        )
+        fix = "choose from this list"
+        raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
     return [ycb_part(root, name) for name in names]
 
 
-def build_datamodule(data: DataConfig, parts: Sequence[Part], seed: int) -> PoseDataModule:
+def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
     """Build training, validation and test data and say in one line where real frames are missing.
 
-    The seed is that of the training images; the others have ``data.eval_seed``.
-
-    Raises:
-        UserError: An option or a file is wrong.
+    The seed is that of the training images; the others have ``data.eval_seed``. A
+    :class:`UserError` tells which option or file is wrong.
     """
-    backgrounds = choose_backgrounds(data)
+    backgrounds = find_backgrounds(data.virtual.backgrounds)
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
         val=build_validation_source(data, parts),
@@ -107,24 +100,18 @@ def build_datamodule(data: DataConfig, parts: Sequence[Part], seed: int) -> Pose
     )
 
 
-def build_test_source(data: DataConfig, parts: Sequence[Part]) -> DescribedSource:
+def build_test_source(data: DataConfig, parts: Parts) -> DescribedSource:
     """Build the test images alone, at their native resolution."""
     return _held_out_source(data, parts, "test")
 
 
-def build_validation_source(data: DataConfig, parts: Sequence[Part]) -> DescribedSource:
+def build_validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
     """Build the validation images alone, at their native resolution."""
     return _held_out_source(data, parts, "val")
 
 
-def build_scaled_test_source(
-    data: DataConfig, parts: Sequence[Part], scale: float
-) -> DescribedSource:
-    """Build the scenes of the test images with a camera so many times as near.
-
-    Raises:
-        UserError: They are no renders.
-    """
+def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
+    """Build the test scenes, which must be renders, with a camera so many times as near."""
     if not data.is_rendered("test"):
         raise UserError(
             f"scale={scale:g} on the images in data.root={data.root}",
@@ -135,24 +122,20 @@ def build_scaled_test_source(
 
 
 def build_source_without_objects(
-    data: DataConfig, parts: Sequence[Part], split: Split, num_images: int
+    data: DataConfig, parts: Parts, split: Split, num_images: int
 ) -> DescribedSource:
     """Render what the network must be silent on: backgrounds, distractors and look-alike parts.
 
     They are the scenes of the validation or the test range, without the objects.
     """
     scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
-    empty = replace(
-        data,
-        virtual=replace(data.virtual, scene=scene),
-        num_val=num_images,
-        num_test=num_images,
-    )
+    virtual = replace(data.virtual, scene=scene)
+    empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
     return held_out_renders(empty, parts, split)
 
 
 def _train_source(
-    data: DataConfig, parts: Sequence[Part], seed: int, backgrounds: Backgrounds
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource:
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
@@ -185,7 +168,7 @@ def _train_source(
     )
 
 
-def _held_out_source(data: DataConfig, parts: Sequence[Part], split: Split) -> DescribedSource:
+def _held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Open labelled images where there is a root, else a range of renders that no other uses."""
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)

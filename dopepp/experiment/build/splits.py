@@ -5,7 +5,7 @@ To add a format, write a source and one function in :data:`FORMATS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +22,7 @@ from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.experiment.config.data import Cache, DataConfig
 from dopepp.geometry.camera import Letterbox
 from dopepp.parts.catalogue import load_part
-from dopepp.parts.part import Part
+from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
 from dopepp.virtual.presets.preset import Preset, customised_preset
@@ -31,24 +31,20 @@ _TRAINING_SHARE: Final = 0.8
 """Of the images of a folder that training shares with validation or test."""
 
 
-def labelled_images(
-    data: DataConfig, parts: Sequence[Part], seed: int, split: Split
-) -> DescribedSource:
+def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
     """Open a split's labelled images, which are in ``data.root``.
 
-    Raises:
-        UserError: The format is unknown, or the folder does not hold it.
+    A :class:`UserError`: the format is unknown, or the folder does not hold it.
     """
     assert data.root is not None
     if data.format not in FORMATS:
-        raise UserError(
-            f"data.format={data.format}", ", ".join(FORMATS), "choose the images' format"
-        )
+        formats = ", ".join(FORMATS)
+        raise UserError(f"data.format={data.format}", formats, "choose the images' format")
     return FORMATS[data.format](data, data.root, parts, seed, split)
 
 
 def synthetic_companions(
-    data: DataConfig, parts: Sequence[Part], seed: int, backgrounds: Backgrounds
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
 ) -> DescribedSource | None:
     """Open YCB-Video's own synthetic frames where its training list names any."""
     if data.root is None or data.format != "ycb_video":
@@ -78,7 +74,7 @@ def share_of(image_sets: Mapping[str, str], split: Split) -> tuple[float, float]
 
 
 def _ycb_video(
-    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Parts, seed: int, split: Split
 ) -> DescribedSource:
     """Open an image set of real frames, or the listed frames, the same for every split."""
     return YcbVideoSource(
@@ -87,9 +83,7 @@ def _ycb_video(
     )  # fmt: skip
 
 
-def _bop(
-    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
-) -> DescribedSource:
+def _bop(data: DataConfig, root: Path, parts: Parts, seed: int, split: Split) -> DescribedSource:
     return BopSource(
         root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
         targets=data.targets if split == "test" else None, read_depth=split == "test",
@@ -97,7 +91,7 @@ def _bop(
 
 
 def _webdataset(
-    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
+    data: DataConfig, root: Path, parts: Parts, seed: int, split: Split
 ) -> DescribedSource:
     return WebdatasetSource(
         root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
@@ -105,9 +99,7 @@ def _webdataset(
     )  # fmt: skip
 
 
-def _ndds(
-    data: DataConfig, root: Path, parts: Sequence[Part], seed: int, split: Split
-) -> DescribedSource:
+def _ndds(data: DataConfig, root: Path, parts: Parts, seed: int, split: Split) -> DescribedSource:
     return NddsSource(
         root / data.image_sets[split], parts, part_of=share_of(data.image_sets, split),
         classes=data.classes, read_depth=split == "test",
@@ -123,19 +115,18 @@ FORMATS: Final[dict[str, Callable[..., DescribedSource]]] = {
 """How the images of each format are opened."""
 
 
-def training_renders(data: DataConfig, parts: Sequence[Part], seed: int) -> DescribedSource:
+def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
     """Render at the size the network sees, which costs a fraction of the native one."""
     preset = choose_preset(data)
     box = Letterbox.fit((preset.width, preset.height), data.input_size)
-    factory = _factory(
-        data, parts, preset.resized(box.width, box.height), seed, data.virtual.renderer
-    )
+    small = preset.resized(box.width, box.height)
+    factory = _factory(data, parts, small, seed, data.virtual.renderer)
     source = RenderedSource(factory, data.samples_per_epoch)
     return kept(source, data, data.cache, data.input_size)
 
 
 def held_out_renders(
-    data: DataConfig, parts: Sequence[Part], split: Split, scale: float = 1.0
+    data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
 ) -> DescribedSource:
     """Render a range that no other split uses, at its native size, with parts of any scale."""
     renderer, count = data.virtual.renderer, data.num_val
@@ -150,14 +141,12 @@ def held_out_renders(
 def kept(
     source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
 ) -> DescribedSource:
-    """Put the chosen cache around a source.
-
-    Raises:
-        UserError: There is no room.
-    """
+    """Put the chosen cache around a source; a :class:`UserError` where there is no room."""
     if cache == "none":
         return source
-    folder = None if cache == "memory" else _cache_folder(data.cache_dir)
+    folder = None
+    if cache == "disk":
+        folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
     return CachedSource(source, input_size, folder, identity=code_hash())
 
 
@@ -167,23 +156,12 @@ def choose_preset(data: DataConfig) -> Preset:
     return customised_preset(name, data.virtual.scene or {})
 
 
-def choose_backgrounds(data: DataConfig) -> Backgrounds:
-    """Return the config's backgrounds."""
-    return find_backgrounds(data.virtual.backgrounds)
-
-
-def _factory(
-    data: DataConfig, parts: Sequence[Part], preset: Preset, seed: int, renderer: str
-) -> Factory:
+def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:
     return Factory(
         parts,
         preset,
         seed,
-        choose_backgrounds(data),
+        find_backgrounds(data.virtual.backgrounds),
         renderer=renderer,
         negatives=[load_part(name, data.unit) for name in data.virtual.negatives],
     )
-
-
-def _cache_folder(chosen: str | None) -> Path:
-    return cache_folder() / "renders" if chosen is None else Path(chosen)

@@ -32,10 +32,7 @@ from dopepp.training.system import PoseSystem
 
 
 def build_system(
-    config: RunConfig,
-    parts: list[Part],
-    fingerprint: str,
-    images: Mapping[str, Any] | None = None,
+    config: RunConfig, parts: list[Part], fingerprint: str, images: Mapping[str, Any] | None = None
 ) -> PoseSystem:
     """Build the network, its loss and its optimiser as the config names them.
 
@@ -71,10 +68,8 @@ def build_system(
 def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, Checkpoint]:
     """Build the chosen network and what it is to be trained for, its data left out.
 
-    Its spec is the chosen components, and what the loss and the objects decide.
-
-    Raises:
-        UserError: A choice or a threshold is wrong.
+    Its spec is the chosen components, and what the loss and the objects decide. A
+    :class:`UserError` tells which choice or threshold is wrong.
     """
     spec = {
         "backbone": config.model.backbone,
@@ -111,10 +106,8 @@ def _start_from(network: torch.nn.Module, path: Path) -> None:
 def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] = ()) -> Trainer:
     """Build Lightning's trainer with the config's callbacks.
 
-    Trackers are loggers besides the CSV table that is always on.
-
-    Raises:
-        UserError: A callback is wrong, or Lightning refuses an option.
+    Trackers are loggers besides the CSV table that is always on. A :class:`UserError`: a callback
+    is wrong, or Lightning refuses an option.
     """
     options, accelerator = config.trainer, config.trainer.accelerator
     if accelerator in ("auto", "gpu") and torch.cuda.is_available():
@@ -126,21 +119,18 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
     callbacks = [CALLBACKS.build(node) for node in config.callbacks.values()]
     if config.ema is not None:
         callbacks.append(AveragedWeights(config.ema))
-    arguments: dict[str, Any] = {
-        **options.lightning,
-        "accelerator": accelerator,
-        "devices": options.devices,
-        "num_nodes": options.num_nodes,
-        "strategy": _strategy(options),
-        "precision": precision,
-        "max_epochs": options.max_epochs,
-        "max_steps": options.max_steps,
-        "profiler": make_profiler(options.profiler, run_dir),
-    }
     table = MetricsTable(run_dir / "metrics.csv")
     try:
         return Trainer(
-            **arguments,
+            **options.lightning,
+            accelerator=accelerator,
+            devices=options.devices,
+            num_nodes=options.num_nodes,
+            strategy=_strategy(options),
+            precision=precision,  # type: ignore[arg-type]
+            max_epochs=options.max_epochs,
+            max_steps=options.max_steps,
+            profiler=make_profiler(options.profiler, run_dir),
             default_root_dir=run_dir,
             logger=[table, *trackers],
             callbacks=[*callbacks, RunProgress()],

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal
 
 from dopepp.core.errors import UserError
 from dopepp.data.sources.rendered import MAX_ITEMS, Split
-from dopepp.experiment.config.parse import Range, Seed, Share, parse
+from dopepp.experiment.config.parse import Node, Range, Seed, Share, parse
 
 Cache = Literal["none", "memory", "disk"]
 Count = Annotated[int, Range(1, MAX_ITEMS)]
@@ -130,10 +130,8 @@ class DataConfig:
     def of(cls, data: object, virtual: object) -> DataConfig:
         """Read both nodes; ``virtual`` None is one that says nothing.
 
-        ``data.virtual``, which earlier versions wrote beside ``virtual``, may repeat it.
-
-        Raises:
-            UserError: An option is unknown, missing, of a wrong type or out of range.
+        ``data.virtual``, which earlier versions wrote beside ``virtual``, may repeat it. A
+        :class:`UserError` tells which option is unknown, missing, of a wrong type or out of range.
         """
         if isinstance(data, Mapping):
             _check_size(data.get("input_size"))
@@ -145,22 +143,12 @@ class DataConfig:
         return self.root is None or (split == "test" and self.test.renderer is not None)
 
 
-def chosen_data(
-    data: Mapping[str, Any] | None,
-    virtual: Mapping[str, Any] | None,
-    stored: object,
-    source: str,
-) -> DataConfig:
+def chosen_data(data: Node | None, virtual: Node | None, stored: object, source: str) -> DataConfig:
     """Return the data to evaluate on: the checkpoint's, with what the user gives instead.
 
-    Args:
-        data: Given: whole, or options to change.
-        virtual: Given: whole, or options to change.
-        stored: What the checkpoint was trained on; it may be by anybody.
-        source: The checkpoint's path, for messages.
-
-    Raises:
-        UserError: Neither names the data, or one of them is wrong.
+    ``data`` and ``virtual`` are whole nodes or options to change. ``stored`` is what the checkpoint
+    of the path ``source`` was trained on; it may be by anybody. A :class:`UserError`: neither names
+    the data, or one of them is wrong.
     """
     given, base = data or {}, stored if isinstance(stored, dict) else {}
     whole = "name" in given  # a file of conf/data, not single options
@@ -184,11 +172,10 @@ def chosen_data(
 
 
 def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config that a checkpoint names, None where it names none.
+    """Return the data config that a checkpoint's description names, None where it names none.
 
-    Args:
-        description: What the checkpoint says about its data. Where it is older than
-            ``data.eval_seed``, held-out images were rendered with the training's own seed.
+    Where it is older than ``data.eval_seed``, held-out images were rendered with the training's
+    own seed.
     """
     config = description.get("config")
     if not isinstance(config, dict):

@@ -31,6 +31,9 @@ from dopepp.models.registry import TARGET
 
 T = TypeVar("T")
 
+Node = Mapping[str, Any]
+"""``{"_target_": …, argument: …}`` for a registry; without a target there is no such thing."""
+
 _WORDS: Final = {str: "text", int: "an integer", float: "a number", Path: "a path"}
 
 
@@ -49,15 +52,9 @@ Share = Annotated[float, Range(0, 1)]
 def parse(kind: type[T], given: object, name: str = "", **known: Any) -> T:
     """Build a dataclass from a plain mapping.
 
-    Args:
-        kind: The dataclass.
-        given: The mapping.
-        name: The node's dotted name, for messages; empty for the whole config.
-        known: Fields whose values the caller has.
-
-    Raises:
-        UserError: It is no mapping, an option is unknown or missing, or a value is not of its
-            field's type or outside of its range.
+    ``name`` is the node's dotted name, for messages, empty for the whole config; ``known`` are the
+    fields whose values the caller has. A :class:`UserError` tells what is no mapping, what is
+    unknown or missing, or whose value is not of its field's type or out of its range.
     """
     own = {one.name: one for one in fields(kind) if one.name not in known}  # type: ignore[arg-type]
     prefix, allowed = f"{name}." if name else "", ", ".join(own)

@@ -11,16 +11,13 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.data import DataConfig
-from dopepp.experiment.config.parse import Range, Seed, parse, with_present_names
+from dopepp.experiment.config.parse import Node, Range, Seed, parse, with_present_names
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.symmetry import SymmetryOptions
 
 T = TypeVar("T")
-
-Node = Mapping[str, Any]
-"""``{"_target_": …, argument: …}`` for a registry; without a target there is no such thing."""
 
 _MOST: Final = 10**6
 _MAX_EPOCHS: Final = 10**9
@@ -110,11 +107,7 @@ class TrainerConfig:
 
     @property
     def num_processes(self) -> int:
-        """Training processes, over all machines.
-
-        Raises:
-            UserError: ``devices`` means nothing.
-        """
+        """Training processes, over all machines; a :class:`UserError` if ``devices`` is wrong."""
         # Where torchrun has started this process, the others exist already.
         world_size = os.environ.get("WORLD_SIZE", "")
         outside = int(world_size) if world_size.isdecimal() else 1
@@ -133,11 +126,8 @@ class TrainerConfig:
             return 1 if on_cpu else torch.cuda.device_count()
         if type(devices) is int and devices > 0:
             return devices
-        raise UserError(
-            f"trainer.devices={self.devices}",
-            "a positive number, a list of devices, auto or -1",
-            "correct it",
-        )
+        allowed = "a positive number, a list of devices, auto or -1"
+        raise UserError(f"trainer.devices={self.devices}", allowed, "correct it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +159,8 @@ class LearningRateConfig:
 
     def __post_init__(self) -> None:
         if self.max_lr <= self.min_lr:
-            raise UserError(
-                f"lr_finder.max_lr={self.max_lr:g}",
-                f"above lr_finder.min_lr={self.min_lr:g}",
-                "widen the range",
-            )
+            allowed = f"above lr_finder.min_lr={self.min_lr:g}"
+            raise UserError(f"lr_finder.max_lr={self.max_lr:g}", allowed, "widen the range")
 
 
 @dataclass(frozen=True, kw_only=True)

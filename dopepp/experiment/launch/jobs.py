@@ -33,11 +33,8 @@ _IDLE_S: Final = 300
 class Jobs:
     """What the jobs of a multirun have in common; travels to the processes that run them.
 
-    Attributes:
-        context: Hydra's config loader and callbacks.
-        config: Of the multirun.
-        task: The entry point's function.
-        state: Hydra's global state.
+    That is Hydra's config loader and callbacks, the config of the multirun, the entry point's
+    function, and Hydra's global state.
     """
 
     context: HydraContext
@@ -83,14 +80,8 @@ def launch(
 ) -> list[JobReturn]:
     """Run jobs and wait for all of them; a lost one has failed, the others go on.
 
-    Args:
-        jobs: What they have in common.
-        overrides: Of each job.
-        first: Number of the first job.
-        run: Where they run.
-
-    Raises:
-        UserError: They cannot be run there.
+    ``overrides`` are of each job, ``first`` is the number of the first one. A :class:`UserError`:
+    they cannot be run there.
     """
     jobs.folder.mkdir(parents=True, exist_ok=True)
     numbered = {first + index: list(one) for index, one in enumerate(overrides)}
@@ -115,8 +106,7 @@ def _lost(folder: Path, error: Exception) -> JobReturn:
 def on_joblib(n_jobs: int) -> Runner:
     """Return a runner that keeps so many jobs going in processes of this machine.
 
-    Raises:
-        UserError: The number is out of range, or joblib is not installed.
+    A :class:`UserError`: the number is out of range, or joblib is not installed.
     """
     check_integer("hydra.launcher.n_jobs", n_jobs, 1, _MOST)
     require("joblib", "hydra/launcher=joblib", "joblib")
@@ -149,10 +139,8 @@ def on_joblib(n_jobs: int) -> Runner:
 def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
     """Return a runner of jobs that occupy so many cores and accelerators of a cluster.
 
-    Args:
-        address: The cluster's ``host:port``; None starts one on this machine for these jobs.
-        num_cpus: Cores.
-        num_gpus: Accelerators; a job sees only its own.
+    ``address`` is the cluster's ``host:port``; None starts one on this machine for these jobs. A
+    job sees only its own accelerators.
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:

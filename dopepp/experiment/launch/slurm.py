@@ -101,29 +101,21 @@ class _Task:
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
     """Return a runner that submits an array and waits for it.
 
-    Args:
-        folder: Of SLURM's own logs.
-        cluster: ``slurm``, or submitit's ``local``: processes of this machine.
-        max_num_timeout: How often a job that reaches its time limit is queued again.
-        sbatch: Options of sbatch by submitit's names; None leaves one to the cluster.
-
-    Raises:
-        UserError: submitit is not installed.
+    SLURM's own logs go to the folder. The cluster is ``slurm``, or submitit's ``local``: processes
+    of this machine. A job that reaches its time limit is queued again ``max_num_timeout`` times.
+    Of ``sbatch``, options by submitit's names, None leaves one to the cluster. A
+    :class:`UserError`: submitit is not installed.
     """
     require("submitit", "hydra/launcher=submitit_slurm", "slurm")
-    named = {
-        key if key in _ANYWHERE else f"slurm_{key}": value
-        for key, value in sbatch.items()
-        if value is not None
-    }
+    given = {key: value for key, value in sbatch.items() if value is not None}
+    named = {key if key in _ANYWHERE else f"slurm_{key}": value for key, value in given.items()}
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
         import submitit
 
         try:
-            executor = submitit.AutoExecutor(
-                folder, cluster=cluster, slurm_max_num_timeout=max_num_timeout
-            )
+            slurm = {"cluster": cluster, "slurm_max_num_timeout": max_num_timeout}
+            executor = submitit.AutoExecutor(folder, **slurm)
             executor.update_parameters(**named)
             handles = executor.map_array(_Task(jobs), *zip(*overrides.items(), strict=True))
         except (RuntimeError, ValueError, NameError, TypeError, OSError) as error:

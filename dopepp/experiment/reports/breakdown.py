@@ -38,34 +38,30 @@ from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
 from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
+Values = Float[np.ndarray, "n"]
+"""A number of each of n instances."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What instances are sorted by.
-
-    Attributes:
-        heading: Name and unit, for tables and axes.
-        of: Its value for every instance of an object.
-        decimals: Digits after the point in tables.
-    """
+    """What instances are sorted by: its name and unit, its value of each, digits in tables."""
 
     heading: str
-    of: Callable[[Gathered], Float[np.ndarray, "n"]]
+    of: Callable[[Gathered], Values]
     decimals: int
 
 
-def distances(instances: Gathered) -> Float[np.ndarray, "n"]:
+def distances(instances: Gathered) -> Values:
     """Return the distance from the camera to the centre of the cuboid, metres."""
     return np.asarray(np.linalg.norm(_centres(instances), axis=1))
 
 
-def visible_fractions(instances: Gathered) -> Float[np.ndarray, "n"]:
+def visible_fractions(instances: Gathered) -> Values:
     """Return the visible share of the silhouette, in [0, 1]."""
     return np.asarray(instances.visible_fractions.numpy())
 
 
-def sizes(instances: Gathered) -> Float[np.ndarray, "n"]:
+def sizes(instances: Gathered) -> Values:
     """Return the root of the area of the projected cuboid, pixels of the image as it came.
 
     The whole cuboid counts, with what is hidden or outside the image; unlike the distance it says
@@ -80,7 +76,7 @@ def sizes(instances: Gathered) -> Float[np.ndarray, "n"]:
     return np.sqrt(np.array(areas, np.float64))
 
 
-def view_angles(instances: Gathered) -> Float[np.ndarray, "n"]:
+def view_angles(instances: Gathered) -> Values:
     """Return the angle between the object's +z axis and the way from it to the camera, degrees.
 
     At 0° the +z face of the cuboid looks at the camera, at 90° it is seen from its edge.
@@ -105,14 +101,11 @@ QUANTITIES: Final[dict[str, Quantity]] = {
 """What rates can be broken down by."""
 
 
-def bin_numbers(values: Float[np.ndarray, "n"], num_bins: int) -> Int[np.ndarray, "n"]:
-    """Distribute values over bins of equal counts; equal values share a bin.
+def bin_numbers(values: Values, num_bins: int) -> Int[np.ndarray, "n"]:
+    """Return each value's bin, counted from 0; bins have equal counts, equal values share one.
 
     A value falls where the middle of its ranks does, so that a bin of many equal values (objects
     that nothing hides) draws no others in. Bins that stay empty are left out.
-
-    Returns:
-        The bin of each value, counted from 0 in ascending order.
     """
     _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
     middles = np.cumsum(counts) - counts / 2
@@ -124,10 +117,7 @@ def bin_numbers(values: Float[np.ndarray, "n"], num_bins: int) -> Int[np.ndarray
 class Bin:
     """The instances between two values of a quantity, over the whole test set.
 
-    Attributes:
-        low: The smallest value.
-        high: The largest.
-        middle: The median; no other bin has it.
+    ``middle`` is their median, which no other bin has.
     """
 
     low: float
@@ -140,12 +130,8 @@ def break_down(
 ) -> tuple[list[Bin], list[Figure]]:
     """Measure rates per bin, over the instances of all objects together.
 
-    Args:
-        metrics: The accumulator of each method on one test set; the last one scores all objects,
-            and its instances decide the bins.
-        quantity: A key of :data:`QUANTITIES`.
-        num_bins: How many bins of equal counts.
-        rates: Which rates.
+    Of the accumulators of the methods on one test set, the last one scores all objects, and its
+    instances decide the bins.
 
     Returns:
         The bins, in ascending order, and bin by bin what each method reaches in them: how many
@@ -171,11 +157,7 @@ def break_down(
 
 
 def _in_bin(
-    one: Bin,
-    method: str,
-    values: Float[np.ndarray, "n"],
-    gathered: Sequence[Gathered],
-    rates: Sequence[PassRate],
+    one: Bin, method: str, values: Values, gathered: Sequence[Gathered], rates: Sequence[PassRate]
 ) -> Iterator[Figure]:
     """Measure one method in one bin; a rate of no instance does not exist."""
     chosen = torch.from_numpy((values >= one.low) & (values <= one.high))

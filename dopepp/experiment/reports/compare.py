@@ -52,12 +52,7 @@ def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> N
 
 
 def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
-    """Print and write table and AUC curves; returns the text of ``compare.md``.
-
-    Args:
-        entries: The methods, the baseline first.
-        folder: Where the files go.
-    """
+    """Print and write table and AUC curves; returns the text of ``compare.md``."""
     table = figures(entries)
     compact, said = headline(table), notes(entries, table)
     display.show_table(
@@ -96,16 +91,12 @@ def compare_paths(
 ) -> Path:
     """Compare run folders and return the folder with the comparison.
 
-    Args:
-        paths: Folders of trainings, evaluations and multiruns.
-        out: Where to; a new folder under ``outputs/compare`` by default.
-        baseline: Name of the method that Δ is against; ``dope`` by default, else the first one.
-        num_pictures: Test images that are shown through every model.
-        table: An experiment's file, whose table the methods are laid out in as well.
-
-    Raises:
-        UserError: A path holds no run, the baseline is none of the methods, the experiment has no
-            table, or ``out`` holds a comparison already.
+    Paths are folders of trainings, evaluations and multiruns; ``out`` is a new folder under
+    ``outputs/compare`` by default. Δ is against the method called ``baseline``: ``dope`` by
+    default, else the first one. ``num_pictures`` test images are shown through every model. The
+    methods are laid out as in the experiment's file ``table`` as well. A :class:`UserError`: a path
+    holds no run, the baseline is none of the methods, the experiment has no table, or ``out`` holds
+    a comparison already.
     """
     layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)
@@ -126,10 +117,8 @@ def compare_runs(
 ) -> list[Entry]:
     """Print and write a comparison of runs into a folder; returns its methods.
 
-    The table is written first, so that it is there whatever befalls curves and pictures.
-
-    Raises:
-        UserError: The baseline is none of the methods.
+    The table is written first, so that it is there whatever befalls curves and pictures. A
+    :class:`UserError`: the baseline is none of the methods.
     """
     entries = group(runs)
     names = [entry.name for entry in entries]

@@ -96,11 +96,7 @@ class Condition:
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
-        """Make sure that every method can be run on other images than it was run on.
-
-        Raises:
-            UserError: One of them is a file of poses.
-        """
+        """Refuse files of poses: a method must be able to run on other images."""
         for name, method in methods.items():
             if isinstance(method, FileMethod):
                 raise UserError(
@@ -229,12 +225,9 @@ def _draw(
 
 
 def check_masks(source: Source) -> None:
-    """Make sure, before anything takes time, that there is something to shade.
+    """Read images until one has an instance mask; a :class:`UserError` if none has.
 
-    Images are read until one has an instance mask.
-
-    Raises:
-        UserError: None of them has.
+    So it shows before anything takes time whether there is something to shade.
     """
     for index in range(len(source)):
         if any(one.mask is not None and one.mask.any() for one in source.sample(index).instances):
@@ -254,21 +247,13 @@ def measure_shading(
     unmasked: Sequence[Report],
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method at every share.
+    """Measure every method at every share of the visible area of every instance, without 0.
 
     The ground truth is that of the image as it came: an instance counts by what is visible of it
-    before the shading, or heavy shading would drop out of the measurement.
+    before the shading, or heavy shading would drop out of the measurement. ``seed`` is of the
+    patches, ``unmasked`` what was measured at 0.
 
-    Args:
-        methods: By name.
-        source: The test set.
-        shares: Of the visible area of every instance, without 0.
-        seed: Of the patches.
-        unmasked: What was measured at 0.
-        num_examples: How many images are shown.
-
-    Returns:
-        What was measured at 0 and at every share, and the examples, image by image.
+    Returns what was measured at 0 and at every share, and the examples, image by image.
     """
     metrics = {share: accumulators(methods) for share in shares}
     reached: dict[float, list[float]] = {share: [] for share in shares}
@@ -315,9 +300,8 @@ def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
     for one in shaded:
         known = [f"{100 * r:.1f}" for r in sorted(r for r in one.reached if r is not None)]
         covered = " … ".join(dict.fromkeys([*known[:1], *known[-1:]])) or "nothing"
-        tiles.append(
-            Tile(one.sample.image[place], f"{SHADING.heading(one.share)} (reached {covered})")
-        )
+        caption = f"{SHADING.heading(one.share)} (reached {covered})"
+        tiles.append(Tile(one.sample.image[place], caption))
     return tiles
 
 
@@ -341,16 +325,9 @@ def measure_scales(
     unmoved: Measured,
     num_examples: int = MAX_EXAMPLES,
 ) -> tuple[list[Level], list[Tile]]:
-    """Measure every method at every scale.
+    """Measure every method at every scale; sources are the test set at every scale but 1.
 
-    Args:
-        methods: By name, the baseline first where there is one.
-        sources: The test set at every scale but 1.
-        unmoved: What was measured at 1.
-        num_examples: How many images are shown.
-
-    Returns:
-        What was measured, by ascending scale, and the examples, image by image.
+    Returns what was measured, by ascending scale, and the examples, image by image.
     """
     num_examples = min(num_examples, MAX_EXAMPLES)
     measured = {1.0: unmoved}

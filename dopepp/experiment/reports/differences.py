@@ -252,10 +252,8 @@ def _compared(baseline: Entry, others: Sequence[Entry], doubts: Sequence[str]) -
         said = f"Not of the same seeds as {baseline.name}, so not paired over them"
         yield f"{said}: {', '.join(unpaired)}."
     if not baseline.test_set:
-        yield (
-            f"Without Δ: {baseline.name} does not say which images it was measured on; "
-            "evaluate.py measures it again."
-        )
+        said = f"Without Δ: {baseline.name} does not say which images it was measured on"
+        yield f"{said}; evaluate.py measures it again."
     elif unlike := [entry.name for entry in others if not comparable(entry, baseline)]:
         said = f"Without Δ, because not measured on the same images as {baseline.name}"
         yield f"{said}: {', '.join(unlike)}."
@@ -291,10 +289,8 @@ def noise(table: Sequence[Figure]) -> list[str]:
     known = [one.difference for one in changes if one.difference is not None]
     few = [one.fewest for one in known if one.num_differing < one.fewest]
     if few:
-        found.append(
-            f"Where methods differ on fewer than {few[0]} instances, no difference is called more "
-            "than noise."
-        )
+        said = f"Where methods differ on fewer than {few[0]} instances"
+        found.append(f"{said}, no difference is called more than noise.")
     return found
 
 

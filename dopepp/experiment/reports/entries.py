@@ -128,8 +128,7 @@ class Entry:
 def find_runs(paths: Sequence[Path]) -> list[Run]:
     """Read run folders, evaluation folders and all jobs of multirun folders, each once.
 
-    Raises:
-        UserError: A path is none of them.
+    A :class:`UserError`: a path is none of them.
     """
     folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
     return [read_run(folder) for folder in folders.values()]
@@ -210,11 +209,7 @@ class _PrunedError(_FailedError):
 
 
 def _result(folder: Path) -> Report | None:
-    """Return a run's result; None of a job that was to measure its network's cost alone.
-
-    Raises:
-        _FailedError: It failed, did not finish, or left a damaged file.
-    """
+    """Return a run's result; None of a job that was to measure its network's cost alone."""
     failed, metrics = folder / record.FAILURE_FILE, folder / record.METRICS_FILE
     try:
         if failed.is_file():

@@ -23,11 +23,11 @@ from dopepp.data.formats.bop.results import PoseResult, read_results
 from dopepp.data.formats.ycb_video.frame import read_classes
 from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
-from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.assignment import PredictedPose
 from dopepp.models.network import network_cost
-from dopepp.parts.part import Part
+from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Method(Protocol):
         parts: The objects it is scored on, as the test set has them.
     """
 
-    parts: Sequence[Part]
+    parts: Parts
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
         """Return the poses on an image and the seconds they took, None where unknown."""
@@ -96,17 +96,12 @@ class Method(Protocol):
 
 
 class EstimatorMethod:
-    """An estimator, run on every image at native resolution.
+    """An estimator, run on every image at its own size; scored on the objects that it knows."""
 
-    Args:
-        estimator: The estimator.
-        parts: The test set's objects; it is scored on those that it knows.
-    """
-
-    def __init__(self, estimator: PoseEstimator, parts: Sequence[Part]) -> None:
+    def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
         known = {part.name for part in estimator.parts}
         self.estimator = estimator
-        self.parts: Sequence[Part] = [part for part in parts if part.name in known]
+        self.parts: Parts = [part for part in parts if part.name in known]
         self._names = {part.name for part in self.parts}
 
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
@@ -129,25 +124,22 @@ class FilePose:
 
     object: str
     score: float
-    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj: Transform
     keypoints: Float[np.ndarray, "9 2"]
 
 
 class FileMethod:
-    """Another program's poses, out of a BOP challenge CSV.
+    """Another program's poses, out of a BOP challenge CSV; a :class:`UserError` if that is wrong.
 
     Args:
         path: The file.
         parts: The measured objects; poses of the data set's other objects are left out.
         numbers: Numbers of the data set's objects, by name.
-
-    Raises:
-        UserError: The file is wrong.
     """
 
-    def __init__(self, path: Path, parts: Sequence[Part], numbers: Mapping[str, int]) -> None:
+    def __init__(self, path: Path, parts: Parts, numbers: Mapping[str, int]) -> None:
         self._path = path
-        self.parts: Sequence[Part] = list(parts)
+        self.parts: Parts = list(parts)
         self._parts = {numbers[part.name]: part for part in parts}
         self._unused: dict[ImageId, list[PoseResult]] = {}
         self._used: dict[ImageId, list[PoseResult]] = {}
@@ -172,8 +164,7 @@ class FileMethod:
     def check_used(self) -> None:
         """Say, after all images, how many poses had no place in the measurement.
 
-        Raises:
-            UserError: None of them was on one of the images.
+        A :class:`UserError`: none of them was on one of the images.
         """
         used = [one for rows in self._used.values() for one in rows]
         unused = [one for rows in self._unused.values() for one in rows]
@@ -192,7 +183,7 @@ class FileMethod:
             )  # fmt: skip
 
 
-def object_numbers(data: DataConfig, parts: Sequence[Part]) -> dict[str, int]:
+def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
     """Return BOP's number of each object, by name.
 
     In a BOP data set they are those of ``models_info.json``, all of them; in YCB-Video the lines of

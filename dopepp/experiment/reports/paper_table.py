@@ -90,11 +90,7 @@ class PaperTable:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PaperTable:
-        """Read the config's ``table``.
-
-        Raises:
-            UserError: A field or a value is unknown.
-        """
+        """Read the config's ``table``; a :class:`UserError` if a field or a value is unknown."""
         known = [entry.name for entry in fields(cls)]
         unknown = sorted(set(config) - set(known))
         if unknown:
@@ -113,8 +109,7 @@ class PaperTable:
     def read(cls, path: Path) -> PaperTable:
         """Read the ``table`` of an experiment's file, ``conf/experiment/NAME.yaml``.
 
-        Raises:
-            UserError: The file cannot be read, or its table is missing or wrong.
+        A :class:`UserError`: the file cannot be read, or its table is missing or wrong.
         """
         config = read_yaml(path)
         table = config.get("table") if isinstance(config, dict) else None
@@ -148,10 +143,7 @@ class PaperTable:
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
     """Print and write ``table.md`` and ``table.csv``, and the figure of a kind that has one.
 
-    Args:
-        table: The layout.
-        entries: The sweep's methods; one without a result is a row that says why.
-        folder: Where the files go.
+    A method without a result is a row that says why.
     """
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     methods = table.methods(entries)
@@ -176,10 +168,9 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
     if table.kind in _MEASURED:
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
-            notes.append(
-                "DOPE's VGG19 started untrained, as nothing is downloaded; "
-                "model.backbone.weights_path=FILE starts it from a file of torchvision's."
-            )
+            said = "DOPE's VGG19 started untrained, as nothing is downloaded"
+            option = "model.backbone.weights_path=FILE"
+            notes.append(f"{said}; {option} starts it from a file of torchvision's.")
     if not table.paper:
         notes.append("The paper prints no such table.")
     return notes

@@ -34,15 +34,10 @@ Series = dict[int, float]
 def training_lines(
     entries: Sequence[Entry], column: str, colours: Mapping[str, str], scale: float = 1.0
 ) -> list[PlotLine]:
-    """Return a line per method for a column of ``metrics.csv``; also of runs that did not finish.
+    """Return a line per method for a column of ``metrics.csv``, such as ``train/loss``.
 
-    Several seeds are drawn at the steps that all of them have logged.
-
-    Args:
-        entries: The methods.
-        column: E.g. ``train/loss``.
-        colours: By method.
-        scale: Factor of the values.
+    Runs that did not finish have one, too; several seeds are drawn at the steps that all of them
+    have logged. Colours go by method; ``scale`` is a factor of the values.
     """
     lines = []
     for entry in entries:
@@ -86,18 +81,11 @@ class _Model:
 def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
     """Predict on the first test images of the first method whose images can be opened.
 
-    Args:
-        entries: The methods, the baseline first; of several seeds the first run is shown, of
-            several networks, one a part, one after the other.
-        num: Test images.
-
-    Returns:
-        Row by row the tiles of an image, one per method; and why there are none, where they are
-        missing.
+    Of several seeds the first run is shown, of several networks, one a part, one after the other.
+    Returns row by row the tiles of an image, one per method; and why some are missing.
     """
-    kinds = list(
-        dict.fromkeys(_parts(run) for entry in entries for run in entry.runs if run.report)
-    )
+    measured = [run for entry in entries for run in entry.runs if run.report]
+    kinds = list(dict.fromkeys(map(_parts, measured)))
     tiles, notes = [], []
     for number, parts in enumerate(kinds or [()]):
         share = num // max(1, len(kinds)) + (number < num % max(1, len(kinds)))

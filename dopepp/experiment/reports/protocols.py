@@ -44,8 +44,7 @@ class Protocols:
     def of(cls, config: Mapping[str, Any]) -> Protocols:
         """Read an evaluation's options, or a training's, which has no scales.
 
-        Raises:
-            UserError: One of them is wrong.
+        A :class:`UserError` tells which is wrong.
         """
         shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
         bounds = (1 / _MAX_SCALE, _MAX_SCALE)
@@ -79,7 +78,6 @@ def _quantities(given: object) -> tuple[str, ...]:
     names = [] if given is None else given if isinstance(given, list) else [given]
     wrong = [name for name in names if not isinstance(name, str) or name not in QUANTITIES]
     if wrong or (given is not None and not names):
-        raise UserError(
-            f"by={given!r:.100}", f"one or more of {', '.join(QUANTITIES)}", "change by"
-        )
+        allowed = f"one or more of {', '.join(QUANTITIES)}"
+        raise UserError(f"by={given!r:.100}", allowed, "change by")
     return tuple(dict.fromkeys(str(name) for name in names))

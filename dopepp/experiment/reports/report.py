@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -109,8 +110,7 @@ class Report:
     def joined(cls, reports: Sequence[Report]) -> Report:
         """Return the results of several networks, one a part, as those of one method.
 
-        Args:
-            reports: Of networks that differ in nothing but their parts; no part occurs twice.
+        They differ in nothing but their parts; no part occurs twice.
         """
         reports = sorted(reports, key=lambda report: list(report.rows))
         first = reports[0]
@@ -164,13 +164,9 @@ def _unlisted(
 
 @dataclass
 class Measured:
-    """What came out of measuring methods on a test set.
+    """What came out of measuring methods: a report each, and pictures of the first images.
 
-    Attributes:
-        reports: One per method.
-        tiles: Pictures of the first images.
-        poses: Every pose of each method.
-        metrics: The accumulator of each method.
+    ``poses`` is every pose of each method, ``metrics`` the accumulator of each.
     """
 
     reports: list[Report]
@@ -182,16 +178,10 @@ class Measured:
 def measure(
     methods: Mapping[str, Method], samples: Iterable[Sample], num_pictures: int = 12
 ) -> Measured:
-    """Run methods over the same images at native resolution.
+    """Run methods, the baseline first where there is one, over the same images at native size.
 
-    Args:
-        methods: By name, the baseline first where there is one.
-        samples: The test set.
-        num_pictures: How many of the first images are drawn.
-
-    Returns:
-        A report per method, and pictures with the truth in green, the last method's predictions in
-        yellow and those of the methods before it in blue (paper Fig. 14).
+    Returns a report per method, and pictures with the truth in green, the last method's predictions
+    in yellow and those of the methods before it in blue (paper Fig. 14).
     """
     metrics = accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
@@ -235,19 +225,15 @@ def measure(
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
     """Return what scores each method's poses on its parts."""
     # One process measures alone: after a distributed training the others have ended.
-    return {
-        name: PoseMetrics(method.parts, name, sync_on_compute=False)
-        for name, method in methods.items()
-    }
+    of = functools.partial(PoseMetrics, sync_on_compute=False)
+    return {name: of(method.parts, name) for name, method in methods.items()}
 
 
 def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:
     """Measure the untrained network of a spec at width 1: what narrowing has saved.
 
-    Args:
-        spec: The narrowed network's spec.
-        input_size: Input (width, height), pixels; the paper's is 416×416.
-        repeats: Timed forward passes after one that is not; the median counts.
+    The input is (width, height), pixels (the paper's is 416×416). Of ``repeats`` timed forward
+    passes after one that is not, the median counts.
     """
     widened = {
         key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node

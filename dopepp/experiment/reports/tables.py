@@ -27,7 +27,7 @@ from dopepp.metrics.bootstrap import Difference
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN, Gathered
 from dopepp.metrics.row import COLUMNS, Column, PoseRow
-from dopepp.parts.part import Part
+from dopepp.parts.part import Parts
 
 Row = dict[str, str]
 """Heading to text."""
@@ -216,7 +216,7 @@ ADD_10CM: Final = PassRate("pass_10cm", "add", 0.1, relative=False)
 MSSD_01D: Final = PassRate("mssd_01d", "mssd", 0.1)
 
 
-def reported_rates(data: DataConfig, parts: Sequence[Part]) -> tuple[PassRate, ...]:
+def reported_rates(data: DataConfig, parts: Parts) -> tuple[PassRate, ...]:
     """Return the rates for these data: the paper's and ADD-0.1d.
 
     The paper's is ADD below 0.1 m on images of YCB-Video, below 0.05 m on parts. Where a part has

@@ -52,16 +52,12 @@ def show_sources(rows: Sequence[SourceRow]) -> None:
 def show_report(report: Report, all_measures: bool = False) -> None:
     """Print a table per object: a line per measure, the reference rows beside the estimate.
 
-    Args:
-        report: What was measured.
-        all_measures: Whether to print the symmetric measures of a part without symmetries, too.
+    ``all_measures`` adds the symmetric measures of a part without symmetries.
     """
     for name, (row, *references) in report.tables.items():
         if row.num_instances == 0:
-            console.print(
-                f"{name}: n/a, no ground truth in the test set; "
-                f"{row.false_positives} false positives"
-            )
+            absent = "n/a, no ground truth in the test set"
+            console.print(f"{name}: {absent}; {row.false_positives} false positives")
             continue
         table = Table("", title=f"{name}: {report.num_images} test images")
         for one in (row, *references):

@@ -11,12 +11,12 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
@@ -26,7 +26,7 @@ from dopepp.experiment.config.parse import flat
 from dopepp.geometry.camera import Letterbox
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
-from dopepp.parts.part import Part
+from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)
 
@@ -53,21 +53,17 @@ class Fingerprint:
         parts: The objects that are scored.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Parts) -> None:
         self._hash = hashlib.sha256()
         self._add(sorted((part.name, part.mesh_hash) for part in parts))
 
     def add(self, sample: Sample) -> None:
         """Take the next image."""
-        truths = [
-            [
-                one.label,
-                _rounded(one.T_cam_obj),
-                bool(one.visible_fraction >= MIN_VISIBLE_FRACTION),
-                round(one.masked_fraction, 2),
-            ]
-            for one in sample.instances
-        ]
+        truths = []
+        for one in sample.instances:
+            counts = bool(one.visible_fraction >= MIN_VISIBLE_FRACTION)
+            covered = round(one.masked_fraction, 2)
+            truths.append([one.label, _rounded(one.T_cam_obj), counts, covered])
         self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
 
     def word(self) -> str:
@@ -122,22 +118,19 @@ def _look(sample: Sample) -> dict[str, Any]:
 def _same_labels(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     if one["labels"] != other["labels"]:
         return False
-    return all(
-        np.allclose(one[name], other[name], rtol=_MAX_LABEL, atol=_MAX_LABEL)
-        for name in ("K", "T_cam_obj")
-    )
+    pairs = [(one[name], other[name]) for name in ("K", "T_cam_obj")]
+    return all(np.allclose(*pair, rtol=_MAX_LABEL, atol=_MAX_LABEL) for pair in pairs)
 
 
 def _picture_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
     """Return the mean absolute difference, grey levels; infinite for other sizes."""
     if one["size"] != other["size"]:
         return np.inf
-    pictures = (_pixels(look["pixels"]).astype(float) for look in (one, other))
+    pictures = (
+        np.frombuffer(bytes.fromhex(look["pixels"]), np.uint8).astype(float)
+        for look in (one, other)
+    )
     return float(np.abs(np.subtract(*pictures)).mean())
-
-
-def _pixels(text: str) -> UInt8[np.ndarray, "n"]:
-    return np.frombuffer(bytes.fromhex(text), np.uint8)
 
 
 def _shown(value: object) -> str:
@@ -145,17 +138,13 @@ def _shown(value: object) -> str:
     return text if len(text) <= _LONG else f"{text[:_LONG]}…"
 
 
-def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Sequence[Part]) -> None:
+def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts) -> None:
     """Say it in one line where figures are not comparable with the checkpoint's own.
 
     Two things are: a test set that has changed although its configuration is the checkpoint's, and
-    an object of another shape than the one trained on, whatever the test set. Another test set,
-    chosen by its configuration, is as its user wants it.
-
-    Args:
-        checkpoint: What is measured.
-        data: What is evaluated on.
-        parts: The checkpoint's objects as these data have them.
+    an object of another shape than the one trained on, whatever the test set (``parts`` are the
+    checkpoint's objects as these data have them). Another test set, chosen by its configuration, is
+    as its user wants it.
     """
     pairs = zip(checkpoint.parts, parts, strict=True)
     others = [a.name for a, b in pairs if a.mesh_hash and b.mesh_hash not in ("", a.mesh_hash)]

@@ -74,10 +74,6 @@ class RunReadme:
 
     A run that could not begin leaves what stands in its folder as it is. One whose README cannot
     be written goes on without.
-
-    Args:
-        config: Of the run.
-        run_dir: Its folder.
     """
 
     def __init__(self, config: RunConfig, run_dir: Path) -> None:
@@ -95,13 +91,7 @@ class RunReadme:
         )
 
     def end(self, state: str, reason: str = "", report: Report | None = None) -> None:
-        """Say how the run ended.
-
-        Args:
-            state: One of this module's words.
-            reason: Why, in a line.
-            report: What was measured, of a run that was.
-        """
+        """Say how the run ended: one of this module's words, why in a line, what was measured."""
         if self._begun:
             self._write(state, reason, report)
 
@@ -118,9 +108,8 @@ class RunReadme:
         details = {} if report is None else report.details
         best = shlex.quote(shown(self._folder / details.get("checkpoint", record.BEST_CHECKPOINT)))
         if not self._config.keep_checkpoints:
-            return (
-                "A trial of the program itself (`keep_checkpoints=false`): nothing to go on with."
-            )
+            trial = "A trial of the program itself (`keep_checkpoints=false`)"
+            return f"{trial}: nothing to go on with."
         lines = [] if state == FINISHED else [f"python train.py resume={run}  # go on"]
         if state == FINISHED:
             epochs = 2 * self._config.trainer.max_epochs
@@ -136,13 +125,7 @@ class RunReadme:
 
 
 def write_job_readme(folder: Path, title: str, report: Report | None = None) -> None:
-    """Write the README of what is no training, when it is done.
-
-    Args:
-        folder: Its folder.
-        title: What it was.
-        report: What was measured.
-    """
+    """Write the README of what is no training, when it is done; ``title`` says what it was."""
     result = "" if report is None else _result(report)
     _write(folder, [f"# {title}", _commands(folder), result, _pictures(folder), _files(folder)])
 
@@ -150,20 +133,19 @@ def write_job_readme(folder: Path, title: str, report: Report | None = None) -> 
 def write_sweep_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, str]) -> None:
     """Write the README of a multirun's folder.
 
-    Args:
-        folder: The sweep's folder.
-        command: The command line.
-        jobs: How each job stands, by its folder's name; empty while none has ended.
+    ``jobs`` tells how each job stands, by its folder's name; it is empty while none has ended.
     """
     rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
     state = "finished" if jobs else "running; this page is written again at its end"
+    links = {
+        "compare.md": "The comparison is in [compare.md](compare.md), its numbers in "
+        "`compare.csv`.",
+        "compare.png": "![compare](compare.png)",
+    }
     sections = [
         f"# Multirun: {state}",
         f"```bash\npython {shlex.join(command)}\n```",
-        "The comparison is in [compare.md](compare.md), its numbers in `compare.csv`."
-        if (folder / "compare.md").is_file()
-        else "",
-        "![compare](compare.png)" if (folder / "compare.png").is_file() else "",
+        *(text for name, text in links.items() if (folder / name).is_file()),
         "Every job that has begun to train has a README in its folder.",
         markdown_text(rows, ["job", "state"]) if rows else "",
     ]
@@ -203,9 +185,9 @@ def _result(report: Report) -> str:
         if rows[0].num_instances == 0:
             sections.append(f"{name}: not in the test images.")
             continue
+        columns = shown_columns(rows[0])
         table = [
-            {name: column.heading, **{row.method: column.text(row) for row in rows}}
-            for column in shown_columns(rows[0])
+            {name: one.heading, **{row.method: one.text(row) for row in rows}} for one in columns
         ]
         sections.append(markdown_text(table, [name]).rstrip())
     sections.append(

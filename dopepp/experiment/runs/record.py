@@ -54,15 +54,13 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON record of a run folder.
 
-    Raises:
-        UserError: The file is missing or no JSON object.
+    A :class:`UserError`: the file is missing or no JSON object.
     """
     try:
         record = read_strict_json(path)
     except UserError as error:
-        raise UserError(
-            f"{error.got}, unreadable", "a file written by a run", "check the run folder"
-        ) from error
+        allowed = "a file written by a run"
+        raise UserError(f"{error.got}, unreadable", allowed, "check the run folder") from error
     if not isinstance(record, dict):
         raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", "check the file")
     return record
@@ -73,11 +71,7 @@ def write_environment(
 ) -> None:
     """Write what a run is made with; a run that goes on keeps what it was made with before.
 
-    Args:
-        run_dir: The run's folder.
-        seed: The run's seed.
-        data_fingerprint: Of its data.
-        changes: What has changed in its config since it was begun or last resumed.
+    ``changes`` are those of its config since it was begun or last resumed.
     """
     path = run_dir / VERSIONS_FILE
     earlier: list[object] = []

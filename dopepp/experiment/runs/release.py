@@ -25,19 +25,10 @@ _CARD_FIELDS: Final = (
 
 
 def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
-    """Write ``NAME.safetensors`` and its card ``NAME.md``.
+    """Write ``NAME.safetensors`` and its card ``NAME.md``; return both.
 
-    Args:
-        checkpoint: What is released.
-        results: ``metrics.json`` of a run or an evaluation of it.
-        name: What it is called.
-        folder: Where both files go.
-
-    Returns:
-        The two files.
-
-    Raises:
-        UserError: A file is not what it should be, or the release is too large.
+    ``results`` is ``metrics.json`` of a run or an evaluation of the checkpoint. A
+    :class:`UserError`: a file is not what it should be, or the release is too large.
     """
     if not name.isidentifier():
         raise UserError(f"name {name!r}", "letters, digits and _", "choose another name")
@@ -63,9 +54,8 @@ def _card(name: str, trained: Checkpoint, report: Report) -> str:
     ]
     width, height = trained.input_size
     parameters = sum(value.numel() for value in trained.state_dict.values())
-    parts = "\n".join(
-        f"- {part.name}: {1000 * part.diameter:.0f} mm across" for part in trained.parts
-    )
+    sizes = [f"- {part.name}: {1000 * part.diameter:.0f} mm across" for part in trained.parts]
+    parts = "\n".join(sizes)
     return f"""# pretrained/{name}
 
 Finds, on an RGB image with its camera matrix, the 6D pose of
@@ -96,6 +86,5 @@ def _training(data: Mapping[str, Any]) -> str:
     config = data.get("config") or {}
     virtual = config.get("virtual") or {}
     masks = (config.get("masking") or {}).get("probability", 0)
-    return (
-        f"preset `{virtual.get('preset')}`, random masks on {100 * masks:.0f} % of the instances."
-    )
+    preset = f"preset `{virtual.get('preset')}`"
+    return f"{preset}, random masks on {100 * masks:.0f} % of the instances."

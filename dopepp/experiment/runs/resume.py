@@ -52,13 +52,7 @@ _OVERRIDE: Final = re.compile(r"(\+\+?|~)?(?P<key>[A-Za-z_][\w/.@:]*)(=.*)?", re
 
 @dataclass(frozen=True)
 class ConfigDifference:
-    """One option that is not as it was.
-
-    Attributes:
-        key: Its dotted name.
-        old: Its value in the run, as text.
-        new: Its value now.
-    """
+    """One option, by its dotted name, whose value is not as it was; both values as text."""
 
     key: str
     old: str
@@ -74,18 +68,10 @@ def check_resume(
 ) -> list[ConfigDifference]:
     """Compare a run's folder and checkpoint with the config that is to go on with it.
 
-    Args:
-        run: Its folder.
-        config: The present config.
-        saved: The run's checkpoint.
-        payload: What a checkpoint of the present run would say of itself.
+    ``payload`` is what a checkpoint of the present run would say of itself.
 
-    Returns:
-        The differences that are accepted.
-
-    Raises:
-        UserError: The network or the kind of optimiser differs, or what is learnt from does and
-            ``resume_anyway`` is not set.
+    Returns the differences that are accepted. A :class:`UserError`: the network or the kind of
+    optimiser differs, or what is learnt from does and ``resume_anyway`` is not set.
     """
     path = run / record.CONFIG_FILE
     found = config_differences(_read_config(path), config.plain) if path.is_file() else []
@@ -100,9 +86,8 @@ def check_resume(
             f"leave them as they were, or start anew with init_from={run / record.BEST_CHECKPOINT}"
             " where the network is the same",
         )
-    learnt = [
-        one for one in found if below(one.key, LEARNT_FROM) and not below(one.key, _NOT_LEARNT_FROM)
-    ]
+    learnt = [one for one in found if below(one.key, LEARNT_FROM)]
+    learnt = [one for one in learnt if not below(one.key, _NOT_LEARNT_FROM)]
     if not learnt:  # else the images are others for that reason
         learnt = image_differences(saved.data.get("images"), payload["data"].get("images"))
     if learnt and not config.resume_anyway:
@@ -141,9 +126,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 
     A run's folder may come from anybody, and what stands in it goes back on the command line. There
     Hydra takes flags, and builds whatever its own nodes name; so neither is taken from a folder.
-
-    Raises:
-        UserError: There is something else than overrides.
+    Anything but overrides is a :class:`UserError`.
     """
     if not isinstance(stored, list) or not all(isinstance(text, str) for text in stored):
         raise UserError(f"{source} without a list of overrides", "key=value lines", "check the run")
@@ -151,9 +134,8 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
     for text in stored:
         match = _OVERRIDE.fullmatch(text)
         if match is None:
-            raise UserError(
-                f"{source} with {text!r:.100}", "overrides as key=value", "check the run's folder"
-            )
+            got, allowed = f"{source} with {text!r:.100}", "overrides as key=value"
+            raise UserError(got, allowed, "check the run's folder")
         if match["key"] in ("resume", "resume_anyway", "hydra.run.dir"):
             continue
         if "hydra" in re.split(r"[/.@:]", match["key"]):
@@ -166,8 +148,7 @@ def trusted_overrides(stored: object, source: Path) -> list[str]:
 def read_overrides(run: Path) -> list[str] | None:
     """Return the overrides that a run was started with; None where they are not known as a whole.
 
-    Raises:
-        UserError: The file holds something else.
+    A file that holds something else is a :class:`UserError`.
     """
     own, overrides, hydra = (run / path for path in (record.OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if own.is_file():

@@ -30,22 +30,13 @@ class CompareJobs(Callback):
         write_sweep_readme(Path(str(config.hydra.sweep.dir)), _command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Compare all jobs of the sweep folder.
-
-        Raises:
-            SystemExit: With code 1 if a job failed.
-        """
+        """Compare all jobs of the sweep folder; exit with code 1 if one failed."""
         if not compare_jobs(Path(str(config.hydra.sweep.dir)), config):
             raise SystemExit(1)
 
 
 def compare_jobs(folder: Path, config: DictConfig) -> bool:
-    """Compare the jobs that a sweep's folder holds; return whether none has failed.
-
-    Args:
-        folder: The sweep's folder.
-        config: Of the multirun; its ``table`` and ``logger`` are read.
-    """
+    """Compare the jobs that a sweep's folder holds; return whether none has failed."""
     table = _node(config, "table")
     jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
     if not jobs:

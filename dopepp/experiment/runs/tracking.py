@@ -21,12 +21,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.build.registries import LOGGERS
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.reports.compare import (
-    CURVES_FILE,
-    LOSS_FILE,
-    PICTURES_FILE,
-    TABLE_FILE,
-)
+from dopepp.experiment.reports.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE, TABLE_FILE
 from dopepp.experiment.reports.entries import overrides_of
 from dopepp.experiment.reports.paper_table import TABLE_FILE as PAPER_TABLE_FILE
 from dopepp.experiment.reports.report import Report
@@ -47,12 +42,7 @@ _UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume"
 def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
     """Give a training's trackers, and end the run with each of them however the training ends.
 
-    Args:
-        config: Of the run.
-        run_dir: The run's folder; of a job, in its multirun's.
-
-    Raises:
-        UserError: ``logger`` names something that is no logger.
+    A job's folder is in its multirun's. A ``logger`` that names no logger is a :class:`UserError`.
     """
     chosen = [one for one in overrides_of(run_dir) if not one.startswith(_UNSAID)]
     name = " ".join([config.model.name, config.data.name, *chosen])
@@ -98,14 +88,9 @@ def _begun_id(run_dir: Path) -> str | None:
 
 def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
     """Tell trackers what a run was measured at: test figures, reference rows, curves, pictures."""
-    figures = {
-        **_figures("test", report.rows),
-        **{
-            key: value
-            for reference, rows in report.references.items()
-            for key, value in _figures(f"reference/{reference}", rows).items()
-        },
-    }
+    figures = _figures("test", report.rows)
+    for reference, rows in report.references.items():
+        figures |= _figures(f"reference/{reference}", rows)
     for tracker in trackers:
         tracker.log_summary(figures)
         _send_pictures(tracker, {f"test/{one}": run_dir / f"{one}.png" for one in _PICTURES})
@@ -124,9 +109,7 @@ def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
 def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
     """Tell trackers how a multirun's jobs compare, in a run of its own in their group.
 
-    Args:
-        nodes: The config's ``logger``.
-        folder: The multirun's folder, with the comparison's files.
+    The multirun's folder holds the comparison's files.
     """
     with _open(nodes, folder, _COMPARISON, folder.resolve().name, _COMPARISON) as trackers:
         for tracker in trackers:

@@ -48,15 +48,9 @@ def search(
 ) -> list[JobReturn]:
     """Run trials until the study has as many finished ones as ``search.num_trials``.
 
-    Args:
-        config: Hydra's config of the multirun.
-        loader: Composes a trial's config.
-        launcher: Runs jobs.
-        arguments: The command line's overrides.
-        swept: Options that the experiment sweeps over by itself; there must be none.
-
-    Raises:
-        UserError: An option of the search is wrong, or the study does not belong to this command.
+    ``swept`` are the options that the experiment sweeps over by itself; there must be none. A
+    :class:`UserError`: an option of the search is wrong, or the study does not belong to this
+    command.
     """
     if swept:
         raise UserError(

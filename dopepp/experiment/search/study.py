@@ -68,8 +68,7 @@ class Space:
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
     """Read ``search.space`` and the command line, whose overrides win.
 
-    Raises:
-        UserError: An entry cannot be read or is no sweep, or nothing is varied.
+    A :class:`UserError`: an entry cannot be read or is no sweep, or nothing is varied.
     """
     parser = OverridesParser.create(config_loader=loader)
     try:
@@ -156,8 +155,7 @@ def chosen(params: dict[str, object]) -> list[str]:
 def alone(folder: Path, study: str) -> Iterator[None]:
     """Keep a second command from searching in the same folder; ends with the process.
 
-    Raises:
-        UserError: There is another one.
+    If there is another one, it is a :class:`UserError`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / _LOCK_FILE).open("w") as stream:
@@ -175,13 +173,9 @@ def alone(folder: Path, study: str) -> Iterator[None]:
 def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
     """Open a study, or begin it.
 
-    Args:
-        options: The node ``search``.
-        facts: What decides about a trial's result besides what is varied, by its name.
-        seed: Of the draws; those of a command that goes on are not those of the first one again.
-
-    Raises:
-        UserError: The study was begun with other facts, or its storage cannot be opened.
+    ``facts`` is what decides about a trial's result besides what is varied, by its name. The seed
+    is of the draws; those of a command that goes on are not those of the first one again. A
+    :class:`UserError`: the study was begun with other facts, or its storage cannot be opened.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = str(options["study"])
@@ -204,11 +198,8 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
     """Refuse to mix trials that cannot be compared."""
-    before = {
-        key: FORMER_TARGETS.get(value, value)
-        for key, value in before.items()
-        if not below(key, _NO_PART)
-    }
+    named = {key: FORMER_TARGETS.get(value, value) for key, value in before.items()}
+    before = {key: value for key, value in named.items() if not below(key, _NO_PART)}
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return

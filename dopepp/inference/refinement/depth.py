@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dopepp.core.errors import require
 from dopepp.geometry.camera import (
@@ -31,6 +31,9 @@ from dopepp.inference.refinement.search import best_shift
 from dopepp.inference.refinement.view import GATE, DepthView, Overlay, lay_over, view_around
 from dopepp.inference.refinement.visible import (
     FEWEST_POINTS,
+    Depth,
+    PoseMatrix,
+    Seen,
     SurfacePoints,
     surface_points,
     visible,
@@ -89,38 +92,28 @@ class Refinement:
     """
 
     T_cam_obj: Transform
-    covariance: Float[np.ndarray, "6 6"] | None = None
+    covariance: PoseMatrix | None = None
     reason: str = ""
     fit: Fit | None = None
 
 
 class DepthRefiner:
-    """Refines the poses of some parts.
-
-    Args:
-        parts: The parts, with their points.
-
-    Raises:
-        UserError: The extra ``depth`` is not installed.
-    """
+    """Refines the poses of some parts; a :class:`UserError` if the extra ``depth`` is missing."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
         require("small_gicp", "refine=depth", "depth")
         self._gicp: ModuleType = import_module("small_gicp")
-        self._surfaces = {
-            part.name: surface_points(part.points)
-            for part in parts
-            if len(part.points) >= FEWEST_POINTS
-        }
+        large = [part for part in parts if len(part.points) >= FEWEST_POINTS]
+        self._surfaces = {part.name: surface_points(part.points) for part in large}
         self._diameters = {part.name: part.diameter for part in parts}
 
     def refine(
         self,
         name: str,
         T_cam_obj: Transform,
-        depth: Float[np.ndarray, "height width"],
+        depth: Depth,
         K: CameraMatrix,
-        covariance: Float[np.ndarray, "6 6"] | None = None,
+        covariance: PoseMatrix | None = None,
     ) -> Refinement:
         """Refine one pose.
 
@@ -159,13 +152,8 @@ class DepthRefiner:
         return Refinement(pose, np.linalg.inv(information), fit=after)
 
     def _descend(
-        self,
-        view: DepthView,
-        surface: SurfacePoints,
-        diameter: float,
-        prior: Prior,
-        seen: Bool[np.ndarray, "points"],
-    ) -> tuple[Transform, Float[np.ndarray, "6 6"]] | None:
+        self, view: DepthView, surface: SurfacePoints, diameter: float, prior: Prior, seen: Seen
+    ) -> tuple[Transform, PoseMatrix] | None:
         """Search and descend, coarse to fine; return the pose and the information behind it.
 
         ``seen`` are the visible points at the prior's pose.
@@ -203,7 +191,7 @@ class DepthRefiner:
         return pose, information
 
     def _plane_terms(
-        self, surface: SurfacePoints, seen: Bool[np.ndarray, "points"]
+        self, surface: SurfacePoints, seen: Seen
     ) -> Callable[[DepthView, Overlay, Transform, float], Terms]:
         """Return small_gicp's point-to-plane terms against a part's visible points."""
         gicp = self._gicp
@@ -235,6 +223,5 @@ class DepthRefiner:
 
 def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
     """Turn a pose about the object's origin and shift it, both in camera axes."""
-    return make_transform(
-        rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
-    )
+    turn = rotation_vector_to_matrix(step[:3])
+    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + step[3:])

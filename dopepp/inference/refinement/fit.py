@@ -16,13 +16,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.view import COVERED, GATE, DepthView, Overlay, lay_over
-from dopepp.inference.refinement.visible import SurfacePoints
+from dopepp.inference.refinement.visible import PoseMatrix, Region, Seen, SurfacePoints
 
 STEP: Final = 2.0
 """Standard deviations of the depth by which a surface may differ from what it goes on from."""
@@ -69,7 +69,7 @@ class Prior:
     """
 
     T_cam_obj: Transform
-    information: Float[np.ndarray, "6 6"]
+    information: PoseMatrix
 
     def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
         """Return the turn and the shift from a pose to the prior's."""
@@ -87,14 +87,11 @@ class Prior:
 
 
 def make_prior(
-    T_cam_obj: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None = None
+    T_cam_obj: Transform, diameter: float, covariance: PoseMatrix | None = None
 ) -> Prior:
-    """Return the prior of a pose, with a broad covariance where none is given.
+    """Return the prior of a pose, with a broad covariance where none, or no finite one, is given.
 
-    Args:
-        T_cam_obj: The pose.
-        diameter: Of the part, metres.
-        covariance: Of (turn, shift); one that is not finite counts as none.
+    The diameter is of the part, metres; the covariance of (turn, shift).
     """
     ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
     along = np.outer(ray, ray)
@@ -143,9 +140,7 @@ class Fit:
         return ""
 
 
-def fit_of(
-    view: DepthView, surface: SurfacePoints, T_cam_obj: Transform, seen: Bool[np.ndarray, "points"]
-) -> Fit:
+def fit_of(view: DepthView, surface: SurfacePoints, T_cam_obj: Transform, seen: Seen) -> Fit:
     """Measure the agreement of a pose, and of the points it shows, with a depth view."""
     overlay = lay_over(view, surface, seen, T_cam_obj)
     if overlay is None:
@@ -167,7 +162,7 @@ def fit_of(
     )
 
 
-def continues(view: DepthView, overlay: Overlay, reach: float) -> Bool[np.ndarray, "height width"]:
+def continues(view: DepthView, overlay: Overlay, reach: float) -> Region:
     """Tell pixels beside a part, up to ``reach`` spacings away, that go on as its surface does.
 
     They are compared with the offset of the surface that they would go on, so that a pose that is
@@ -179,7 +174,7 @@ def continues(view: DepthView, overlay: Overlay, reach: float) -> Bool[np.ndarra
     return np.asarray(beside & (np.abs(overlay.offset - here) <= STEP * view.noise))
 
 
-Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
+Terms = tuple[PoseMatrix, Float[np.ndarray, "6"]]
 """Information matrix and vector of (turn about the object's origin, shift): H ξ = g."""
 
 
@@ -188,12 +183,9 @@ def outline_terms(
 ) -> Terms:
     """Return the pull of the outline.
 
-    Args:
-        view: The depth.
-        overlay: The part on it.
-        origin: The object's origin, camera frame, metres.
-        spacing: Of the part's points, metres; also the standard deviation of a place.
-        reach: Largest difference between the outlines, metres.
+    The object's origin is in the camera frame; ``spacing`` is that of the part's points and also
+    the standard deviation of a place; ``reach`` is the largest difference between the outlines that
+    pulls. All are metres.
     """
     gate = GATE * view.noise
     offset = overlay.at_points
@@ -217,9 +209,7 @@ Pulls = tuple[Float[np.ndarray, "places 3"], Float[np.ndarray, "places 2"]]
 """Places on the part, camera frame, and where they should go from there, pixels."""
 
 
-def _to_surface(
-    overlay: Overlay, past: Int[np.ndarray, "past"], supported: Bool[np.ndarray, "height width"]
-) -> Pulls:
+def _to_surface(overlay: Overlay, past: Int[np.ndarray, "past"], supported: Region) -> Pulls:
     """Pull points that look past the surface to the nearest pixel of it."""
     if not len(past) or not supported.any():
         return np.empty((0, 3)), np.empty((0, 2))
@@ -233,7 +223,7 @@ def _to_surface(
     return overlay.points[past], place[labels[own[:, 1], own[:, 0]]] - own
 
 
-def _to_pixels(overlay: Overlay, beside: Bool[np.ndarray, "height width"]) -> Pulls:
+def _to_pixels(overlay: Overlay, beside: Region) -> Pulls:
     """Pull the points nearest to uncovered surface until they cover it."""
     rows, columns = np.nonzero(beside)
     nearest = overlay.nearest[rows, columns]
@@ -243,7 +233,7 @@ def _to_pixels(overlay: Overlay, beside: Bool[np.ndarray, "height width"]) -> Pu
 
 
 def _add(
-    H: Float[np.ndarray, "6 6"],
+    H: PoseMatrix,
     g: Float[np.ndarray, "6"],
     arms: Float[np.ndarray, "places 3"],
     pulls: Float[np.ndarray, "places 2"],

@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.fit import Prior
 from dopepp.inference.refinement.view import DepthView
+from dopepp.inference.refinement.visible import Points
 
 MOST_POINTS: Final = 400
 """Points in the search."""
@@ -39,22 +39,14 @@ LEAST_POINTS: Final = 20
 
 
 def best_shift(
-    view: DepthView,
-    points: Float[np.ndarray, "points 3"],
-    prior: Prior,
-    moved: Vector,
-    step: float,
-    tolerance: float,
+    view: DepthView, points: Points, prior: Prior, moved: Vector, step: float, tolerance: float
 ) -> Vector | None:
     """Return the shift in camera axes that most points agree on; None where too few have depth.
 
-    Args:
-        view: The depth.
-        points: Visible points of the part at the present pose, camera frame, metres.
-        prior: What the image says.
-        moved: How far the present pose is from the prior's already, metres.
-        step: Between neighbouring shifts along x and y, metres.
-        tolerance: Depth by which a point may differ and still count, the less the more, metres.
+    The points are those of the part that are visible at the present pose, in the camera frame;
+    ``moved`` is how far that pose is from the prior's already, ``step`` is between neighbouring
+    shifts along x and y, and ``tolerance`` is the depth by which a point may differ and still
+    count, the less the more. All are metres.
     """
     chosen = np.ascontiguousarray(points[:: -(-len(points) // MOST_POINTS)])
     information = np.ascontiguousarray(prior.information[3:, 3:])

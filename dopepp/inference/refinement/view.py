@@ -12,13 +12,20 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_image
 from dopepp.geometry.camera import CameraMatrix, Transform
-from dopepp.inference.refinement.visible import SurfacePoints, plane_depth
+from dopepp.inference.refinement.visible import (
+    Depth,
+    Points,
+    Region,
+    Seen,
+    SurfacePoints,
+    plane_depth,
+)
 
 FARTHEST: Final = 50.0
 """Metres. No depth camera for parts sees so far; millimetres taken for metres do."""
@@ -48,18 +55,11 @@ COVERED: Final = 1.0
 """Spacings around a surface point that count as covered by the part."""
 
 
-def checked_depth(
-    depth: Float[np.ndarray, "height width"], image_size: tuple[int, int]
-) -> Float32[np.ndarray, "height width"]:
-    """Return depth as float32, 0 where unknown.
+def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    """Return depth, metres along z, as float32, 0 where it is unknown (0, NaN or infinite).
 
-    Args:
-        depth: Metres along z; 0, NaN or infinite where unknown.
-        image_size: (width, height) of the colour image it is aligned to.
-
-    Raises:
-        UserError: It has another shape, is no array of floats, has negative values, or its median
-            cannot be in metres.
+    A :class:`UserError`: it is not aligned to a colour image of (width, height), is no array of
+    floats, has negative values, or its median cannot be in metres.
     """
     depth = np.asarray(depth)
     if depth.shape != image_size[::-1]:
@@ -69,19 +69,16 @@ def checked_depth(
             "align the depth to the colour image first",
         )
     if not np.issubdtype(depth.dtype, np.floating):
-        raise UserError(
-            f"depth of type {depth.dtype}",
-            "floats in metres",
-            "convert it, e.g. depth.astype('float32') / 1000 for millimetres",
-        )
+        fix = "convert it, e.g. depth.astype('float32') / 1000 for millimetres"
+        raise UserError(f"depth of type {depth.dtype}", "floats in metres", fix)
     known = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
     measured = known[known != 0]
     if measured.size and measured.min() < 0:
-        raise UserError(
+        got, fix = (
             f"depth with values down to {measured.min():.4g}",
-            "metres along z, 0 where unknown",
             "check how the depth was decoded",
         )
+        raise UserError(got, "metres along z, 0 where unknown", fix)
     if measured.size and np.median(measured) > FARTHEST:
         raise UserError(
             f"depth with a median of {np.median(measured):.4g} m",
@@ -92,19 +89,13 @@ def checked_depth(
 
 
 def read_depth(path: Path, scale: float) -> Float32[np.ndarray, "height width"]:
-    """Read a 16-bit depth image as metres, 0 where unknown.
+    """Read a PNG of 16 bits as metres, 0 where unknown; ``scale`` is metres per unit.
 
-    Args:
-        path: A PNG file.
-        scale: Metres per unit.
-
-    Raises:
-        UserError: The scale is no positive number, or the file is no 16-bit image.
+    A :class:`UserError`: the scale is no positive number, or the file is no 16-bit image.
     """
     if not 0 < scale < np.inf:
-        raise UserError(
-            f"depth scale {scale}", "metres per unit, above 0", "pass 0.001 for millimetres"
-        )
+        fix = "pass 0.001 for millimetres"
+        raise UserError(f"depth scale {scale}", "metres per unit, above 0", fix)
     units = read_image(path)
     if units.dtype != np.uint16 or units.ndim != 2:
         raise UserError(
@@ -137,21 +128,17 @@ class DepthView:
         noise: Standard deviation of the depth at the part, metres.
     """
 
-    depth: Float[np.ndarray, "height width"]
+    depth: Depth
     K: CameraMatrix
     rays: Float[np.ndarray, "height width 3"]
     noise: float
 
-    def points(self, chosen: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "points 3"]:
+    def points(self, chosen: Region) -> Points:
         """Return the camera-frame points of some pixels, metres."""
         return np.asarray(self.rays[chosen] * self.depth[chosen][:, None])
 
 
-def view_around(
-    depth: Float[np.ndarray, "height width"],
-    K: CameraMatrix,
-    points_cam: Float[np.ndarray, "points 3"],
-) -> DepthView | None:
+def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView | None:
     """Cut out what a part at some pose can have to do with; None outside the image."""
     u, v = (points_cam[:, :2] / points_cam[:, 2:] * K.diagonal()[:2] + K[:2, 2]).T
     edge = MARGIN * max(np.ptp(u), np.ptp(v))
@@ -187,14 +174,14 @@ class Overlay:
             depth was measured.
     """
 
-    points: Float[np.ndarray, "points 3"]
+    points: Points
     pixels: Int[np.ndarray, "points 2"]
-    distance: Float[np.ndarray, "height width"]
+    distance: Depth
     nearest: Int[np.ndarray, "height width"]
-    offset: Float[np.ndarray, "height width"]
+    offset: Depth
 
     @property
-    def covered(self) -> Bool[np.ndarray, "height width"]:
+    def covered(self) -> Region:
         """Pixels of the part with a measured depth."""
         return np.asarray((self.distance <= COVERED) & np.isfinite(self.offset))
 
@@ -205,15 +192,11 @@ class Overlay:
 
 
 def lay_over(
-    view: DepthView, surface: SurfacePoints, seen: Bool[np.ndarray, "points"], T_cam_obj: Transform
+    view: DepthView, surface: SurfacePoints, seen: Seen, T_cam_obj: Transform
 ) -> Overlay | None:
     """Relate every pixel of a view to a posed part's nearest visible point; None if none is in it.
 
-    Args:
-        view: The depth.
-        surface: The part's points.
-        seen: Which of them the camera sees.
-        T_cam_obj: The pose.
+    ``seen`` tells which of the part's points the camera sees.
     """
     points = surface.points[seen] @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     normals = surface.normals[seen] @ T_cam_obj[:3, :3].T

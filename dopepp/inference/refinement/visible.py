@@ -18,6 +18,15 @@ from scipy.spatial import KDTree
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import Transform
 
+Depth = Float[np.ndarray, "height width"]
+Region = Bool[np.ndarray, "height width"]
+"""Metres along z of every pixel, and some of the pixels."""
+
+Points = Float[np.ndarray, "points 3"]
+Seen = Bool[np.ndarray, "points"]
+PoseMatrix = Float[np.ndarray, "6 6"]
+"""Covariance or information of a turn (radians) and a shift (metres)."""
+
 MOST_POINTS: Final = 3000
 """More do not make a refinement better, only slower."""
 
@@ -53,16 +62,15 @@ class SurfacePoints:
         spacing: Side of the square of surface that a point stands for, metres.
     """
 
-    points: Float[np.ndarray, "points 3"]
-    normals: Float[np.ndarray, "points 3"]
+    points: Points
+    normals: Points
     spacing: float
 
 
-def surface_points(points: Float[np.ndarray, "points 3"]) -> SurfacePoints:
+def surface_points(points: Points) -> SurfacePoints:
     """Estimate the normals and the spacing of surface points (object frame, metres).
 
-    Raises:
-        ValueError: There are fewer than :data:`FEWEST_POINTS`.
+    Fewer than :data:`FEWEST_POINTS` are a ``ValueError``.
     """
     if len(points) < FEWEST_POINTS:
         raise ValueError(f"{len(points)} points are no surface, {FEWEST_POINTS} are needed")
@@ -78,13 +86,11 @@ def surface_points(points: Float[np.ndarray, "points 3"]) -> SurfacePoints:
     return SurfacePoints(points, _normals(offsets / spacing), spacing)
 
 
-def _normals(offsets: Float[np.ndarray, "points near 3"]) -> Float[np.ndarray, "points 3"]:
+def _normals(offsets: Float[np.ndarray, "points near 3"]) -> Points:
     """Return the normal of the plane through each point and two neighbours that most others fit.
 
-    A plane of least squares would mix the two faces of a thin plate.
-
-    Args:
-        offsets: From each point to its neighbours, in spacings.
+    A plane of least squares would mix the two faces of a thin plate. Offsets are from each point to
+    its neighbours, in spacings.
     """
     best = np.full(len(offsets), np.inf)
     normals = np.zeros((len(offsets), 3))
@@ -99,13 +105,8 @@ def _normals(offsets: Float[np.ndarray, "points near 3"]) -> Float[np.ndarray, "
     return normals
 
 
-def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Bool[np.ndarray, "points"]:
-    """Tell which points no other part of the surface hides.
-
-    Args:
-        surface: The part's points.
-        T_cam_obj: Its pose, metres; all points are in front of the camera.
-    """
+def visible(surface: SurfacePoints, T_cam_obj: Transform) -> Seen:
+    """Tell which points no other part of the surface hides; all are in front of the camera."""
     points = surface.points @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
     normals = surface.normals @ T_cam_obj[:3, :3].T
     rays = points / points[:, 2:]

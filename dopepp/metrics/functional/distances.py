@@ -9,6 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.metrics.functional.inputs import (
+    Errors,
+    Points,
+    Positions,
+    Rotations,
+    Symmetries,
     check_cameras,
     check_poses,
     check_symmetries,
@@ -24,17 +29,9 @@ _CHUNK_PAIRS: Final = 1 << 26
 
 
 def add(
-    R_est: Float[Tensor, "n 3 3"],
-    t_est: Float[Tensor, "n 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    t_gt: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
-) -> Float[Tensor, "n"]:
-    """Average distance between corresponding points at both poses (ADD, paper Eq. 1), metres.
-
-    Raises:
-        ValueError: A shape is wrong or there are no points.
-    """
+    R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
+) -> Errors:
+    """Average distance between corresponding points at both poses (ADD, paper Eq. 1), metres."""
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     # R_est·x + t_est − R_gt·x − t_gt needs one product instead of two.
     rotation, translation = R_est - R_gt, t_est - t_gt
@@ -45,19 +42,12 @@ def add(
 
 
 def add_s(
-    R_est: Float[Tensor, "n 3 3"],
-    t_est: Float[Tensor, "n 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    t_gt: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
-) -> Float[Tensor, "n"]:
+    R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
+) -> Errors:
     """Average distance from each true point to the nearest ESTIMATED point (ADD-S), metres.
 
     Exact, for symmetric objects: one tree over the object's points serves all poses on a CPU; on a
     GPU every pair of points is compared.
-
-    Raises:
-        ValueError: A shape is wrong or there are no points.
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     everything = torch.cat([R_est.flatten(1), t_est, R_gt.flatten(1), t_gt], dim=1)
@@ -75,18 +65,11 @@ def add_s(
 
 
 def compare_all_pairs(
-    R_est: Float[Tensor, "n 3 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    offset: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
-) -> Float[Tensor, "n"]:
+    R_est: Rotations, R_gt: Rotations, offset: Positions, points: Points
+) -> Errors:
     """Average the distances to the nearest points by comparing every pair: ADD-S for a GPU.
 
-    Args:
-        R_est: Estimated rotations.
-        R_gt: True rotations.
-        offset: True minus estimated translation, metres.
-        points: Object frame, metres.
+    ``offset`` is the true minus the estimated translation, metres.
     """
     errors = offset.new_empty(len(offset))
     rows = max(1, _CHUNK_PAIRS // len(points))
@@ -102,37 +85,26 @@ def compare_all_pairs(
 
 
 def mssd(
-    R_est: Float[Tensor, "n 3 3"],
-    t_est: Float[Tensor, "n 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    t_gt: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
-    symmetries: Float[Tensor, "s 4 4"] | None = None,
-) -> Float[Tensor, "n"]:
+    R_est: Rotations,
+    t_est: Positions,
+    R_gt: Rotations,
+    t_gt: Positions,
+    points: Points,
+    symmetries: Symmetries | None = None,
+) -> Errors:
     """Maximum symmetry-aware surface distance, metres (MSSD; Drost et al. 2017, BOP 2019).
 
     min over S of max over x of ‖(R̂x + t̂) − (R(Sx) + t)‖.
 
-    Args:
-        R_est: Estimated rotations.
-        t_est: Estimated translations, metres.
-        R_gt: True rotations.
-        t_gt: True translations, metres.
-        points: Object frame, metres.
-        symmetries: The transforms S, taken as they are: put the identity among them, as
-            :func:`dopepp.geometry.symmetry.symmetry_group` does. (S, 3, 3) are rotations.
-
-    Raises:
-        ValueError: A shape is wrong or there are no points.
+    The transforms S are taken as they are: put the identity among them, as
+    :func:`dopepp.geometry.symmetry.symmetry_group` does. (S, 3, 3) are rotations.
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     group = check_symmetries(symmetries, t_est)
     return least_farthest((R_est, t_est), (R_gt, t_gt), points, group, perspective=False)
 
 
-def _lengths(
-    rotation: Float[Tensor, "n 3 3"], translation: Float[Tensor, "n 3"], points: Tensor
-) -> Float[Tensor, "n v"]:
+def _lengths(rotation: Rotations, translation: Positions, points: Tensor) -> Float[Tensor, "n v"]:
     """Return ‖A x + b‖ of every point for every pair (A, b)."""
     offsets = torch.baddbmm(
         translation[..., None], rotation, points.T.expand(len(rotation), *points.T.shape)
@@ -141,20 +113,17 @@ def _lengths(
 
 
 def reprojection_error(
-    R_est: Float[Tensor, "n 3 3"],
-    t_est: Float[Tensor, "n 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    t_gt: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
+    R_est: Rotations,
+    t_est: Positions,
+    R_gt: Rotations,
+    t_gt: Positions,
+    points: Points,
     K: Float[Tensor, "*n 3 3"],
-) -> Float[Tensor, "n"]:
+) -> Errors:
     """Average pixel distance between the points' projections at both poses.
 
     One K serves all poses, or each has its own. A point at or behind the camera in either pose
     makes the error infinite.
-
-    Raises:
-        ValueError: A shape is wrong or there are no points.
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     K = check_cameras(K, len(R_est))
@@ -167,30 +136,19 @@ def reprojection_error(
 
 
 def mspd(
-    R_est: Float[Tensor, "n 3 3"],
-    t_est: Float[Tensor, "n 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    t_gt: Float[Tensor, "n 3"],
-    points: Float[Tensor, "v 3"],
+    R_est: Rotations,
+    t_est: Positions,
+    R_gt: Rotations,
+    t_gt: Positions,
+    points: Points,
     K: Float[Tensor, "*n 3 3"],
-    symmetries: Float[Tensor, "s 4 4"] | None = None,
-) -> Float[Tensor, "n"]:
+    symmetries: Symmetries | None = None,
+) -> Errors:
     """Maximum symmetry-aware projection distance, pixels (MSPD; BOP 2019).
 
     min over S of max over x of ‖π(R̂x + t̂) − π(R(Sx) + t)‖. A point at or behind the camera makes
-    it infinite.
-
-    Args:
-        R_est: Estimated rotations.
-        t_est: Estimated translations, metres.
-        R_gt: True rotations.
-        t_gt: True translations, metres.
-        points: Object frame, metres.
-        K: One camera matrix, or one for every pose; pixels.
-        symmetries: As of :func:`dopepp.metrics.functional.mssd`.
-
-    Raises:
-        ValueError: A shape is wrong or there are no points.
+    it infinite. K is one camera matrix, or one for every pose, pixels; symmetries are as of
+    :func:`dopepp.metrics.functional.mssd`.
     """
     R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
     K = check_cameras(K, len(R_est))
@@ -205,9 +163,7 @@ def mspd(
     return least_farthest(estimated, true, points, group, perspective=True)
 
 
-def _project(
-    R: Float[Tensor, "n 3 3"], t: Float[Tensor, "n 3"], points: Tensor, K: Float[Tensor, "n 3 3"]
-) -> Float[Tensor, "n v 2"]:
+def _project(R: Rotations, t: Positions, points: Tensor, K: Rotations) -> Float[Tensor, "n v 2"]:
     """Project points at poses to pixels; NaN at or behind the camera."""
     cam = points @ R.mT + t[:, None]
     depth = cam[..., 2:]
@@ -216,22 +172,14 @@ def _project(
 
 
 def rotation_error_deg(
-    R_est: Float[Tensor, "n 3 3"],
-    R_gt: Float[Tensor, "n 3 3"],
-    symmetries: Float[Tensor, "s 4 4"] | None = None,
-) -> Float[Tensor, "n"]:
+    R_est: Rotations, R_gt: Rotations, symmetries: Symmetries | None = None
+) -> Errors:
     """Angle of the rotation between two orientations, degrees in [0, 180].
 
     ``atan2(|axial vector|, trace − 1)`` keeps its digits near 0° and 180°, where arccos loses half.
 
-    Args:
-        R_est: Estimated rotations.
-        R_gt: True rotations.
-        symmetries: Where given, the smallest angle to R_gt·S of these transforms; taken as they
-            are, so put the identity among them. (S, 3, 3) are rotations.
-
-    Raises:
-        ValueError: A shape is wrong.
+    With symmetries it is the smallest angle to R_gt·S of these transforms; they are taken as they
+    are, so put the identity among them. (S, 3, 3) are rotations.
     """
     R_est, R_gt = to_float64(R_est), to_float64(R_gt)
     if R_est.shape != R_gt.shape or R_est.shape[1:] != (3, 3):
@@ -244,7 +192,7 @@ def rotation_error_deg(
     return errors
 
 
-def _angles_deg(Q: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
+def _angles_deg(Q: Rotations) -> Errors:
     axial = torch.stack(
         [Q[:, 2, 1] - Q[:, 1, 2], Q[:, 0, 2] - Q[:, 2, 0], Q[:, 1, 0] - Q[:, 0, 1]], dim=1
     )
@@ -252,8 +200,6 @@ def _angles_deg(Q: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
     return torch.rad2deg(torch.atan2(axial.norm(dim=1), trace - 1))
 
 
-def translation_error(
-    t_est: Float[Tensor, "n 3"], t_gt: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n"]:
+def translation_error(t_est: Positions, t_gt: Positions) -> Errors:
     """Distance between the two positions of the object's origin, metres."""
     return nan_is_miss((to_float64(t_est) - to_float64(t_gt)).norm(dim=1))

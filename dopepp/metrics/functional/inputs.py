@@ -9,6 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Rotations = Float[Tensor, "n 3 3"]
+Positions = Float[Tensor, "n 3"]
+Points = Float[Tensor, "v 3"]
+Symmetries = Float[Tensor, "s 4 4"]
+Errors = Float[Tensor, "n"]
+"""Of N poses and one object's V points: metres, object frame; errors infinite for a miss."""
+
 _CHUNK_POINTS: Final = 1 << 17
 """Transformed points held at once: 3 MB in float64, which stays in a CPU's cache."""
 
@@ -23,8 +30,7 @@ def check_poses(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Cast to float64 and insist on the shapes that broadcasting would otherwise hide.
 
-    Raises:
-        ValueError: A shape is wrong or there are no points.
+    A wrong shape, or no points, are a ``ValueError``.
     """
     R_est, t_est, R_gt, t_gt, points = map(to_float64, (R_est, t_est, R_gt, t_gt, points))
     n = len(t_est)
@@ -36,12 +42,8 @@ def check_poses(
     return R_est, t_est, R_gt, t_gt, points
 
 
-def check_cameras(K: Tensor, num_poses: int) -> Float[Tensor, "n 3 3"]:
-    """Return one camera matrix for every pose.
-
-    Raises:
-        ValueError: K is neither (3, 3) nor (N, 3, 3).
-    """
+def check_cameras(K: Tensor, num_poses: int) -> Rotations:
+    """Return one camera matrix for every pose; K must be (3, 3) or (N, 3, 3)."""
     K = to_float64(K)
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (num_poses,)):
         raise ValueError(f"K must be (3, 3) or (N, 3, 3) of N = {num_poses}, got {tuple(K.shape)}")
@@ -51,10 +53,9 @@ def check_cameras(K: Tensor, num_poses: int) -> Float[Tensor, "n 3 3"]:
 def check_symmetries(
     symmetries: Tensor | None, like: Tensor
 ) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
-    """Split symmetry transforms into rotations and translations; None is the identity alone.
+    """Split (S, 4, 4) or (S, 3, 3) transforms into rotations and translations.
 
-    Raises:
-        ValueError: They are neither (S, 4, 4) nor (S, 3, 3) with S >= 1.
+    None is the identity alone; any other shape is a ``ValueError``.
     """
     if symmetries is None:
         return torch.eye(3, dtype=like.dtype, device=like.device)[None], like.new_zeros(1, 3)

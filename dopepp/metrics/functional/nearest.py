@@ -23,11 +23,7 @@ _ROUNDING: Final = 1e-9
 
 
 class NearestPoints:
-    """Finds nearest points between an object and itself at another pose; exact.
-
-    Args:
-        points: Object frame, metres.
-    """
+    """Finds nearest points (metres) between an object and itself at another pose; exact."""
 
     def __init__(self, points: Float[np.ndarray, "v 3"]) -> None:
         depth = max(math.ceil(math.log2(len(points) / _LEAF)), 0)
@@ -54,10 +50,8 @@ class NearestPoints:
     ) -> Float[np.ndarray, "n"]:
         """Return the mean distance from the true points to their nearest estimated ones, metres.
 
-        Args:
-            R_est: Estimated rotations; of any matrix here the formula holds.
-            R_gt: True rotations.
-            offset: True minus estimated translation, metres.
+        ``offset`` is the true minus the estimated translation, metres. The formula holds for any
+        matrix, not rotations alone.
         """
         distances = np.empty(len(offset))
         # ‖R_est v‖ ≥ s ‖v‖ with the smallest singular value s: 1 for a rotation.

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.metrics.functional.inputs import nan_is_miss, to_float64
+from dopepp.metrics.functional.inputs import Errors, nan_is_miss, to_float64
 
 AucMethod = Literal["exact", "voc"]
 
@@ -24,7 +24,7 @@ BOP_MSPD_THRESHOLDS: Final = tuple(5.0 * k for k in range(1, 11))
 """5 to 50 pixels: of MSPD in an image 640 pixels wide; times width/640 in others (BOP)."""
 
 
-def auc(errors: Float[Tensor, "n"], max_threshold: float, method: AucMethod = "exact") -> float:
+def auc(errors: Errors, max_threshold: float, method: AucMethod = "exact") -> float:
     """Area under the accuracy-threshold curve from 0 to ``max_threshold``, as a share of 1.
 
     Args:
@@ -35,11 +35,8 @@ def auc(errors: Float[Tensor, "n"], max_threshold: float, method: AucMethod = "e
             counts from its left end: (Σ (eᵢ − eᵢ₋₁)·i + (max − eₖ)·k) / (N·max), e₀ = 0. It is
             larger than ``exact`` by eₖ / (N·max).
 
-    Returns:
-        The area in [0, 1]; 0.0 without errors.
-
-    Raises:
-        UserError: The method is unknown or ``max_threshold`` is not positive.
+    A :class:`UserError`: the method is unknown or ``max_threshold`` is not positive. Without errors
+    the area is 0.0.
     """
     if not max_threshold > 0:
         raise UserError(
@@ -60,27 +57,18 @@ def auc(errors: Float[Tensor, "n"], max_threshold: float, method: AucMethod = "e
     return float(edges.diff() @ ranks) / (len(errors) * max_threshold)
 
 
-def pass_rate(errors: Float[Tensor, "n"], threshold: float) -> float:
+def pass_rate(errors: Errors, threshold: float) -> float:
     """Share of errors strictly below ``threshold``, TP / (TP + FN); 0.0 without errors."""
     errors = to_float64(errors)
     return float((errors < threshold).double().mean()) if len(errors) else 0.0
 
 
-def average_recall(errors: Float[Tensor, "n"], thresholds: Sequence[float]) -> float:
+def average_recall(errors: Errors, thresholds: Sequence[float]) -> float:
     """Mean of the pass rates at several thresholds: BOP's AR of one error function.
 
     AR_MSSD takes :data:`BOP_THRESHOLDS` times the diameter, AR_MSPD
-    :data:`BOP_MSPD_THRESHOLDS` times width/640.
-
-    Args:
-        errors: One error per instance that is to be found; a miss is infinite.
-        thresholds: In the unit of the errors.
-
-    Returns:
-        The average in [0, 1]; 0.0 without errors.
-
-    Raises:
-        UserError: There is no threshold.
+    :data:`BOP_MSPD_THRESHOLDS` times width/640. A miss is infinite; without errors the average is
+    0.0. No threshold at all is a :class:`UserError`.
     """
     if not len(thresholds):
         raise UserError("no thresholds", "one or more", "give those of BOP_THRESHOLDS")
@@ -93,16 +81,8 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
     With z the two-sided normal quantile and p = passed / num, the ends are
     (p + z²/2n ± z·√(p(1 − p)/n + z²/4n²)) / (1 + z²/n).
 
-    Args:
-        passed: Trials that passed.
-        num: All trials.
-        confidence: Chance that the interval holds the true rate.
-
-    Returns:
-        Its ends, in [0, 1]; (0, 1) without trials.
-
-    Raises:
-        ValueError: ``passed`` is not in 0 … num, or ``confidence`` not strictly between 0 and 1.
+    Without trials they are (0, 1). A ``ValueError``: ``passed`` is not in 0 … ``num``, or the
+    confidence, the chance that the interval holds the true rate, not strictly between 0 and 1.
     """
     if not 0 <= passed <= num or not 0 < confidence < 1:
         raise ValueError(f"passed={passed}, num={num}, confidence={confidence}")
@@ -124,16 +104,8 @@ def expected_calibration_error(
 
     Predictions are put into bins of equal width by their score; each bin counts by its size.
 
-    Args:
-        scores: Confidence of every prediction, in [0, 1].
-        correct: Whether it is right.
-        bins: Number of bins; a score on an edge belongs to the lower one, as there.
-
-    Returns:
-        The error in [0, 1]; 0.0 without predictions.
-
-    Raises:
-        ValueError: The two differ in length, a score is outside of [0, 1], or there are no bins.
+    A score on an edge belongs to the lower bin, as there; without predictions the error is 0.0. A
+    ``ValueError``: the two differ in length, a score is outside of [0, 1], or there are no bins.
     """
     scores, correct = to_float64(scores), torch.as_tensor(correct, dtype=torch.bool)
     if scores.shape != correct.shape or scores.ndim != 1 or bins < 1:
@@ -169,13 +141,8 @@ def match(
     next one the nearest that is left, and so on. Equal scores go in input order, equal distances
     to the first instance; a score that is NaN comes last and a distance that is NaN never matches.
 
-    Args:
-        scores: Confidence of each prediction.
-        distances: Metres from each prediction (row) to each instance (column).
-        max_distance: Largest distance of a match, metres.
-
-    Returns:
-        The instance of each prediction, −1 where it has none.
+    Distances are metres from each prediction (row) to each instance (column). Returned is the
+    instance of each prediction, −1 where it has none.
     """
     scores, distances = to_float64(scores), to_float64(distances)
     if distances.shape[0] != len(scores) or distances.ndim != 2:
@@ -198,17 +165,9 @@ def average_precision(
 ) -> float:
     """Mean of the precision at 101 recalls, each the best at that recall or a higher one (COCO).
 
-    Args:
-        scores: Confidence of every prediction of the whole test set; equal ones stay in order and
-            a score that is NaN comes last.
-        correct: Whether it is the one that found its instance; a duplicate is not.
-        num_instances: Instances that were to be found.
-
-    Returns:
-        The average precision in [0, 1]; 0.0 without predictions or without instances.
-
-    Raises:
-        ValueError: The two differ in length, or more are correct than there are instances.
+    Equal scores stay in order and a score that is NaN comes last; a duplicate is not correct.
+    Without predictions or without instances (that were to be found) it is 0.0. A ``ValueError``:
+    the two differ in length, or more are correct than there are instances.
     """
     scores, correct = to_float64(scores), torch.as_tensor(correct, dtype=torch.bool)
     if scores.shape != correct.shape or scores.ndim != 1:

@@ -16,28 +16,31 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.metrics.functional.inputs import chunks, nan_is_miss
+from dopepp.metrics.functional.inputs import (
+    Errors,
+    Points,
+    Positions,
+    Rotations,
+    chunks,
+    nan_is_miss,
+)
 
 _NUM_PROBES: Final = 8
 """Points tried first: as many as a box has corners."""
 
 
 def least_farthest(
-    estimated: tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]],
-    true: tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]],
-    points: Float[Tensor, "v 3"],
+    estimated: tuple[Rotations, Positions],
+    true: tuple[Rotations, Positions],
+    points: Points,
     symmetries: tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]],
     perspective: bool,
-) -> Float[Tensor, "n"]:
+) -> Errors:
     """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖, infinite where it is NaN.
 
-    Args:
-        estimated: B and b.
-        true: A and a.
-        points: x, metres.
-        symmetries: Rotations and translations of the transforms S.
-        perspective: Whether π divides by the third coordinate, which must be positive; otherwise
-            it changes nothing.
+    Estimated are (B, b), true are (A, a); symmetries are rotations and translations of the S. With
+    ``perspective`` π divides by the third coordinate, which must be positive; otherwise it changes
+    nothing.
     """
     if points.device.type != "cpu":
         return _try_everything(estimated, true, points, symmetries, perspective)
@@ -57,7 +60,7 @@ def _try_everything(
     points: Tensor,
     symmetries: tuple[Tensor, Tensor],
     perspective: bool,
-) -> Float[Tensor, "n"]:
+) -> Errors:
     """Take every point under every symmetry, many at once: for a GPU."""
     errors = torch.full_like(true[1][:, 0], torch.inf)
     for chunk in chunks(len(errors), len(points)):
@@ -170,15 +173,9 @@ def _search(
 def _least(
     P: Array, p: Array, points: Array, targets: Array, floors: Array, perspective: bool
 ) -> float:
-    """Return the least squared maximum over the symmetries.
+    """Return the least squared maximum over the symmetries, given as matrices and translations.
 
-    Args:
-        P: Matrix of every symmetry, shape (S, 3, 3).
-        p: Its translation, shape (S, 3).
-        points: Shape (V, 3).
-        targets: Where the points should be.
-        floors: Of every symmetry, the maximum over some points.
-        perspective: As of :func:`least_farthest`.
+    ``targets`` is where the points should be, ``floors`` of every symmetry the maximum over some.
     """
     promising = floors.argmin()
     best, culprit = np.inf, 0

@@ -53,8 +53,7 @@ def released_paths() -> dict[str, Path]:
 def find(path: Path) -> Path:
     """Return the file that a path stands for: ``pretrained/NAME`` is a released checkpoint.
 
-    Raises:
-        UserError: No checkpoint of that name was released.
+    If none of that name was released, it is a :class:`UserError`.
     """
     if path.parent != Path(FOLDER) or path.exists():
         return path
@@ -68,8 +67,7 @@ def find(path: Path) -> Path:
 def read_content(path: Path) -> tuple[dict[str, Any], int]:
     """Read weights, in single precision, and payload; returns them and their size in bytes.
 
-    Raises:
-        UserError: The file is missing, damaged or foreign.
+    A file that is missing, damaged or foreign is a :class:`UserError`.
     """
     tensors, metadata = read_safetensors(path)
     if KEY not in metadata:
@@ -86,13 +84,8 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
 def write_content(content: Mapping[str, Any], path: Path) -> None:
     """Write weights in half precision and the payload without local paths.
 
-    Args:
-        content: As :meth:`dopepp.models.checkpoint.schema.Checkpoint.to_file` returns it.
-        path: The file.
-
-    Raises:
-        UserError: A weight does not fit into half precision.
-        OSError: The folder cannot be written.
+    The content is as :meth:`~dopepp.models.checkpoint.schema.Checkpoint.to_file` returns it. A
+    weight that does not fit into half precision is a :class:`UserError`.
     """
     weights = {name: _half(name, value) for name, value in content["state_dict"].items()}
     payload = json.dumps(_portable(content[KEY]), allow_nan=False)
@@ -100,13 +93,9 @@ def write_content(content: Mapping[str, Any], path: Path) -> None:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file that anybody may have written.
+    """Read a file that anybody may have written: tensors by name, on the CPU, and the metadata.
 
-    Returns:
-        The tensors by name, on the CPU, and the metadata.
-
-    Raises:
-        UserError: The file is missing, damaged or too large, or its header is.
+    A file that is missing, damaged or too large, or whose header is, is a :class:`UserError`.
     """
     path = Path(path)
     try:
@@ -134,16 +123,9 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def write_safetensors(
     path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write a file, whole or not at all.
+    """Write a file, whole or not at all: tensors of any device and strides, metadata as texts.
 
-    Args:
-        path: The file.
-        tensors: By name, on any device, of any strides.
-        metadata: What else the file says, text by name.
-
-    Raises:
-        ValueError: The header is longer than what is read.
-        OSError: The folder cannot be written.
+    A header longer than what is read is a ``ValueError``.
     """
     plain = {name: one.detach().cpu().contiguous().clone() for name, one in tensors.items()}
     content = save(plain, dict(metadata))

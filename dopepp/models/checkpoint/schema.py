@@ -104,12 +104,9 @@ class Checkpoint:
 def read(path: Path) -> Checkpoint:
     """Read a checkpoint and check that its weights fit its own spec.
 
-    Args:
-        path: A file that training or ``dopepp release`` has written, or ``pretrained/NAME``.
-
-    Raises:
-        UserError: The file is missing, damaged, foreign, too large, written by a newer version,
-            names something that may not be built, or is not consistent.
+    The path is of a file that training or ``dopepp release`` has written, or ``pretrained/NAME``. A
+    :class:`UserError`: the file is missing, damaged, foreign, too large, written by a newer
+    version, names something that may not be built, or is not consistent.
     """
     path = released.find(Path(path))
     if path.suffix == released.SUFFIX:
@@ -128,11 +125,7 @@ def read(path: Path) -> Checkpoint:
 
 
 def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
-    """Read a checkpoint and return its network, in evaluation mode on the CPU, and itself.
-
-    Raises:
-        UserError: As :func:`read`.
-    """
+    """Read a checkpoint as :func:`read`; return its network, evaluating on the CPU, and itself."""
     checkpoint = read(path)
     network = build_network(checkpoint.spec)
     network.load_state_dict(checkpoint.state_dict)
@@ -146,18 +139,13 @@ def _parse(content: Mapping[str, Any]) -> Checkpoint:
     _check_plain(payload)
     version = _take(payload, "format_version", int)
     if not 1 <= version <= FORMAT_VERSION:
-        raise UserError(
-            f"format_version {version}", f"1 to {FORMAT_VERSION}", "update dopepp to read this file"
-        )
+        fix = "update dopepp to read this file"
+        raise UserError(f"format_version {version}", f"1 to {FORMAT_VERSION}", fix)
     input_size = _take(payload, "input_size", list)
-    if len(input_size) != 2 or not all(
-        type(side) is int and 0 < side <= MAX_SIDE for side in input_size
-    ):
-        raise UserError(
-            f"input_size {input_size!r:.100}",
-            f"[width, height] in pixels, at most {MAX_SIDE}",
-            "train again",
-        )
+    sound = all(type(side) is int and 0 < side <= MAX_SIDE for side in input_size)
+    if len(input_size) != 2 or not sound:
+        allowed = f"[width, height] in pixels, at most {MAX_SIDE}"
+        raise UserError(f"input_size {input_size!r:.100}", allowed, "train again")
     sigma = _take(payload, "sigma", float)
     if not (math.isfinite(sigma) and sigma > 0):
         raise UserError(f"sigma {sigma}", "a positive number of cells", "train again")
@@ -187,20 +175,15 @@ def _check_plain(payload: Mapping[Any, Any]) -> None:
         try:
             _count(value, 0, known)
         except ValueError as error:
-            raise UserError(
-                f"{name!s:.50} with {error}",
-                "mappings, lists, text, numbers, true/false and null",
-                "write the file with train.py",
-            ) from error
+            allowed = "mappings, lists, text, numbers, true/false and null"
+            fix = "write the file with train.py"
+            raise UserError(f"{name!s:.50} with {error}", allowed, fix) from error
 
 
 def _count(value: object, depth: int, known: dict[int, int]) -> int:
     """Return how many plain values there are in one, as often as they are there.
 
-    Args:
-        value: What a file holds.
-        depth: Containers around it.
-        known: Numbers of containers that were counted, by their identity.
+    ``known`` are the numbers of containers that were counted, by their identity.
     """
     if type(value) not in (dict, list, tuple):
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:
@@ -226,11 +209,8 @@ def _count(value: object, depth: int, known: dict[int, int]) -> int:
 def _take(payload: Mapping[str, Any], name: str, expected: type[T]) -> T:
     value = payload.get(name)
     if type(value) is not expected:
-        raise UserError(
-            f"{name} {value!r:.100}",
-            f"{name} as {expected.__name__}",
-            "write the file with train.py",
-        )
+        allowed = f"{name} as {expected.__name__}"
+        raise UserError(f"{name} {value!r:.100}", allowed, "write the file with train.py")
     return value
 
 
@@ -238,19 +218,15 @@ def _take_numbers(payload: Mapping[str, Any], name: str) -> dict[str, float]:
     numbers = _take(payload, name, dict)
     for key, value in numbers.items():
         if type(key) is not str or type(value) not in (int, float):
-            raise UserError(
-                f"{name} with {key!r:.100}: {value!r:.100}", "numbers by name", "train again"
-            )
+            got = f"{name} with {key!r:.100}: {value!r:.100}"
+            raise UserError(got, "numbers by name", "train again")
     return numbers
 
 
 def _parse_weights(state_dict: object) -> dict[str, Tensor]:
     if not isinstance(state_dict, dict):
-        raise UserError(
-            f"state_dict as {type(state_dict).__name__}",
-            "weights by name",
-            "write it with train.py",
-        )
+        got = f"state_dict as {type(state_dict).__name__}"
+        raise UserError(got, "weights by name", "write it with train.py")
     return {
         name.removeprefix(STATE_PREFIX): value
         for name, value in state_dict.items()

@@ -63,13 +63,8 @@ memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
     """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
 
-    Args:
-        payload: What to write.
-        path: The file.
-        previous: Where the file that was there is kept; it is gone if None.
-
-    Raises:
-        OSError: The folder cannot be written; the old file is intact and nothing else is left.
+    The file that was there is kept at ``previous``, or gone if that is None. Where the folder
+    cannot be written (``OSError``), the old file is intact and nothing else is left.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -107,15 +102,9 @@ def _serialise(payload: Mapping[str, Any], stream: IO[bytes]) -> None:
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
 
-    Loading takes no more memory than the file has bytes.
-
-    Args:
-        path: The file, also one of torch before 1.6.
-        what: What it should be, for messages.
-
-    Raises:
-        UserError: The file is missing, damaged, holds something else or more than tensors and
-            plain values, or unpacks to too much.
+    Loading takes no more memory than the file, also one of torch before 1.6, has bytes. ``what``
+    says in messages what it should be. A :class:`UserError`: it is missing, damaged, holds
+    something else or more than tensors and plain values, or unpacks to too much.
     """
     path = Path(path)
     if not path.is_file():
@@ -149,13 +138,8 @@ def check_container(path: Path, what: str) -> int:
     """Return a zip archive's unpacked size; it holds no more than the file has bytes.
 
     ``torch.save`` stores without compression, so a file that promises more than it has is a bomb.
-
-    Args:
-        path: The file.
-        what: What it should be, for messages.
-
-    Raises:
-        UserError: The file is missing, is not a torch file, is cut short or unpacks to too much.
+    ``what`` says in messages what it should be. A :class:`UserError`: the file is missing, is not a
+    torch file, is cut short or unpacks to too much.
     """
     path = Path(path)
     if not path.is_file():
@@ -183,11 +167,7 @@ def check_container(path: Path, what: str) -> int:
 
 
 def _check_archive(path: Path) -> None:
-    """Hold a zip archive of torch's to what it may contain.
-
-    Raises:
-        ValueError: It holds something else.
-    """
+    """Hold a zip archive of torch's to what it may contain; else it is a ``ValueError``."""
     with zipfile.ZipFile(path) as archive:
         # torch takes any of two members of one name, and any of two pickles.
         sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
@@ -207,11 +187,10 @@ def _check_archive(path: Path) -> None:
 
 
 def _check_legacy(path: Path) -> None:
-    """Hold a file of torch before 1.6 to what it may contain.
+    """Hold a file of torch before 1.6 to what it may contain; else it is a ``ValueError``.
 
-    Raises:
-        ValueError: It holds something else, or fewer numbers than it says: torch allocates a
-            storage before it reads it (case "a storage of terabytes").
+    So are fewer numbers than it says: torch allocates a storage before it reads it (case "a storage
+    of terabytes").
     """
     with path.open("rb") as file:
         claimed = _claimed_storages(file.read(_MAX_PICKLE_BYTES + 1), _NUM_LEGACY_PICKLES)
@@ -222,13 +201,8 @@ def _check_legacy(path: Path) -> None:
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
     """Return the bytes that each storage claims to have, by its key.
 
-    Args:
-        content: Pickles one after the other, and whatever follows them.
-        num_pickles: How many of them.
-
-    Raises:
-        ValueError: A pickle is damaged or too long, or does what weights and plain values do not
-            need.
+    The content is some pickles one after the other, and whatever follows them. One that is damaged
+    or too long, or does what weights and plain values do not need, is a ``ValueError``.
     """
     stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
     try:

@@ -37,10 +37,8 @@ class AveragedWeights(WeightAveraging):
     training goes on with the weights under :data:`TRAINED`.
 
     Args:
-        decay: Between 0 (no averaging) and 1: the average spans about 1 / (1 − decay) steps.
-
-    Raises:
-        UserError: The decay is out of its range.
+        decay: Between 0 (no averaging) and 1: the average spans about 1 / (1 − decay) steps; any
+            other is a :class:`UserError`.
     """
 
     def __init__(self, decay: float) -> None:
@@ -115,12 +113,9 @@ class AveragedWeights(WeightAveraging):
 
 
 def go_on_with_trained(checkpoint: dict[str, Any]) -> None:
-    """Make the trained weights of a loaded checkpoint the ones that training goes on with.
+    """Make the trained weights of a checkpoint, just loaded, those that training goes on with.
 
     A run that was begun with an average may go on without one, which then is dropped.
-
-    Args:
-        checkpoint: As loaded, before anything has been taken from it; is changed.
     """
     if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]

@@ -44,9 +44,6 @@ class EmptyMaps(Callback):
 
     Args:
         patience: Validations; a network of few steps is rightly silent.
-
-    Raises:
-        UserError: The number is out of range.
     """
 
     def __init__(self, patience: int = 3) -> None:

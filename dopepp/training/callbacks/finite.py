@@ -98,9 +98,8 @@ class FiniteSteps(Callback):
         """Look at the pass without waiting for the device."""
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         statistics = [buffer for buffer in self._buffers if buffer.is_floating_point()]
-        norms = [
-            torch.nn.utils.get_total_norm(some).to(self._loss) for some in (gradients, statistics)
-        ]
+        tensors = gradients, statistics
+        norms = [torch.nn.utils.get_total_norm(one).to(self._loss) for one in tensors]
         bad = ~torch.stack([self._loss, *norms]).isfinite()
         self._passes.append(_Pass(self._batch, self._loss, bad))
 
@@ -109,8 +108,7 @@ class FiniteSteps(Callback):
     ) -> None:
         """Leave the step out if any process had a pass that was not finite.
 
-        Raises:
-            RunError: It was one too many, or the weights themselves are not finite.
+        One too many, or weights that are not finite, are a ``RunError``.
         """
         passes, self._passes = self._passes, []
         bad = torch.stack([one.bad for one in passes]).sum(dim=0)
@@ -170,12 +168,8 @@ class FiniteSteps(Callback):
         if "loss" in what:
             own = [one for one in own if one.bad[0]]
         if own:
-            facts = {
-                "step": trainer.global_step,
-                "epoch": trainer.current_epoch,
-                "not_finite": what,
-                "loss": float(own[0].loss),
-            }
+            facts: dict[str, Any] = {"step": trainer.global_step, "epoch": trainer.current_epoch}
+            facts |= {"not_finite": what, "loss": float(own[0].loss)}
             name = f"step_{trainer.global_step}_rank_{trainer.global_rank}"
             dump_batch(folder / name, own[0].batch, facts)
         return folder
@@ -184,11 +178,8 @@ class FiniteSteps(Callback):
 def dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
     """Write ``path.pt`` and ``path.png``; a disk that takes neither is reported, not raised.
 
-    Args:
-        path: Where, without suffix.
-        batch: The images and their poses.
-        facts: Plain values stored with them. The file is a mapping of these and of the batch's
-            fields, and loads under ``weights_only=True``.
+    The file is a mapping of the facts, plain values, and of the batch's fields, and loads under
+    ``weights_only=True``.
     """
     try:
         write_atomic({**facts, **vars(batch.to("cpu"))}, path.with_name(f"{path.name}.pt"))
@@ -213,11 +204,7 @@ def all_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def check_state(checkpoint: Mapping[str, Any]) -> None:
-    """Refuse to save weights or an optimiser's state that are not finite.
-
-    Raises:
-        RunError: They are not; what was saved before stays.
-    """
+    """Refuse, with a ``RunError``, to save weights or an optimiser's state that are not finite."""
     state = {name: checkpoint.get(name) for name in ("state_dict", "optimizer_states")}
     for name, value in state.items():
         if not all_finite(_tensors(value)):

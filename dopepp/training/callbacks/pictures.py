@@ -41,11 +41,8 @@ class AUCCurves(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw one curve per object; every process takes part in gathering the errors."""
-        metrics = next(
-            callback.metrics
-            for callback in trainer.callbacks  # type: ignore[attr-defined]
-            if isinstance(callback, PoseMetricsCallback)
-        )
+        listed: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        metrics = next(one.metrics for one in listed if isinstance(one, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
@@ -156,10 +153,8 @@ def heat_picture(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Blend one map into the dimmed image, the more opaque the stronger the belief.
 
-    Args:
-        image: RGB, at the network's input scale.
-        channel: A map that covers it; values are clipped to [0, 1].
-        stride: Pixels of the image per cell.
+    The image is at the scale of the network's input, ``stride`` pixels per cell of the map that
+    covers it, whose values are clipped to [0, 1].
     """
     # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
     large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)

@@ -134,10 +134,8 @@ class RunProgress(TQDMProgressBar):
 class Operators(PyTorchProfiler):
     """Torch's operators in a few steps of training and of validation, without what they call.
 
-    Lightning's own report is of the last recording alone, a validation.
-
-    Args:
-        folder: Where the report and a trace of each recording are written to.
+    Lightning's own report is of the last recording alone, a validation. The folder gets the report
+    and a trace of each recording.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -174,9 +172,7 @@ class Operators(PyTorchProfiler):
 def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
     """Build the profiler that ``trainer.profiler`` names.
 
-    Args:
-        kind: ``simple`` (hooks of the training loop), ``pytorch`` (operators, a few steps) or None.
-        run_dir: The run's folder.
+    ``simple`` is of the hooks of the training loop, ``pytorch`` of the operators in a few steps.
     """
     if kind is None:
         return None
@@ -188,9 +184,7 @@ def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> P
 def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
     """Return what took longest, a row of texts each; empty where nothing was recorded.
 
-    Args:
-        profiler: Of :func:`make_profiler`, after the training; of any other nothing is known.
-        limit: Rows, at most.
+    The profiler is of :func:`make_profiler`, after the training; of any other nothing is known.
     """
     totals: list[Total] = []
     if isinstance(profiler, Operators):

@@ -47,9 +47,6 @@ class TrialReport(Callback):
 
     Attributes:
         pruned: Why training was stopped; empty where it was not.
-
-    Raises:
-        UserError: A number is out of range.
     """
 
     def __init__(
@@ -78,9 +75,8 @@ class TrialReport(Callback):
         self._storage = open_storage(self._place)
         self._study = optuna.load_study(study_name=self._name, storage=self._storage, pruner=pruner)
         study_id = self._storage.get_study_id_from_name(self._name)
-        self._trial_id = self._storage.get_trial_id_from_study_id_trial_number(
-            study_id, self.number
-        )
+        find = self._storage.get_trial_id_from_study_id_trial_number
+        self._trial_id = find(study_id, self.number)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Report this epoch's value; one that goes on after an interruption repeats itself."""
@@ -104,11 +100,7 @@ class TrialReport(Callback):
 
 
 def raise_if_pruned(trainer: Trainer) -> None:
-    """Tell a training that was stopped early from one that ended.
-
-    Raises:
-        PrunedError: It was stopped; the message says why.
-    """
+    """Raise :class:`PrunedError`, which says why, if training was stopped early."""
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if isinstance(callback, TrialReport) and callback.pruned:
             raise PrunedError(callback.pruned)
@@ -117,8 +109,7 @@ def raise_if_pruned(trainer: Trainer) -> None:
 def open_storage(place: str) -> BaseStorage:
     """Open the database of a study, which is created where there is none.
 
-    Raises:
-        UserError: It cannot be opened.
+    A :class:`UserError`: it cannot be opened.
     """
     from optuna.exceptions import StorageInternalError
     from optuna.storages import RDBStorage

@@ -80,10 +80,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     ) -> None:
         """Write the file so that a crash leaves either the old or the new one.
 
-        Args:
-            checkpoint: What to write.
-            path: The file.
-            storage_options: None, or ``{"previous": PATH}`` to keep the old file there.
+        ``storage_options`` are None, or ``{"previous": PATH}`` to keep the old file there.
         """
         target = Path(os.fspath(path))
         self._waiting.pop(target, None)
@@ -93,11 +90,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             _log.warning("%s; trying again at the next saving", _failure(self.waiting[0], error))
 
     def finish(self) -> None:
-        """Write what is still waiting.
-
-        Raises:
-            SavingFailedError: It still cannot be written.
-        """
+        """Write what is still waiting, or raise :class:`SavingFailedError`."""
         error = self._write_waiting()
         if error is not None:
             raise SavingFailedError(_failure(self.waiting[0], error)) from error
@@ -139,9 +132,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         A run's folder may have been moved since: what its callbacks call their files is looked for
         beside the file itself.
         """
-        loaded: Mapping[str, Any] = super().load_checkpoint(
-            path, map_location=map_location, weights_only=True
-        )
+        loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
             return dict(loaded)
         folder = self._folder / FOLDER
@@ -155,10 +146,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
     """Return the newest whole checkpoint of a run; None if it has not saved any yet.
 
-    Every damaged file is reported in a line.
-
-    Raises:
-        UserError: There are checkpoints, and none is whole.
+    Every damaged file is reported in a line. If none is whole, it is a :class:`UserError`.
     """
     damaged = []
     for name in (LAST, PREVIOUS, BEST):
@@ -195,12 +183,8 @@ def saved_step(path: Path) -> int | None:
 def check_room(run_dir: Path, weight_bytes: int) -> None:
     """Check that a run can write its checkpoints, as far as that can be known in advance.
 
-    Args:
-        run_dir: The run's folder.
-        weight_bytes: Size of the network's weights.
-
-    Raises:
-        UserError: The folder cannot be written, or its disk has too little space.
+    A folder that cannot be written, or whose disk has too little space for weights of so many
+    bytes, is a :class:`UserError`.
     """
     folder = run_dir / FOLDER
     probe = folder / ".probe"
@@ -234,11 +218,7 @@ def sweep(run_dir: Path) -> None:
 
 
 def _read_whole(path: Path) -> tuple[Checkpoint, int]:
-    """Read a checkpoint after comparing its checksums, which torch does not do.
-
-    Raises:
-        UserError: It is damaged, or holds no training to go on with.
-    """
+    """Read a checkpoint after comparing its checksums, which torch does not do."""
     checkpoint = read(path)
     with zipfile.ZipFile(path) as archive:
         try:

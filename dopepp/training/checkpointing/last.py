@@ -133,11 +133,7 @@ class LastCheckpoint(Checkpoint):
         self._random = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the result.
-
-        Raises:
-            SavingFailedError: It cannot be written.
-        """
+        """Save the result; a ``SavingFailedError`` if it cannot be written."""
         self._stop.end()
         self._save(trainer, resume_point.between_epochs)
         if trainer.is_global_zero:
@@ -152,11 +148,7 @@ class LastCheckpoint(Checkpoint):
         self._stop.end()
 
     def _save_if_due(self, trainer: Trainer, cut: Cut) -> None:
-        """Save by the clock and by request; after a request, end the run.
-
-        Raises:
-            Interruption: A signal asks for it.
-        """
+        """Save by the clock and by request; after a request, end the run."""
         stop = self._stop.number
         wait_s = max(self.every_s, self._duration_s / self.max_share)
         due = trainer.is_global_zero and (
@@ -255,10 +247,8 @@ def _state(trainer: Trainer) -> tuple[int, float | None]:
 
 def _best(trainer: Trainer) -> ModelCheckpoint | None:
     """Return the callback that keeps the best checkpoint."""
-    for callback in trainer.checkpoint_callbacks:
-        if isinstance(callback, ModelCheckpoint) and callback.monitor is not None:
-            return callback
-    return None
+    kept = (one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint))
+    return next((one for one in kept if one.monitor is not None), None)
 
 
 def _forget_later_best(trainer: Trainer) -> None:
