@@ -17,23 +17,9 @@ from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
+from dopepp.experiment.reports import conditions, evaluators
 from dopepp.experiment.reports.breakdown import record_breakdown
 from dopepp.experiment.reports.compare import compare_reports
-from dopepp.experiment.reports.conditions import (
-    SCALE,
-    SHADING,
-    check_masks,
-    measure_scales,
-    measure_shading,
-    record_condition,
-)
-from dopepp.experiment.reports.evaluators import (
-    EstimatorMethod,
-    FileMethod,
-    MeasuredPose,
-    Method,
-    object_numbers,
-)
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.reports.report import Report, measure
 from dopepp.experiment.reports.tables import reported_rates
@@ -69,17 +55,19 @@ def measure_and_record(
     """
     protocols = protocols or Protocols()
     source = build_test_source(data, parts)
-    numbers = object_numbers(data, parts)
-    files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
-    methods: dict[str, Method] = {
-        **{name: EstimatorMethod(one, parts) for name, one in estimators.items()},
+    numbers = evaluators.object_numbers(data, parts)
+    files = {
+        name: evaluators.FileMethod(path, parts, numbers) for name, path in (results or {}).items()
+    }
+    methods: dict[str, evaluators.Method] = {
+        **{name: evaluators.EstimatorMethod(one, parts) for name, one in estimators.items()},
         **files,
     }
     if protocols.shading:
-        SHADING.check_methods(methods)
-        check_masks(source)
+        conditions.SHADING.check_methods(methods)
+        conditions.check_masks(source)
     if protocols.scales:
-        SCALE.check_methods(methods)
+        conditions.SCALE.check_methods(methods)
     scaled = {one: build_scaled_test_source(data, parts, one) for one in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
     measured = measure(methods, samples, num_pictures)
@@ -106,13 +94,13 @@ def measure_and_record(
     for quantity in protocols.by:
         record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
     if protocols.shading:
-        shaded = measure_shading(
+        shaded = conditions.measure_shading(
             methods, source, protocols.shading, data.eval_seed, reports, num_pictures
         )
-        record_condition(run_dir, SHADING, *shaded, rates)
+        conditions.record_condition(run_dir, conditions.SHADING, *shaded, rates)
     if scaled:
-        levels = measure_scales(methods, scaled, measured, num_pictures)
-        record_condition(run_dir, SCALE, *levels, rates)
+        levels = conditions.measure_scales(methods, scaled, measured, num_pictures)
+        conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
     display.show_files(run_dir)
     return reports
 
@@ -135,7 +123,7 @@ def tune_and_record(
 
 def _write_results(
     run_dir: Path,
-    poses: Mapping[str, Sequence[MeasuredPose]],
+    poses: Mapping[str, Sequence[evaluators.MeasuredPose]],
     data: DataConfig,
     numbers: Mapping[str, int],
 ) -> None:

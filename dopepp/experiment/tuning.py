@@ -18,11 +18,7 @@ from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
-from dopepp.experiment.build.sources import (
-    build_source_without_objects,
-    build_test_source,
-    build_validation_source,
-)
+from dopepp.experiment.build import sources
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
 from dopepp.geometry.cuboid import CENTROID
@@ -33,14 +29,7 @@ from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.checkpoint.storage import write_atomic
 from dopepp.parts.part import Part, Parts
-from dopepp.recovery.calibration import (
-    FEATURES,
-    PASSING,
-    detection_features,
-    fit_distance_factor,
-    fit_weights,
-    score,
-)
+from dopepp.recovery import calibration
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.options import RecoveryOptions
 
@@ -116,10 +105,10 @@ def tune(
     A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
     """
     old = estimator.recovery
-    validation = build_validation_source(data, parts)
-    test = build_test_source(data, parts)
-    empty = build_source_without_objects(data, parts, "val", target.num_empty)
-    empty_test = build_source_without_objects(data, parts, "test", target.num_empty)
+    validation = sources.build_validation_source(data, parts)
+    test = sources.build_test_source(data, parts)
+    empty = sources.build_source_without_objects(data, parts, "val", target.num_empty)
+    empty_test = sources.build_source_without_objects(data, parts, "test", target.num_empty)
 
     def scored(options: RecoveryOptions, source: Source) -> Scored:
         # Every detection counts here, whatever its score.
@@ -129,7 +118,7 @@ def tune(
     try:
         before = _figures(scored(old, test), scored(old, empty_test), old.min_score)
         estimator.recovery = replace(old, min_score=0.0, distance_factor=1.0)
-        factor = fit_distance_factor(*matched_poses(estimator, parts, validation))
+        factor = calibration.fit_distance_factor(*matched_poses(estimator, parts, validation))
         new = replace(old, distance_factor=factor)
         chosen = choose(scored(new, validation), scored(new, empty), target.false_positive_rate)
         new = replace(new, **chosen)  # type: ignore[arg-type]
@@ -161,12 +150,12 @@ def choose(
             "right and wrong ones to learn from",
             "train longer, or raise data.num_val and num_empty",
         )
-    weights = fit_weights(features, correct)
-    loudest = np.sort(empty.loudest(score(empty.features, weights)))[::-1]
+    weights = calibration.fit_weights(features, correct)
+    loudest = np.sort(empty.loudest(calibration.score(empty.features, weights)))[::-1]
     allowed = int(false_positive_rate * empty.num_images)
     # A detection passes from the threshold on, so it lies just above the first that must not.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
-    named = zip(FEATURES, weights, strict=True)
+    named = zip(calibration.FEATURES, weights, strict=True)
     return {"min_score": threshold} | {f"score_{name}": float(value) for name, value in named}
 
 
@@ -178,10 +167,10 @@ def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scor
         num_instances += sum(one.visible_fraction >= MIN_VISIBLE_FRACTION for one in true)
         right, judged = _judge(part, own, true)
         for one, is_right in zip(compress(own, judged), right[judged], strict=True):
-            features = detection_features(one, part.cuboid, sample.K)
+            features = calibration.detection_features(one, part.cuboid, sample.K)
             rows.append((features, one.score, bool(is_right), number))
     return Scored(
-        np.array([row[0] for row in rows]).reshape(-1, len(FEATURES)),
+        np.array([row[0] for row in rows]).reshape(-1, len(calibration.FEATURES)),
         np.array([row[1] for row in rows], np.float64),
         np.array([row[2] for row in rows], bool),
         np.array([row[3] for row in rows], np.int64),
@@ -243,7 +232,7 @@ def _judge(
         points = torch.from_numpy(np.asarray(part.points, np.float64))
         error = add_s if len(symmetries(part)) > 1 else add
         errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
-        right[matched] = (errors < PASSING * part.diameter).numpy()
+        right[matched] = (errors < calibration.PASSING * part.diameter).numpy()
     judged = np.ones(len(found), bool)
     unmatched = (indices < 0).nonzero()[:, 0].tolist()
     explained = match_by_centre(part.cuboid[CENTROID], [found[k] for k in unmatched], hidden) >= 0

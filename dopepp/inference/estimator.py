@@ -18,7 +18,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, check_camera, project_keypoints
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference.refinement.depth import DepthRefiner
-from dopepp.inference.refinement.view import checked_depth, undistorted_depth
+from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
@@ -27,8 +27,6 @@ from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 
 _log = logging.getLogger(__name__)
-
-Coefficients = Float[np.ndarray, "coefficients"]
 
 Decoded = TypeVar("Decoded")
 

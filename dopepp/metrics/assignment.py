@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dopepp.geometry.camera import Transform, transform
+from dopepp.geometry.rotation import Vector
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.metrics.functional import (
     add,
@@ -25,7 +26,10 @@ from dopepp.metrics.functional import (
     rotation_error_deg,
     translation_error,
 )
+from dopepp.metrics.functional.inputs import Errors
 from dopepp.parts.part import Part
+
+Poses = Float[Tensor, "n 4 4"]
 
 
 @dataclass
@@ -43,22 +47,17 @@ class PoseErrors:
         translation: Distance between the object frame's origins, metres.
     """
 
-    add: Float[Tensor, "n"]
-    add_s: Float[Tensor, "n"]
-    mssd: Float[Tensor, "n"]
-    mspd: Float[Tensor, "n"] | None
-    rotation_deg: Float[Tensor, "n"]
-    rotation_s_deg: Float[Tensor, "n"]
-    translation: Float[Tensor, "n"]
+    add: Errors
+    add_s: Errors
+    mssd: Errors
+    mspd: Errors | None
+    rotation_deg: Errors
+    rotation_s_deg: Errors
+    translation: Errors
 
     @classmethod
     def of(
-        cls,
-        part: Part,
-        T_est: Float[Tensor, "n 4 4"],
-        T_gt: Float[Tensor, "n 4 4"],
-        K: Float[Tensor, "n 3 3"],
-        width: Float[Tensor, "n"],
+        cls, part: Part, T_est: Poses, T_gt: Poses, K: Float[Tensor, "n 3 3"], width: Errors
     ) -> PoseErrors:
         """Compute them, of estimated poses (NaN for a miss) and true ones, metres.
 
@@ -146,7 +145,7 @@ class Assignment:
 
 
 def assign(
-    centre: Float[np.ndarray, "3"],
+    centre: Vector,
     detections: Sequence[PredictedPose],
     instances: Sequence[TruePose],
     min_visible_fraction: float,
@@ -176,9 +175,7 @@ def assign(
 
 
 def match_by_centre(
-    centre: Float[np.ndarray, "3"],
-    detections: Sequence[PredictedPose],
-    instances: Sequence[TruePose],
+    centre: Vector, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
 ) -> Int[Tensor, "detections"]:
     """Match by the distance between the centres of the objects' cuboids; see :func:`match`."""
     # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.

@@ -19,9 +19,9 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.models.layers import Features, conv_block, find_activation, initialise, scaled_channels
 
-BeliefMaps = Float[Tensor, "batch 9*objects height width"]
-FieldMaps = Float[Tensor, "batch 16*objects height width"]
-Stage: TypeAlias = tuple[BeliefMaps, FieldMaps]
+Beliefs = Float[Tensor, "batch 9*objects height width"]
+Fields = Float[Tensor, "batch 16*objects height width"]
+Stage: TypeAlias = tuple[Beliefs, Fields]
 """Belief logits and vector field of one stage."""
 
 MAX_STAGES: Final = 12

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dopepp.core.checks import check_number
-from dopepp.models.heads import BeliefMaps, FieldMaps, Stage
+from dopepp.models.heads import Beliefs, Fields, Stage
 
 
 class MapLoss(nn.Module, ABC):
@@ -30,16 +30,12 @@ class MapLoss(nn.Module, ABC):
 
     @abstractmethod
     def parts(
-        self,
-        logits: BeliefMaps,
-        field: FieldMaps,
-        belief_target: BeliefMaps,
-        field_target: FieldMaps,
+        self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's weighted terms of each image; the loss is the mean of their sums."""
 
     def forward(
-        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
+        self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
         """Return the loss and its terms, detached; each is summed over the stages.
 
@@ -53,14 +49,14 @@ class MapLoss(nn.Module, ABC):
 
     @torch.no_grad()
     def per_image(
-        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
+        self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> Float[Tensor, "batch"]:
         """Return each image's loss, to choose among targets that are equally right."""
         terms = self._summed(stages, belief_target, field_target)
         return torch.stack(list(terms.values())).sum(dim=0)
 
     def _summed(
-        self, stages: Sequence[Stage], belief_target: BeliefMaps, field_target: FieldMaps
+        self, stages: Sequence[Stage], belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return the terms of each image, summed over the stages."""
         terms: dict[str, Tensor] = {}
@@ -80,11 +76,7 @@ class MapMSE(MapLoss):
     activation = "identity"
 
     def parts(
-        self,
-        logits: BeliefMaps,
-        field: FieldMaps,
-        belief_target: BeliefMaps,
-        field_target: FieldMaps,
+        self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's ``belief`` and ``field`` terms of each image."""
         return {
@@ -128,11 +120,7 @@ class SpatialCrossEntropy(MapLoss):
         self.field_weight = check_number("field_weight", field_weight, 0.0, 1e6)
 
     def parts(
-        self,
-        logits: BeliefMaps,
-        field: FieldMaps,
-        belief_target: BeliefMaps,
-        field_target: FieldMaps,
+        self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
     ) -> dict[str, Float[Tensor, "batch"]]:
         """Return one stage's ``where``, ``count`` and ``field`` terms of each image."""
         z, g = logits.flatten(2), belief_target.flatten(2)

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.recovery.consensus import predict
+from dopepp.recovery.consensus import CornerPeaks, Corners, Evidence, predict
 
 LEAST_DEVIATION: Final = 0.05
 """Radians by which even a clear vector may be off its centroid's direction."""
@@ -43,10 +43,10 @@ class ObjectPeaks:
         area_px: Of the maps, pixels².
     """
 
-    position: Float[np.ndarray, "8 peaks 2"]
+    position: CornerPeaks
     score: Float[np.ndarray, "8 peaks"]
     covariance_px: Float[np.ndarray, "8 peaks 2 2"]
-    toward: Float[np.ndarray, "8 peaks 2"]
+    toward: CornerPeaks
     centroid: Float[np.ndarray, "instances 2"]
     centroid_score: Float[np.ndarray, "instances"]
     centroid_covariance_px: Float[np.ndarray, "instances 2 2"]
@@ -62,9 +62,7 @@ class KeypointGroup:
     covariance_px: Float[np.ndarray, "9 2 2"]
 
 
-def direction_evidence(
-    peaks: ObjectPeaks, max_angle: float, coincident_px: float
-) -> Float[np.ndarray, "instances 8 peaks"]:
+def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
     """Say how much belief and direction speak for each corner peak to belong to each centroid.
 
     The angle's likelihood is taken over that of any angle, so that a vector without a direction
@@ -145,9 +143,7 @@ def _gain(
 
 
 def associate(
-    peaks: ObjectPeaks,
-    evidence: Float[np.ndarray, "instances 8 peaks"],
-    expected: Float[np.ndarray, "instances 8 2"] | None = None,
+    peaks: ObjectPeaks, evidence: Evidence, expected: Corners | None = None
 ) -> list[KeypointGroup]:
     """Group peaks into instances, one per centroid.
 

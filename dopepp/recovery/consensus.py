@@ -16,6 +16,10 @@ from jaxtyping import Float
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import CORNER_SIGNS, NUM_CORNERS
 
+Evidence = Float[np.ndarray, "instances 8 peaks"]
+CornerPeaks = Float[np.ndarray, "8 peaks 2"]
+Corners = Float[np.ndarray, "instances 8 2"]
+
 CANDIDATES: Final = 3
 """Peaks of a corner that are tried: the likeliest ones by belief and direction."""
 
@@ -39,12 +43,12 @@ WEIGHTS: Final = np.array(
 
 
 def predict(
-    position: Float[np.ndarray, "8 peaks 2"],
-    evidence: Float[np.ndarray, "instances 8 peaks"],
+    position: CornerPeaks,
+    evidence: Evidence,
     centroids: Float[np.ndarray, "instances 2"],
     deviation_px: float,
     area_px: float,
-) -> tuple[Float[np.ndarray, "instances 8 2"], Float[np.ndarray, "instances"]]:
+) -> tuple[Corners, Float[np.ndarray, "instances"]]:
     """Find for each centroid the corners that the most and likeliest peaks agree on.
 
     Evidence is the log-likelihood ratio of each peak to belong to each centroid, −∞ if it cannot.

@@ -14,12 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import UInt8
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core.files import write_whole
+from dopepp.drawing.pictures import Picture
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -155,9 +154,7 @@ class GuardedLogger(Logger):
         """Pass on."""
         self._pass_on(lambda inner: inner.finalize(status))
 
-    def log_picture(
-        self, name: str, image: UInt8[np.ndarray, "height width 3"], step: int | None = None
-    ) -> None:
+    def log_picture(self, name: str, image: Picture, step: int | None = None) -> None:
         """Hand an RGB picture to TensorBoard or Weights & Biases."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):

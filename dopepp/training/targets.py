@@ -15,15 +15,13 @@ from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.training.symmetry import SymmetryHandling
 
+Keypoints = Float[Tensor, "batch instances 9 2"]
 Targets = tuple[Beliefs, Fields]
 """Belief maps and vector fields as the network should give them."""
 
 
 def draw_maps(
-    batch: Batch,
-    keypoints: Float[Tensor, "batch instances 9 2"],
-    num_objects: int,
-    geometry: MapGeometry,
+    batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
     """Draw the maps of the instances that are visible enough for a metric to count them.
 
@@ -42,7 +40,7 @@ def choose_keypoints(
     symmetry: SymmetryHandling,
     loss: MapLoss,
     geometry: MapGeometry,
-) -> Float[Tensor, "batch instances 9 2"]:
+) -> Keypoints:
     """Return each instance's keypoints in the one of its look-alike poses that is to be learnt.
 
     That is the pose nearest the reference orientation. Where another one is as good, it is the one

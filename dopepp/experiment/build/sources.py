@@ -17,14 +17,8 @@ from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import Split
+from dopepp.experiment.build import splits
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
-from dopepp.experiment.build.splits import (
-    held_out_renders,
-    kept,
-    labelled_images,
-    synthetic_companions,
-    training_renders,
-)
 from dopepp.experiment.config.data import DataConfig
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ycb_part
@@ -118,7 +112,7 @@ def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> De
             "renders, whose camera can be moved",
             "leave out scale, or test on renders of these objects with data.test.renderer=raster",
         )
-    return held_out_renders(data, parts, "test", scale)
+    return splits.held_out_renders(data, parts, "test", scale)
 
 
 def build_source_without_objects(
@@ -131,7 +125,7 @@ def build_source_without_objects(
     scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
     virtual = replace(data.virtual, scene=scene)
     empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
-    return held_out_renders(empty, parts, split)
+    return splits.held_out_renders(empty, parts, split)
 
 
 def _train_source(
@@ -140,7 +134,9 @@ def _train_source(
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
-        real = kept(labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size)
+        real = splits.kept(
+            splits.labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size
+        )
     elif data.real_fraction > 0:
         if data.real_fraction == 1:
             raise UserError(
@@ -154,8 +150,8 @@ def _train_source(
             ", ".join(part.name for part in parts),
         )
     if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
-        synthetic = synthetic_companions(data, parts, seed, backgrounds)
-    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed)
+        synthetic = splits.synthetic_companions(data, parts, seed, backgrounds)
+    virtual = None if data.real_fraction == 1 else splits.training_renders(data, parts, seed)
     return HybridSource(
         real,
         virtual,
@@ -171,5 +167,5 @@ def _train_source(
 def _held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Open labelled images where there is a root, else a range of renders that no other uses."""
     if data.is_rendered(split):
-        return held_out_renders(data, parts, split)
-    return labelled_images(data, parts, data.eval_seed, split)
+        return splits.held_out_renders(data, parts, split)
+    return splits.labelled_images(data, parts, data.eval_seed, split)

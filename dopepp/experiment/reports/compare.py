@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
 from dopepp.drawing.curves import accuracy_figure, figure_image, save_accuracy_curves
 from dopepp.drawing.panels import grid, lines_figure
+from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.reports.differences import figures, full, headline, notes
 from dopepp.experiment.reports.entries import BASELINE, Entry, Run, find_runs, group, ordered
@@ -41,8 +41,6 @@ _GAP_PX: Final = 12
 """Room between tiles."""
 _TOO_WIDE: Final = ("Δ rotation °", "parameters", "GMACs")
 """What a terminal has no room for."""
-
-Picture = UInt8[np.ndarray, "height width 3"]
 
 
 def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> None:

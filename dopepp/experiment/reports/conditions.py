@@ -26,20 +26,9 @@ from dopepp.data.sample import Sample, Source
 from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.experiment.reports import tables
 from dopepp.experiment.reports.evaluators import FileMethod, Method, image_id
 from dopepp.experiment.reports.report import Measured, Report, accumulators, measure
-from dopepp.experiment.reports.tables import (
-    Figure,
-    PassRate,
-    Row,
-    csv_text,
-    heading,
-    markdown_text,
-    pivot,
-    rate_curves,
-    select,
-    shown_rows,
-)
 from dopepp.experiment.runs import display
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
 from dopepp.metrics.row import PoseRow
@@ -155,7 +144,7 @@ def record_condition(
     condition: Condition,
     levels: Sequence[Level],
     tiles: Sequence[Tile],
-    rates: Sequence[PassRate],
+    rates: Sequence[tables.PassRate],
 ) -> None:
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
@@ -166,24 +155,26 @@ def record_condition(
     fields = [*(rate.field for rate in rates), *_FIELDS, *extra]
     table = list(_figures(levels, fields, rates))
 
-    def cells(one: Figure) -> Row:
+    def cells(one: tables.Figure) -> tables.Row:
         return {**one.names, condition.heading(one.condition): one.text}
 
     shown, sections = [], []
     for name in fields:
-        rows_of_it = pivot(select(table, measure=name), attrgetter("method", "object"), cells)
-        shown += [{"measure": heading(name), **row} for row in rows_of_it]
-        sections.append(f"## {heading(name)}\n\n{markdown_text(rows_of_it)}")
+        rows_of_it = tables.pivot(
+            tables.select(table, measure=name), attrgetter("method", "object"), cells
+        )
+        shown += [{"measure": tables.heading(name), **row} for row in rows_of_it]
+        sections.append(f"## {tables.heading(name)}\n\n{tables.markdown_text(rows_of_it)}")
     display.show_table(f"{condition.name}: {condition.axis}", shown, num_labels=3)
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
-    records = pivot(
+    records = tables.pivot(
         table,
         attrgetter("method", "object", "condition"),
         lambda one: {**one.names, condition.level: one.condition, one.measure: one.value},
     )
-    write_whole(run_dir / condition.table_file, csv_text(records).encode())
+    write_whole(run_dir / condition.table_file, tables.csv_text(records).encode())
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
     write_whole(run_dir / f"{condition.name}.md", text.encode())
     _draw(run_dir / f"{condition.name}.png", condition, table, rates)
@@ -193,31 +184,34 @@ def record_condition(
 
 
 def _figures(
-    levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
-) -> Iterator[Figure]:
+    levels: Sequence[Level], fields: Sequence[str], rates: Sequence[tables.PassRate]
+) -> Iterator[tables.Figure]:
     """Return what was measured, by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
-        for name in shown_rows(rows):
+        for name in tables.shown_rows(rows):
             for level in levels:
                 row = level.rows[method][name]
                 for fact, known in level.facts.items():
-                    yield Figure(method, name, fact, known, level.value)
+                    yield tables.Figure(method, name, fact, known, level.value)
                 for column in ("num_instances", *fields):
                     num = row.num_instances if column in rated else 0
                     value = getattr(row, column)
-                    yield Figure(method, name, column, value, level.value, num_instances=num)
+                    yield tables.Figure(method, name, column, value, level.value, num_instances=num)
 
 
 def _draw(
-    path: Path, condition: Condition, table: Sequence[Figure], rates: Sequence[PassRate]
+    path: Path,
+    condition: Condition,
+    table: Sequence[tables.Figure],
+    rates: Sequence[tables.PassRate],
 ) -> None:
     """Draw a panel per object and rate, in each every method that was measured on it."""
     panels = {}
     for name in dict.fromkeys(one.object for one in table if one.object != MEAN):
         for rate in rates:
-            measured = select(table, object=name, measure=rate.field)
-            curves = rate_curves(measured, condition.per_unit)
+            measured = tables.select(table, object=name, measure=rate.field)
+            curves = tables.rate_curves(measured, condition.per_unit)
             shown = {method: curve for method, curve in curves.items() if len(curve.x)}
             panels[f"{name}: {rate.title}"] = shown
     figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)

@@ -23,22 +23,10 @@ from dopepp.core.files import write_png, write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
+from dopepp.experiment.reports import tables
 from dopepp.experiment.reports.conditions import SHADING
 from dopepp.experiment.reports.differences import figures, noise, row_figures, summary
 from dopepp.experiment.reports.entries import Entry
-from dopepp.experiment.reports.tables import (
-    ADD_5CM,
-    ADD_10CM,
-    DELTA,
-    Figure,
-    Row,
-    csv_text,
-    heading,
-    markdown_text,
-    rate_curves,
-    read_csv,
-    select,
-)
 from dopepp.experiment.runs import display, record
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
@@ -59,7 +47,7 @@ _NETWORK: Final = "network"
 _PAPER: Final = "the paper"
 _CONFIDENCE: Final = 0.95
 
-_PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
+_PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (tables.ADD_5CM, tables.ADD_10CM)}
 _MEASURED: Final = ("poses", "shading")
 """Kinds that rest on trained networks."""
 _UNTRAINED: Final = "dopepp.models.backbones.VGG19"
@@ -150,9 +138,9 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
     rows, doubts = KINDS[table.kind](table, methods, folder)
     labels = sum(name in _LABELS for name in rows[0])
     display.show_table(title, rows, num_labels=labels)
-    write_whole(folder / TABLE_FILE, csv_text(rows).encode())
+    write_whole(folder / TABLE_FILE, tables.csv_text(rows).encode())
     notes = [f"- {note}" for note in (*_notes(table, entries), *doubts)]
-    text = "\n".join([f"# {title}", "", markdown_text(rows), *notes])
+    text = "\n".join([f"# {title}", "", tables.markdown_text(rows), *notes])
     write_whole(folder / TEXT_FILE, f"{text}\n".encode())
 
 
@@ -185,7 +173,7 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
 
 
-Laid = tuple[list[Row], list[str]]
+Laid = tuple[list[tables.Row], list[str]]
 """Rows, and the doubts about them."""
 
 
@@ -209,7 +197,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
             printed = {} if is_other_mean else known.get(name, {})
             entry = methods.get(label)
             if entry is not None and name in entry.objects:
-                found = select(table, method=label, object=name)
+                found = tables.select(table, method=label, object=name)
                 rows.append(_pose_row(layout, label, name, _texts(found), printed))
             elif entry is not None:
                 reason = f"{label}: {entry.failure or 'not measured on it'}"
@@ -225,7 +213,7 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     return rows, noise(table)
 
 
-def _texts(table: Iterable[Figure]) -> Row:
+def _texts(table: Iterable[tables.Figure]) -> tables.Row:
     return {one.measure: summary(one) for one in table}
 
 
@@ -235,17 +223,19 @@ def _field(layout: PaperTable, key: str) -> str:
 
 
 def _pose_row(
-    layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
-) -> Row:
+    layout: PaperTable, method: str, name: str, texts: tables.Row, printed: Mapping[str, float]
+) -> tables.Row:
     """Return a row: the text of every measure, what the paper prints of it, and Δ."""
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
         measure = _field(layout, key)
-        row[heading(measure)] = texts.get(measure, "")
+        row[tables.heading(measure)] = texts.get(measure, "")
         if key in ("pass", "auc_10cm"):
-            row[f"{_PAPER}: {heading(measure)}"] = _number(printed.get(key))
+            row[f"{_PAPER}: {tables.heading(measure)}"] = _number(printed.get(key))
         if key in ("pass", _STRICT):
-            row[f"{DELTA}{heading(measure)}"] = texts.get(f"{DELTA}{measure}", "")
+            row[f"{tables.DELTA}{tables.heading(measure)}"] = texts.get(
+                f"{tables.DELTA}{measure}", ""
+            )
     return row
 
 
@@ -261,7 +251,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     """
     measured = {label: _shading(label, entry) for label, entry in methods.items()}
     table = [one for own in measured.values() for one in own]
-    rows: list[Row] = [
+    rows: list[tables.Row] = [
         {_METHOD: _failed(label, methods[label]), _OBJECT: "", _MEASURE: ""}
         for label, own in measured.items()
         if not own
@@ -269,42 +259,44 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     panels = {}
     for name in dict.fromkeys(one.object for one in table):
         for measure in (layout.pass_field, _STRICT):
-            baseline: dict[float, list[Figure]] = {}
-            pooled: list[Figure] = []
-            head = {_OBJECT: name, _MEASURE: heading(measure)}
-            for label in dict.fromkeys(one.method for one in select(table, object=name)):
-                own = select(table, method=label, object=name, measure=measure)
-                rates = {one.condition: select(own, condition=one.condition) for one in own}
+            baseline: dict[float, list[tables.Figure]] = {}
+            pooled: list[tables.Figure] = []
+            head = {_OBJECT: name, _MEASURE: tables.heading(measure)}
+            for label in dict.fromkeys(one.method for one in tables.select(table, object=name)):
+                own = tables.select(table, method=label, object=name, measure=measure)
+                rates = {one.condition: tables.select(own, condition=one.condition) for one in own}
                 levels = {share: SHADING.heading(share) for share in rates}
                 means = {levels[share]: _mean(rates[share]) for share in rates}
                 rows.append({_METHOD: label, **head, **means})
                 if baseline:
                     changes = {levels[s]: _change(rates[s], baseline.get(s, [])) for s in rates}
-                    rows.append({_METHOD: f"{DELTA}{label}", **head, **changes})
+                    rows.append({_METHOD: f"{tables.DELTA}{label}", **head, **changes})
                 baseline = baseline or rates
                 printed = layout.paper.get(label, {}).get(name, {})
                 if printed and measure == layout.pass_field:
                     texts = {share: _number(value) for share, value in printed.items()}
                     rows.append({_METHOD: f"{label}, {_PAPER}", **head, **texts})
                 pooled += map(_pooled, rates.values())
-            panels[f"{name}: {heading(measure)}"] = rate_curves(pooled, SHADING.per_unit)
+            panels[f"{name}: {tables.heading(measure)}"] = tables.rate_curves(
+                pooled, SHADING.per_unit
+            )
     if panels:
         figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
     return rows, []
 
 
-def _shading(label: str, entry: Entry) -> list[Figure]:
+def _shading(label: str, entry: Entry) -> list[tables.Figure]:
     """Return what a method's runs have measured; of one network a part, the mean, too.
 
     Of several methods in one run's file, the run's own is the last.
     """
-    found: dict[object, Figure] = {}
+    found: dict[object, tables.Figure] = {}
     for run in entry.runs:
-        for row in read_csv(run.folder / SHADING.table_file):
+        for row in tables.read_csv(run.folder / SHADING.table_file):
             for measure in (column.field for column in COLUMNS if row.get(column.field)):
                 key = row["object"], measure, float(row["share"]), run.seed
-                found[key] = Figure(
+                found[key] = tables.Figure(
                     label, row["object"], measure, float(row[measure]), float(row["share"]),
                     (run.seed,), int(row["num_instances"]),
                 )  # fmt: skip
@@ -312,7 +304,7 @@ def _shading(label: str, entry: Entry) -> list[Figure]:
     objects = {one.object for one in table}
     if len(objects) < 2 or MEAN in objects:
         return table
-    alike: dict[object, list[Figure]] = {}
+    alike: dict[object, list[tables.Figure]] = {}
     for one in table:
         alike.setdefault((one.measure, one.condition, one.seeds), []).append(one)
     # The mean is over what all parts have.
@@ -320,7 +312,7 @@ def _shading(label: str, entry: Entry) -> list[Figure]:
     return table + [replace(_pooled(own), object=MEAN) for own in whole]
 
 
-def _pooled(rates: Sequence[Figure]) -> Figure:
+def _pooled(rates: Sequence[tables.Figure]) -> tables.Figure:
     """Return the mean of rates, as one over all their instances."""
     return replace(
         rates[0],
@@ -329,13 +321,13 @@ def _pooled(rates: Sequence[Figure]) -> Figure:
     )
 
 
-def _mean(rates: Sequence[Figure]) -> str:
+def _mean(rates: Sequence[tables.Figure]) -> str:
     values = [100 * float(one.value or 0) for one in rates]
     deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
     return f"{np.mean(values):.1f}{deviation}"
 
 
-def _change(rates: Sequence[Figure], baseline: Sequence[Figure]) -> str:
+def _change(rates: Sequence[tables.Figure], baseline: Sequence[tables.Figure]) -> str:
     """Return the mean difference to the baseline and, of several seeds, its 95 % interval."""
     before = {one.seeds: one.value for one in baseline}
     pairs = [(one.value, before[one.seeds]) for one in rates if one.seeds in before]
@@ -399,7 +391,7 @@ def _printed(layout: PaperTable, label: str, measure: str) -> str:
     return _number(layout.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
 
-def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[Row]]:
+def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[tables.Row]]:
     """Return what each method's network costs, and rows of those of which nobody knows."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
     costs = {label: record.read_json(path) for label, path in paths.items() if path.is_file()}

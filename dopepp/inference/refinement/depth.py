@@ -18,13 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import require
-from dopepp.geometry.camera import (
-    CameraMatrix,
-    Transform,
-    invert_transform,
-    make_transform,
-    transform,
-)
+from dopepp.geometry import camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.fit import Fit, Prior, Terms, fit_of, make_prior, outline_terms
 from dopepp.inference.refinement.search import best_shift
@@ -91,7 +85,7 @@ class Refinement:
         fit: How well the refined pose fits the depth; None where there was nothing to fit.
     """
 
-    T_cam_obj: Transform
+    T_cam_obj: camera.Transform
     covariance: PoseMatrix | None = None
     reason: str = ""
     fit: Fit | None = None
@@ -110,9 +104,9 @@ class DepthRefiner:
     def refine(
         self,
         name: str,
-        T_cam_obj: Transform,
+        T_cam_obj: camera.Transform,
         depth: Depth,
-        K: CameraMatrix,
+        K: camera.CameraMatrix,
         covariance: PoseMatrix | None = None,
     ) -> Refinement:
         """Refine one pose.
@@ -132,7 +126,7 @@ class DepthRefiner:
         surface = self._surfaces.get(name)
         if surface is None:
             return Refinement(given, reason="the part has too few surface points")
-        points = transform(given, surface.points)
+        points = camera.transform(given, surface.points)
         if points[:, 2].min() <= 0:
             return Refinement(given, reason="the part reaches behind the camera")
         view = view_around(depth, K, points)
@@ -153,7 +147,7 @@ class DepthRefiner:
 
     def _descend(
         self, view: DepthView, surface: SurfacePoints, diameter: float, prior: Prior, seen: Seen
-    ) -> tuple[Transform, PoseMatrix] | None:
+    ) -> tuple[camera.Transform, PoseMatrix] | None:
         """Search and descend, coarse to fine; return the pose and the information behind it.
 
         ``seen`` are the visible points at the prior's pose.
@@ -167,13 +161,13 @@ class DepthRefiner:
                 plane = self._plane_terms(surface, seen)
             if stage.search:
                 shift = best_shift(
-                    view, transform(pose, surface.points[seen]), prior,
+                    view, camera.transform(pose, surface.points[seen]), prior,
                     pose[:3, 3] - prior.T_cam_obj[:3, 3], stage.search * diameter,
                     stage.tolerance * view.noise,
                 )  # fmt: skip
                 if shift is None:
                     return None
-                pose = make_transform(pose[:3, :3], pose[:3, 3] + shift)
+                pose = camera.make_transform(pose[:3, :3], pose[:3, 3] + shift)
             reach = max(stage.reach * diameter, GATE * view.noise)
             for _ in range(stage.steps):
                 overlay = lay_over(view, surface, seen, pose)
@@ -192,14 +186,14 @@ class DepthRefiner:
 
     def _plane_terms(
         self, surface: SurfacePoints, seen: Seen
-    ) -> Callable[[DepthView, Overlay, Transform, float], Terms]:
+    ) -> Callable[[DepthView, Overlay, camera.Transform, float], Terms]:
         """Return small_gicp's point-to-plane terms against a part's visible points."""
         gicp = self._gicp
         target = gicp.PointCloud(surface.points[seen])
         tree = gicp.KdTree(target)
         gicp.estimate_normals(target, tree, PLANE_NEIGHBOURS)
 
-        def terms(view: DepthView, overlay: Overlay, pose: Transform, reach: float) -> Terms:
+        def terms(view: DepthView, overlay: Overlay, pose: camera.Transform, reach: float) -> Terms:
             covered = overlay.covered & (np.abs(overlay.offset) <= reach)
             points = view.points(covered)
             points = points[:: -(-len(points) // MOST_PIXELS) or 1]
@@ -207,7 +201,7 @@ class DepthRefiner:
                 return np.zeros((6, 6)), np.zeros(6)
             # One iteration, so H and b are those at this pose, and the step is left to us.
             one = gicp.align(
-                target, gicp.PointCloud(points), tree, invert_transform(pose), "PLANE_ICP",
+                target, gicp.PointCloud(points), tree, camera.invert_transform(pose), "PLANE_ICP",
                 max_correspondence_distance=reach, max_iterations=1,
             )  # fmt: skip
             # It turns and shifts the depth about the camera; a move of the part is the opposite.
@@ -221,7 +215,7 @@ class DepthRefiner:
         return terms
 
 
-def _moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
+def _moved(pose: camera.Transform, step: Float[np.ndarray, "6"]) -> camera.Transform:
     """Turn a pose about the object's origin and shift it, both in camera axes."""
     turn = rotation_vector_to_matrix(step[:3])
-    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + step[3:])
+    return camera.make_transform(turn @ pose[:3, :3], pose[:3, 3] + step[3:])

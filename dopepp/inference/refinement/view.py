@@ -27,6 +27,9 @@ from dopepp.inference.refinement.visible import (
     plane_depth,
 )
 
+Depth32 = Float32[np.ndarray, "height width"]
+Coefficients = Float[np.ndarray, "coefficients"]
+
 FARTHEST: Final = 50.0
 """Metres. No depth camera for parts sees so far; millimetres taken for metres do."""
 
@@ -55,7 +58,7 @@ COVERED: Final = 1.0
 """Spacings around a surface point that count as covered by the part."""
 
 
-def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Depth32:
     """Return depth, metres along z, as float32, 0 where it is unknown (0, NaN or infinite).
 
     A :class:`UserError`: it is not aligned to a colour image of (width, height), is no array of
@@ -88,7 +91,7 @@ def checked_depth(depth: Depth, image_size: tuple[int, int]) -> Float32[np.ndarr
     return known
 
 
-def read_depth(path: Path, scale: float) -> Float32[np.ndarray, "height width"]:
+def read_depth(path: Path, scale: float) -> Depth32:
     """Read a PNG of 16 bits as metres, 0 where unknown; ``scale`` is metres per unit.
 
     A :class:`UserError`: the scale is no positive number, or the file is no 16-bit image.
@@ -106,11 +109,7 @@ def read_depth(path: Path, scale: float) -> Float32[np.ndarray, "height width"]:
     return (units * scale).astype(np.float32)
 
 
-def undistorted_depth(
-    depth: Float32[np.ndarray, "height width"],
-    K: CameraMatrix,
-    distortion: Float[np.ndarray, "coefficients"],
-) -> Float32[np.ndarray, "height width"]:
+def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients) -> Depth32:
     """Undistort depth as the image is, with each pixel's nearest value: a mean is no surface."""
     size = depth.shape[::-1]
     maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)

@@ -16,25 +16,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.metrics.functional.inputs import (
-    Errors,
-    Points,
-    Positions,
-    Rotations,
-    chunks,
-    nan_is_miss,
-)
+from dopepp.metrics.functional.inputs import Errors, Points, chunks, nan_is_miss
+
+Affine = tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]
+"""Matrices and what is added to their products."""
 
 _NUM_PROBES: Final = 8
 """Points tried first: as many as a box has corners."""
 
 
 def least_farthest(
-    estimated: tuple[Rotations, Positions],
-    true: tuple[Rotations, Positions],
-    points: Points,
-    symmetries: tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]],
-    perspective: bool,
+    estimated: Affine, true: Affine, points: Points, symmetries: Affine, perspective: bool
 ) -> Errors:
     """Return min over S of max over x of ‖π(Bx + b) − π(A(Sx) + a)‖, infinite where it is NaN.
 
@@ -55,11 +47,7 @@ def least_farthest(
 
 
 def _try_everything(
-    estimated: tuple[Tensor, Tensor],
-    true: tuple[Tensor, Tensor],
-    points: Tensor,
-    symmetries: tuple[Tensor, Tensor],
-    perspective: bool,
+    estimated: Affine, true: Affine, points: Tensor, symmetries: Affine, perspective: bool
 ) -> Errors:
     """Take every point under every symmetry, many at once: for a GPU."""
     errors = torch.full_like(true[1][:, 0], torch.inf)

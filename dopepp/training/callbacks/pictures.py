@@ -17,13 +17,14 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
 from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
 from dopepp.training.callbacks.pose_metrics import PoseMetricsCallback
@@ -147,10 +148,8 @@ class BeliefMaps(ValidationSheet):
 
 
 def heat_picture(
-    image: UInt8[np.ndarray, "height width 3"],
-    channel: Float[np.ndarray, "map_height map_width"],
-    stride: int = 8,
-) -> UInt8[np.ndarray, "height width 3"]:
+    image: Picture, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
+) -> Picture:
     """Blend one map into the dimmed image, the more opaque the stronger the belief.
 
     The image is at the scale of the network's input, ``stride`` pixels per cell of the map that
@@ -166,7 +165,7 @@ def heat_picture(
     return np.asarray(np.rint(blended), np.uint8)
 
 
-def log_picture(trainer: Trainer, name: str, image: UInt8[np.ndarray, "height width 3"]) -> None:
+def log_picture(trainer: Trainer, name: str, image: Picture) -> None:
     """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
