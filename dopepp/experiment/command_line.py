@@ -128,11 +128,9 @@ def entry(
 ) -> None:
     """Run an entry point and exit with its code; a user's mistake is printed as one line.
 
-    Args:
-        main: The function under ``@hydra.main``.
-        open_nodes: Nodes whose keys are not in ``conf/`` but checked later, so that they can be
-            set without Hydra's ``+``: ``virtual.scene`` takes any field of a preset.
-        short_names: What options may be called instead of their names.
+    ``main`` is the function under ``@hydra.main``. Keys of the open nodes are not in ``conf/`` but
+    checked later, so that they can be set without Hydra's ``+``: ``virtual.scene`` takes any field
+    of a preset. ``short_names`` is what options may be called instead of their names.
     """
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"

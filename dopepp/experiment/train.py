@@ -81,11 +81,9 @@ def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
 def train(config: RunConfig, run_dir: Path) -> Report:
     """Train, then measure the best checkpoint on the test set.
 
-    Raises:
-        UserError: A choice, a file or an option is wrong.
-        PrunedError: A search stopped this training.
-        SavingFailedError: What was trained cannot be written.
-        Interruption: A signal ended it; the message names the last checkpoint.
+    A choice, a file or an option that is wrong is a :class:`UserError`; a search that stops this
+    training a ``PrunedError``; what cannot be written a ``SavingFailedError``; a signal that ends
+    it an :class:`Interruption`, whose message names the last checkpoint.
     """
     explanation = readme.RunReadme(config, run_dir)
     try:

@@ -30,9 +30,6 @@ class MetricsTable(Logger):
     The file is rewritten whole, so it is never cut in the middle, and its columns may grow. An
     existing file is continued. Of several processes only the first one writes. While it cannot be
     written, its rows are kept, and the training goes on.
-
-    Args:
-        path: The CSV file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,11 +98,7 @@ def _read(path: Path) -> list[dict[str, Any]]:
 
 
 class GuardedLogger(Logger):
-    """Passes everything on to a logger and survives its failures, reporting the first.
-
-    Args:
-        make: Builds the logger; a failure to build it is a failure too.
-    """
+    """Passes everything on to a logger that it builds; survives its failures, telling the first."""
 
     def __init__(self, make: Callable[[], Logger]) -> None:
         super().__init__()

@@ -131,10 +131,8 @@ class FilePose:
 class FileMethod:
     """Another program's poses, out of a BOP challenge CSV; a :class:`UserError` if that is wrong.
 
-    Args:
-        path: The file.
-        parts: The measured objects; poses of the data set's other objects are left out.
-        numbers: Numbers of the data set's objects, by name.
+    ``numbers`` are those of the data set's objects, by name; poses of objects that are not measured
+    are left out.
     """
 
     def __init__(self, path: Path, parts: Parts, numbers: Mapping[str, int]) -> None:

@@ -48,9 +48,6 @@ class Fingerprint:
 
     The pixels are not in it, because they may differ in a bit from machine to machine; the name of
     the source tells renderers apart, and the covered share shaded images.
-
-    Args:
-        parts: The objects that are scored.
     """
 
     def __init__(self, parts: Parts) -> None:

@@ -32,13 +32,10 @@ weights of the beginning would otherwise count for a thousand steps and more."""
 class AveragedWeights(WeightAveraging):
     """Keeps a moving average of weights and batch norm statistics, and validates with it.
 
-    After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``.
-    Every checkpoint's ``state_dict`` is the average, so whatever reads a checkpoint gets it;
-    training goes on with the weights under :data:`TRAINED`.
-
-    Args:
-        decay: Between 0 (no averaging) and 1: the average spans about 1 / (1 − decay) steps; any
-            other is a :class:`UserError`.
+    After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``:
+    it spans about 1 / (1 − decay) steps, and a decay of 0 does not average. Every checkpoint's
+    ``state_dict`` is the average, so whatever reads a checkpoint gets it; training goes on with the
+    weights under :data:`TRAINED`. A decay outside of 0 to 1 is a :class:`UserError`.
     """
 
     def __init__(self, decay: float) -> None:

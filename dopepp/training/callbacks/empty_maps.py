@@ -38,12 +38,9 @@ class EmptyMaps(Callback):
     """Warns once when nothing can be found because no belief is high enough, and says why.
 
     Empty are maps none of whose centroid's, or none of whose corners' beliefs reach the threshold
-    of the recovery on any validation image. After ``patience`` such validations in a row, or of a
-    training that ends before, one warning names the three usual causes, the likely ones first,
-    each with what the run shows of it and what to try.
-
-    Args:
-        patience: Validations; a network of few steps is rightly silent.
+    of the recovery on any validation image. After ``patience`` such validations in a row (a network
+    of few steps is rightly silent), or of a training that ends before, one warning names the three
+    usual causes, the likely ones first, each with what the run shows of it and what to try.
     """
 
     def __init__(self, patience: int = 3) -> None:

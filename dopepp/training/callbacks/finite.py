@@ -52,11 +52,9 @@ class FiniteSteps(Callback):
     Weights, the optimiser's state and batch norm's statistics then stay as they were; the step
     counts as one, so the schedule goes on as planned. With accumulation the whole step is left out.
     Gradients that only overflow because mixed precision scales them are its scaler's own business:
-    they are neither counted nor reported. ``train/skipped_steps`` counts over the whole run.
-
-    Args:
-        max_in_a_row: After so many such steps one after the other the run ends, and leaves the
-            last of their batches in the run folder's ``nonfinite/``.
+    they are neither counted nor reported. ``train/skipped_steps`` counts over the whole run. After
+    ``max_in_a_row`` such steps one after the other the run ends, and leaves the last of their
+    batches in the run folder's ``nonfinite/``.
     """
 
     def __init__(self, max_in_a_row: int = 10) -> None:

@@ -55,11 +55,7 @@ class AUCCurves(Callback):
 
 
 class ValidationSheet(Callback):
-    """A contact sheet, written as ``val_NAME.png`` and logged as ``val/NAME``.
-
-    Args:
-        num_images: Images on the sheet, the first ones of the validation set.
-    """
+    """A contact sheet of the first validation images, ``val_NAME.png``, logged as ``val/NAME``."""
 
     name: ClassVar[str]
 

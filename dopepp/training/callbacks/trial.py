@@ -34,16 +34,9 @@ class TrialReport(Callback):
     """Reports the objective after each validation and stops a trial that is not worth finishing.
 
     Optuna's median rule: it is stopped when its best value so far is worse than the median of the
-    other trials' values at the same epoch.
-
-    Args:
-        storage: The study's SQLite file, or a database URL.
-        study: The study's name.
-        number: The trial's number in it.
-        monitor: Logged value that is the objective.
-        prune: Whether to stop bad trials at all.
-        after_trials: Finished trials there must be before any is stopped.
-        after_epochs: Epochs that every trial may train.
+    other trials' values at the same epoch, once ``after_trials`` are finished, and not in its first
+    ``after_epochs``. The storage is an SQLite file or a database URL, ``monitor`` the logged value
+    that is the objective.
 
     Attributes:
         pruned: Why training was stopped; empty where it was not.

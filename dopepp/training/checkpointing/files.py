@@ -56,11 +56,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     A checkpoint that cannot be written (disk full, server away) is kept in memory and written
     before the next one, so files on disk never refer to one that is not there; a newer version of
     the same file takes its place. Training goes on meanwhile; :meth:`finish` fails if something is
-    still not written.
-
-    Args:
-        prepare: Called before each writing; if it raises ``OSError``, nothing is written.
-        folder: The run's folder, outside of which nothing is removed; None for no limit.
+    still not written. ``prepare`` is called before each writing; if it raises ``OSError``, nothing
+    is written. Outside of the run's folder nothing is removed; None is no limit.
     """
 
     def __init__(

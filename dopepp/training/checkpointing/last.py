@@ -47,17 +47,10 @@ Cut = Callable[[dict[str, Any]], None]
 class LastCheckpoint(Checkpoint):
     """Saves ``checkpoints/last.ckpt`` during an epoch, too, and keeps the one before.
 
-    It saves between two batches or before a validation, when ``every_s`` have passed, when a new
-    best checkpoint was saved, at the end, and when a signal asks the run to stop, which it then
-    does.
-
-    Args:
-        every_s: Seconds between two savings.
-        max_share: Share of the time that saving by the clock may take; where saving is slow, it
-            happens less often.
-
-    Raises:
-        ValueError: An argument is out of its range.
+    It saves between two batches or before a validation, when ``every_s`` seconds have passed, when
+    a new best checkpoint was saved, at the end, and when a signal asks the run to stop, which it
+    then does. Saving by the clock takes at most ``max_share`` of the time: where it is slow, it
+    happens less often.
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
