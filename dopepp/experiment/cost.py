@@ -120,12 +120,10 @@ class NetworkCost:
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Seconds that frames took, in their order.
+    """Seconds that frames took, in their order, from picture to poses.
 
-    Attributes:
-        seconds: From picture to poses.
-        network_seconds: Of the network in them: from the resized picture to maps.
-        recovery_seconds: From maps to poses in them; the rest resizes and pads.
+    In them are those of the network, from the resized picture to maps, and those from maps to
+    poses; the rest resizes and pads.
     """
 
     seconds: Float[np.ndarray, "frames"]
@@ -136,10 +134,8 @@ class FrameTimes:
 class RehearsedEstimator(PoseEstimator):
     """An estimator that runs its network and then goes on with maps that it was given.
 
-    Attributes:
-        answer: Maps that the next prediction recovers poses from, on the estimator's device.
-        network_began: When the network was last given a picture, seconds of ``perf_counter``.
-        network_ended: When its maps were there.
+    ``answer`` is what the next prediction recovers poses from, on the estimator's device. The
+    network was last given a picture, and its maps were there, at these seconds of ``perf_counter``.
     """
 
     answer: Maps

@@ -43,12 +43,7 @@ _TINY_ANGLE: Final = 1e-8
 
 @dataclass(frozen=True)
 class Poses:
-    """Several poses.
-
-    Attributes:
-        rotations: R of each.
-        translations: t of each, in object sizes.
-    """
+    """Several poses: R of each, and t of each in object sizes."""
 
     rotations: Float[np.ndarray, "s 3 3"]
     translations: Float[np.ndarray, "s 3"]
@@ -70,10 +65,8 @@ class Poses:
 class Correspondences:
     """Object points, the rays they are seen along, and how well these are known.
 
-    Attributes:
-        object_points: Points in the object frame, centred and of unit size.
-        rays: (x/z, y/z) of their pixels.
-        whitening: Turns a difference of rays into standard deviations of the pixel's position.
+    Points are in the object frame, centred and of unit size; rays are (x/z, y/z) of their pixels;
+    whitening turns a difference of rays into standard deviations of the pixel's position.
     """
 
     object_points: Float[np.ndarray, "n 3"]

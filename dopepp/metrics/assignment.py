@@ -127,14 +127,10 @@ class TruePose(Protocol):
 
 @dataclass(frozen=True)
 class Assignment:
-    """One object on one image.
+    """One object on one image: each instance that counts, and the scores of the false positives.
 
-    Attributes:
-        T_est: Estimated pose of each instance that counts; NaN where it was missed.
-        T_gt: Its true pose.
-        visible_fractions: Visible share of its silhouette.
-        scores: Score of its prediction; NaN where it was missed.
-        false_positive_scores: Scores of the false positives.
+    Of an instance it is the estimated pose and the prediction's score (NaN where it was missed),
+    the true pose, and the visible share of its silhouette.
     """
 
     T_est: Float[np.ndarray, "counted 4 4"]

@@ -54,11 +54,9 @@ where unknown), visible fraction, score (NaN for a miss)."""
 class PoseMetrics(Metric):
     """Accumulates detections against ground truth, image by image; sums up per object.
 
-    Args:
-        parts: The objects that are scored, one or more, of different names. Instances of other
-            objects are not ground truth here; detections of other objects are an error.
-        method: Name of what produces the poses, shown in the rows.
-        **kwargs: As of :class:`torchmetrics.Metric`.
+    The scored parts are one or more, of different names. Instances of other objects are not ground
+    truth here; detections of other objects are an error. Rows show ``method``, which is what
+    produces the poses; further arguments are those of :class:`torchmetrics.Metric`.
     """
 
     is_differentiable = False

@@ -24,12 +24,7 @@ POOL: Final = "pool"
 
 
 class Backbone(nn.Module, ABC):
-    """What a head builds upon.
-
-    Attributes:
-        out_channels: Channels of the feature maps.
-        stride: Input pixels per feature cell, along each axis.
-    """
+    """What a head builds upon: its channels, and input pixels per cell along each axis."""
 
     out_channels: int
     stride: int = 8

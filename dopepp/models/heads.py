@@ -49,14 +49,10 @@ class Head(nn.Module):
     """A chain of stages, each a belief branch and a field branch.
 
     Stage 1 reads the features; every later one reads them together with the belief maps (after the
-    activation, so that both losses feed it the same thing) and the field of the stage before.
-
-    Args:
-        in_channels: Channels of the features.
-        num_objects: Number of objects C; 9·C belief and 16·C field channels.
-        activation: Name of the belief activation.
-        stages: Number of stages; one out of range is a :class:`UserError`, like the other numbers.
-        make_branch: Called with input channels, output channels and the stage's number (from 0).
+    activation, so that both losses feed it the same thing) and the field of the stage before. For C
+    objects there are 9·C belief and 16·C field channels. ``make_branch`` is called with input
+    channels, output channels and the stage's number (from 0). A number out of range is a
+    :class:`UserError`.
 
     Attributes:
         cell_multiple: The feature map's height and width must be multiples of this.
@@ -156,18 +152,13 @@ class CascadeBranch(nn.Sequential, Branch):
 
 
 class MultiScale(Head):
-    """The paper's MultiScaleDOPEstage (§3.3), one or more of them.
+    """The paper's MultiScaleDOPEstage (§3.3), 1 to 12 of them.
 
-    Args:
-        in_channels: Channels of the features.
-        num_objects: Number of objects.
-        activation: Name of the belief activation.
-        stages: Number of stages, 1–12.
-        width: Factor on the channel counts; 1 is 128 channels.
-        batch_norm: Put batch norm behind every convolution but those of maps, in place of its bias.
-        maps: What the three scales hand to the fusion: ``plain`` for maps of 9 or 16 channels each,
-            as §3.3 has them; ``learned`` for the same, and each scale's maps are answers of their
-            own, before the fused ones, that the loss sees as well; None for features.
+    ``width`` is a factor on the channel counts, 1 is 128 channels; batch norm stands behind every
+    convolution but those of maps, in place of its bias. ``maps`` is what the three scales hand to
+    the fusion: ``plain`` for maps of 9 or 16 channels each, as §3.3 has them; ``learned`` for the
+    same, and each scale's maps are answers of their own, before the fused ones, that the loss sees
+    as well; None for features. What is out of range is a :class:`UserError`.
     """
 
     cell_multiple = 4

@@ -28,17 +28,10 @@ _STD: Final = tuple(255 * value for value in (0.229, 0.224, 0.225))
 
 
 class PoseNetwork(nn.Module):
-    """RGB images to belief maps and vector fields.
+    """RGB images to belief maps and vector fields: backbone, attention and head.
 
     The normalisation is part of the network, so training, inference and exported files cannot
     disagree about it.
-
-    Args:
-        backbone: Images to features.
-        attention: Features to features.
-        head: Features to stages.
-        activation: Name of the belief activation.
-        num_objects: Number of objects C.
 
     Attributes:
         stride: Pixels per map cell, along each axis.

@@ -26,10 +26,8 @@ TARGET = "_target_"
 class Registry(Generic[T]):
     """Builds objects of one kind, and nothing else, from plain nodes.
 
-    Args:
-        kind: What the registry builds, for messages: ``"backbone"``, ``"optimizer"``.
-        base: The class that every target must inherit from.
-        targets: Dotted names of the allowed classes.
+    Messages name the kind, such as ``"backbone"``; every target inherits from ``base`` and is one
+    of the dotted names of allowed classes.
     """
 
     def __init__(self, kind: str, base: type[T], targets: Iterable[str] = ()) -> None:

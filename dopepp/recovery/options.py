@@ -30,12 +30,8 @@ class RecoveryOptions:
         min_score: Detections below this score are dropped.
         distance_factor: On the distance of every pose (:mod:`dopepp.recovery.calibration`), as
             ``evaluate.py tune=true`` measures it.
-        score_bias: Weights of the score's features (:mod:`dopepp.recovery.calibration`), as
-            ``evaluate.py tune=true`` fits them; these defaults leave the mean belief.
-        score_belief: Idem.
-        score_spread: Idem.
-        score_misfit: Idem.
-        score_found: Idem.
+        score_bias: It and the following are the weights of the score's features, as ``evaluate.py
+            tune=true`` fits them; these defaults leave the mean belief.
     """
 
     sigma: float = 1.0

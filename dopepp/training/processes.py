@@ -38,11 +38,9 @@ class ProcessDiedError(RunError):
 
 
 class Watch(threading.Thread):
-    """Looks after the other processes of this machine.
+    """Looks after other processes of this machine: this one's children, rank 1 first.
 
-    Args:
-        children: The processes that this one has started; rank 1 comes first.
-        parent: The process that has started this one, where it belongs to the run.
+    ``parent`` is the process that has started this one, where it belongs to the run.
     """
 
     def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
@@ -121,9 +119,8 @@ class WatchedLauncher(_SubprocessScriptLauncher):
 class WatchedDDP(DDPStrategy):
     """Distributed data parallel whose processes notice each other's death.
 
-    Args:
-        timeout_s: How long a process waits for the others in a collective, seconds; what tells
-            that a process on another machine is gone.
+    A process waits for the others in a collective for ``timeout_s`` seconds, which tells that one
+    on another machine is gone.
     """
 
     def __init__(self, timeout_s: float) -> None:

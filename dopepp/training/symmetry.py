@@ -59,11 +59,9 @@ class SymmetryOptions:
 
 @dataclass(frozen=True)
 class Equivalents:
-    """Poses that look alike, the one to learn first.
+    """Poses that look alike, the one to learn first: projected cuboids of each, input pixels.
 
-    Attributes:
-        keypoints: Projected cuboids of each, input pixels.
-        allowed: Which of them may be learnt; the first always.
+    ``allowed`` tells which of them may be learnt; the first always.
     """
 
     keypoints: Float[Tensor, "batch instances choices 9 2"]
@@ -71,12 +69,7 @@ class Equivalents:
 
 
 class SymmetryHandling:
-    """Finds the poses that look like a labelled one.
-
-    Args:
-        parts: The objects, in the order of the network's channels.
-        options: How symmetric parts are learnt.
-    """
+    """Finds the poses that look like a labelled one; parts are in the order of the channels."""
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)

@@ -43,12 +43,9 @@ _SCHEDULE_PROGRESS: Final = ("last_epoch", "_step_count", "_last_lr")
 
 @dataclass
 class ValidationOutput:
-    """One validation batch's loss and maps; callbacks read poses from them.
+    """One validation batch's loss, and the last stage's maps, which callbacks read poses from.
 
-    Attributes:
-        loss: The batch's loss.
-        belief: Last stage's belief maps after the activation.
-        field: Last stage's vector field.
+    Beliefs are after the activation.
     """
 
     loss: Float[Tensor, ""]
@@ -63,7 +60,7 @@ class PoseSystem(LightningModule):
         network: Images to maps.
         loss: Compares every stage with the targets.
         parts: The objects, in the order of the network's channels.
-        geometry: Stride, peak width and disc radius of the target maps.
+        geometry: Of the target maps.
         recovery: Thresholds of the way from maps to poses.
         make_optimizer: Parameters to optimiser.
         make_scheduler: Optimiser and number of steps to a schedule stepped once a batch; None for

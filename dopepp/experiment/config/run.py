@@ -55,12 +55,7 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MapsConfig:
-    """The target maps: the node ``maps``.
-
-    Attributes:
-        sigma: Standard deviation of a belief peak, cells.
-        field_radius: Radius of the disc around a corner that carries its vector, cells.
-    """
+    """The target maps: a belief peak's standard deviation and the field's discs' radius, cells."""
 
     sigma: Cells
     field_radius: Cells
@@ -132,12 +127,7 @@ class TrainerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CostConfig:
-    """``job=cost``: the node ``cost``.
-
-    Attributes:
-        num_frames: Frames that are timed one by one, from picture to poses.
-        batch_size: Images that the network alone is timed with.
-    """
+    """``job=cost``: frames timed one by one, from picture to poses, and the network's batch."""
 
     num_frames: Annotated[int, Range(1, _MOST)]
     batch_size: Annotated[int, Range(1, _MOST)]
@@ -145,12 +135,9 @@ class CostConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningRateConfig:
-    """``job=lr_finder``: the node ``lr_finder``.
+    """``job=lr_finder``: rates of the first and the last step, and the steps between them.
 
-    Attributes:
-        min_lr: Of the first step.
-        max_lr: Of the last step; training ends earlier where the loss diverges.
-        num_steps: Steps between them.
+    Training ends earlier where the loss diverges.
     """
 
     min_lr: Rate

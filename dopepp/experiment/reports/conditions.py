@@ -124,13 +124,10 @@ much. An instance counts by what is visible of it from there, at least 10 %.""",
 
 @dataclass(frozen=True)
 class Level:
-    """What was measured at one level.
+    """What was measured at one level: a row per object and their mean, by method.
 
-    Attributes:
-        value: The level.
-        rows: A row per object and their mean, by method.
-        facts: Further columns of the CSV file, over all objects.
-        note: What a reader must know of this level; empty for nothing.
+    Facts are further columns of the CSV file, over all objects; ``note`` is what a reader must know
+    of this level, empty for nothing.
     """
 
     value: float

@@ -51,13 +51,7 @@ class Posed(PredictedPose, Protocol):
 
 @dataclass(frozen=True)
 class MeasuredPose:
-    """A pose on an image of the test set.
-
-    Attributes:
-        image: The image.
-        pose: The detection.
-        seconds: What the whole image took; None where unknown.
-    """
+    """A pose on an image of the test set, and what the whole image took; None where unknown."""
 
     image: ImageId
     pose: Posed
@@ -68,10 +62,8 @@ class MeasuredPose:
 class Cost:
     """What a method costs; None where nobody knows.
 
-    Attributes:
-        parameters: Number of trained numbers.
-        gmacs: Multiply-accumulates of one image of the input size, 10⁹.
-        ms_per_frame: Median time from image to poses; of an estimator in this run.
+    That is trained numbers, multiply-accumulates of one image of the input size (10⁹), and the
+    median time from image to poses, of an estimator in this run.
     """
 
     parameters: int | None = None

@@ -186,11 +186,8 @@ def markdown_text(rows: Sequence[Mapping[str, str]], texts: Sequence[str] = _TEX
 class PassRate:
     """The share of instances whose error is below a threshold.
 
-    Attributes:
-        field: Its field in a :class:`~dopepp.metrics.row.PoseRow`.
-        error: The error.
-        threshold: In metres, or in diameters where ``relative``.
-        relative: Whether the threshold is in diameters.
+    It has a field in a :class:`~dopepp.metrics.row.PoseRow`. The threshold is in diameters where
+    ``relative``, else in metres.
     """
 
     field: str

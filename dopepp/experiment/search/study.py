@@ -52,12 +52,10 @@ _NO_PART: Final = (
 
 @dataclass(frozen=True)
 class Space:
-    """What is varied and what is not.
+    """What is varied, by option, and from what it is drawn; and what is not.
 
-    Attributes:
-        varied: Option to what it is drawn from.
-        texts: The same as they were written, to be compared with those of an earlier command.
-        fixed: Overrides that every trial has.
+    ``texts`` are the same as they were written, to be compared with those of an earlier command;
+    ``fixed`` are the overrides that every trial has.
     """
 
     varied: dict[str, BaseDistribution]

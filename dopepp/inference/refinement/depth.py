@@ -109,18 +109,12 @@ class DepthRefiner:
         K: camera.CameraMatrix,
         covariance: PoseMatrix | None = None,
     ) -> Refinement:
-        """Refine one pose.
+        """Refine one pose, metres, of a part by its name.
 
-        Args:
-            name: The part's name.
-            T_cam_obj: The pose to start from, metres.
-            depth: Metres along z, aligned to the image, 0 where unknown.
-            K: Camera matrix of the depth image, pixels.
-            covariance: Of the given pose: rotation vector about the object's origin and shift, both
-                in camera axes, radians and metres. Without it, a broad one is taken.
-
-        Raises:
-            KeyError: There is no such part.
+        Depth is in metres along z, aligned to the image of K, 0 where unknown. The covariance is
+        that of the given pose: rotation vector about the object's origin and shift, both in camera
+        axes, radians and metres; without it, a broad one is taken. An unknown part is a
+        ``KeyError``.
         """
         given, diameter = np.asarray(T_cam_obj, np.float64), self._diameters[name]
         surface = self._surfaces.get(name)

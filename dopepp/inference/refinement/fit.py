@@ -61,11 +61,9 @@ BESIDE: Final = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A pose and the inverse of its covariance.
+    """A pose (metres) and the inverse of its covariance, camera axes, radians and metres.
 
-    Attributes:
-        T_cam_obj: The pose, metres.
-        information: Of (turn about the object's origin, shift), camera axes, radians and metres.
+    That is of (turn about the object's origin, shift).
     """
 
     T_cam_obj: Transform

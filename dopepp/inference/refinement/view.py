@@ -118,13 +118,10 @@ def undistorted_depth(depth: Depth32, K: CameraMatrix, distortion: Coefficients)
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A thinned crop of a depth image.
+    """A thinned crop of a depth image: metres along z, float32, 0 where unknown.
 
-    Attributes:
-        depth: Metres along z, float32, 0 where unknown.
-        K: Its camera matrix, pixels of the crop.
-        rays: Camera-frame points at z = 1 of its pixels.
-        noise: Standard deviation of the depth at the part, metres.
+    K is of the crop; rays are camera-frame points at z = 1 of its pixels; noise is the standard
+    deviation of the depth at the part, metres.
     """
 
     depth: Depth

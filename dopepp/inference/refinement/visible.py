@@ -54,12 +54,9 @@ STEEPEST: Final = 0.2
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points spread over a part's surface.
+    """Points spread over a part's surface, object frame, metres, and unit normals of either sign.
 
-    Attributes:
-        points: Object frame, metres.
-        normals: Unit normals, of either sign.
-        spacing: Side of the square of surface that a point stands for, metres.
+    ``spacing`` is the side of the square of surface that a point stands for, metres.
     """
 
     points: Points

@@ -111,16 +111,11 @@ def _mean_distance(
     queries: Array,
     bound: float,
 ) -> float:
-    """Average the distances from targets to the nearest ``R·point``.
+    """Average the distances from targets to the nearest ``R·point``, points in the tree's order.
 
-    Args:
-        points: In the tree's order, shape (V, 3).
-        boxes: Of every node, as of :func:`_to_box`; the children of k are 2k + 1 and 2k + 2.
-        firsts: First point of every leaf, and the number of points.
-        R: Rotation of the points, shape (3, 3).
-        targets: Shape (V, 3).
-        queries: R⁻¹·targets.
-        bound: ‖R v‖² is at least this many times ‖v‖².
+    A box of every node is as of :func:`_to_box`; the children of k are 2k + 1 and 2k + 2.
+    ``firsts`` is the first point of every leaf, and the number of points; queries are R⁻¹·targets;
+    ‖R v‖² is at least ``bound`` times ‖v‖².
     """
     num_inner = len(boxes) // 2
     nodes, floors = np.empty(64, np.int64), np.empty(64)

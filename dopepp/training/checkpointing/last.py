@@ -175,9 +175,7 @@ class StopRequest:
     The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
     that is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
     the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
-
-    Attributes:
-        number: The signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
+    ``number`` is the signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
     """
 
     def __init__(self) -> None:
