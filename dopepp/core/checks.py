@@ -13,12 +13,9 @@ from dopepp.core.errors import UserError
 def check_number(
     name: str, value: object, lowest: float, highest: float, unit: str = "", of: object = None
 ) -> float:
-    """Return a finite real number of a closed range.
+    """Return a finite real number of a closed range; anything else is a :class:`UserError`.
 
     ``name``, ``unit`` (what it counts) and ``of`` (the group of options) are for the message.
-
-    Raises:
-        UserError: It is a bool, not a number, not finite, or outside of the range.
     """
     if not _is_number(value) or not lowest <= value <= highest:  # type: ignore[operator]
         allowed = f"a number from {lowest:g} to {highest:g}"
@@ -43,12 +40,7 @@ def check_flag(name: str, value: object, of: object = None) -> bool:
 def check_range(
     name: str, value: object, low: float, high: float, unit: str, of: object = None
 ) -> None:
-    """Refuse what is no pair (smallest, largest) within bounds; arguments as above.
-
-    Raises:
-        UserError: It is no pair, an entry is no number within the bounds, or the ends are
-            exchanged.
-    """
+    """Refuse what is no pair (smallest, largest) of numbers within bounds, in this order."""
     pair = isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value))
     if not pair or not low <= value[0] <= value[1] <= high:  # type: ignore[index]
         allowed = f"(smallest, largest) with {low:g} <= smallest <= largest <= {high:g} ({unit})"
@@ -56,11 +48,7 @@ def check_range(
 
 
 def check_counts(name: str, value: object, low: int, high: int, of: object = None) -> None:
-    """Refuse what is no pair of whole numbers (smallest, largest) within bounds.
-
-    Raises:
-        UserError: As for :func:`check_range`, or an entry is not an integer.
-    """
+    """Refuse what is no pair of whole numbers (smallest, largest) within bounds."""
     check_range(name, value, low, high, "a count", of)
     if not all(isinstance(entry, int) for entry in value):  # type: ignore[attr-defined]
         raise _refused(name, value, "two whole numbers", of)

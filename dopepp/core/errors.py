@@ -12,12 +12,8 @@ class UserError(ValueError):
     """A mistake in an input, a file or an option that its user can correct.
 
     Entry points print it as one line and exit with code 2; the library raises it, so that a
-    caller can catch it as the ``ValueError`` it is.
-
-    Args:
-        got: What was found, with the file, the field and the value.
-        allowed: What would have been accepted.
-        fix: What to do about it.
+    caller can catch it as the ``ValueError`` it is. It says what was got, with the file, the field
+    and the value, what would have been accepted, and what to do about it.
     """
 
     def __init__(self, got: str, allowed: str, fix: str) -> None:

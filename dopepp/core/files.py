@@ -1,4 +1,4 @@
-"""Files that are there completely or not at all, PNG among them.
+"""Files that are there completely or not at all, PNG among them, and the user's cache folder.
 
 A file is written beside its place under a name of :func:`partial_path` and renamed when it is
 whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
@@ -92,3 +92,8 @@ def _machine() -> str:
     if boot.is_file() and namespace.is_symlink():
         facts += [boot.read_text(), str(namespace.readlink())]
     return hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
+
+
+def cache_folder() -> Path:
+    """Return where dopepp keeps what it can make again (``XDG_CACHE_HOME``); it may be missing."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "dopepp")

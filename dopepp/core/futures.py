@@ -1,4 +1,4 @@
-"""Work that others do: futures in the order they are done in, and Ray as a maker of futures."""
+"""Work in parallel: this machine's cores, futures in the order they are done in, and Ray."""
 
 from __future__ import annotations
 
@@ -17,6 +17,23 @@ _KNOCK_S: Final = 5.0
 
 _OBJECT_STORE_BYTES: Final = 200_000_000
 """Of a local cluster; it holds the work, a few megabytes, and outcomes."""
+
+THREAD_LIMITS: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+"""Environment variables that limit the threads of libraries loaded after they are set."""
+
+
+def available_cores() -> int:
+    """Return the cores that this process may use, where the system tells (Linux), else all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def completed(
@@ -47,10 +64,8 @@ def connect(
 
     A local one, without an ``address``, has ``num_workers`` cores, binds to this machine only,
     reports to nobody and ends with this process. ``asked_by`` and ``option`` name, for messages,
-    the choice that needs Ray and the option that holds the address.
-
-    Raises:
-        UserError: Ray is not installed, or there is no cluster at the address.
+    the choice that needs Ray and the option that holds the address. A :class:`UserError`: Ray is
+    not installed, or there is no cluster at the address.
     """
     require("ray", asked_by, "ray")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # read when Ray starts, so it comes first

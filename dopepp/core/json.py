@@ -36,12 +36,9 @@ _NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DO
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
-    """Read a JSON file.
+    """Read a JSON file; what is missing, too large or refused by :func:`parse_json` is a UserError.
 
     A file of more than ``max_bytes`` is refused before it is read.
-
-    Raises:
-        UserError: The file is missing or too large, or what :func:`parse_json` refuses.
     """
     path = Path(path)
     allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
@@ -61,9 +58,8 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 def parse_json(text: str | bytes, where: str) -> object:
     """Parse JSON text in UTF-8, with or without a byte order mark, of a size its caller bounds.
 
-    Raises:
-        UserError: It is no UTF-8, no JSON, has a key twice in one object, is nested more than 64
-            deep, or has a number that is not finite.
+    A :class:`UserError`: it is no UTF-8, no JSON, has a key twice in one object, is nested more
+    than 64 deep, or has a number that is not finite.
     """
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     bare = _STRING_BYTES.sub(b"", content)

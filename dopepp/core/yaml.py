@@ -22,9 +22,8 @@ MAX_DEPTH: Final = 32
 def read_yaml(path: Path) -> object:
     """Read a YAML file of mappings, lists, text, numbers, true/false and null.
 
-    Raises:
-        UserError: The file cannot be read, is too large or damaged, is nested more than 32 deep, or
-            has an anchor, an alias or a tag in it, none of which a run writes.
+    A :class:`UserError`: the file cannot be read, is too large or damaged, is nested more than 32
+    deep, or has an anchor, an alias or a tag in it, none of which a run writes.
     """
     try:
         if path.stat().st_size > MAX_BYTES:

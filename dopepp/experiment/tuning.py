@@ -21,17 +21,18 @@ from dopepp.data.sample import Instance, Sample, Source
 from dopepp.experiment.build import sources
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
+from dopepp.geometry.camera import Transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.assignment import assign, match_by_centre, symmetries
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
-from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.metrics.pose import assign, counted
+from dopepp.metrics.row import symmetries
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.models.checkpoint.storage import write_atomic
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery import calibration
+from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.options import RecoveryOptions
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scor
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
     for number, sample, part, own, true in _by_object(estimator, parts, source):
-        num_instances += sum(one.visible_fraction >= MIN_VISIBLE_FRACTION for one in true)
+        num_instances += sum(map(counted, true))
         right, judged = _judge(part, own, true)
         for one, is_right in zip(compress(own, judged), right[judged], strict=True):
             features = calibration.detection_features(one, part.cuboid, sample.K)
@@ -183,13 +184,14 @@ def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: Source
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
     """Return the poses found on a source and, for each, that of the instance it found."""
-    estimated, true = [np.empty((0, 4, 4))], [np.empty((0, 4, 4))]
+    estimated: list[Transform] = []
+    true: list[Transform] = []
     for _, _, part, own, instances in _by_object(estimator, parts, source):
-        pairs = assign(part.cuboid[CENTROID], own, instances, MIN_VISIBLE_FRACTION)
-        hit = np.isfinite(pairs.scores)
-        estimated.append(pairs.T_est[hit])
-        true.append(pairs.T_gt[hit])
-    return np.concatenate(estimated), np.concatenate(true)
+        for one, number in zip(own, assign(part.cuboid[CENTROID], own, instances), strict=True):
+            if number >= 0 and counted(instances[number]):
+                estimated.append(one.T_cam_obj)
+                true.append(instances[number].T_cam_obj)
+    return np.reshape(estimated, (-1, 4, 4)), np.reshape(true, (-1, 4, 4))
 
 
 def _by_object(
@@ -221,23 +223,18 @@ def _judge(
     As in every evaluation, one that finds an instance too hidden to count is neither right nor
     wrong. Right is ADD below 0.1 d, for a part with symmetries ADD-S.
     """
-    counted = [one for one in true if one.visible_fraction >= MIN_VISIBLE_FRACTION]
-    hidden = [one for one in true if one.visible_fraction < MIN_VISIBLE_FRACTION]
-    indices = match_by_centre(part.cuboid[CENTROID], found, counted)
-    matched = (indices >= 0).nonzero()[:, 0].tolist()
+    numbers = assign(part.cuboid[CENTROID], found, true)
+    counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
+    matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
     right = np.zeros(len(found), bool)
     if matched:
         T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
-        T_gt = torch.from_numpy(np.array([counted[int(indices[k])].T_cam_obj for k in matched]))
+        T_gt = torch.from_numpy(np.array([true[numbers[k]].T_cam_obj for k in matched]))
         points = torch.from_numpy(np.asarray(part.points, np.float64))
         error = add_s if len(symmetries(part)) > 1 else add
         errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
         right[matched] = (errors < calibration.PASSING * part.diameter).numpy()
-    judged = np.ones(len(found), bool)
-    unmatched = (indices < 0).nonzero()[:, 0].tolist()
-    explained = match_by_centre(part.cuboid[CENTROID], [found[k] for k in unmatched], hidden) >= 0
-    judged[np.array(unmatched, int)[explained.numpy()]] = False
-    return right, judged
+    return right, counts
 
 
 def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:

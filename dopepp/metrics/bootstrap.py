@@ -25,10 +25,10 @@ from dopepp.core.errors import UserError
 Numbers = Sequence[Float[np.ndarray, "_ instances"]]
 """Of each object a number per seed and instance."""
 
-Resamples = Float[np.ndarray, "resamples"]
 Draws = Float[np.ndarray, "resamples seeds"]
 """How often each resample draws each seed, as a share."""
 
+_Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
 StatisticName = Literal["mean", "median"]
 
 _BLOCK: Final = 4_000_000
@@ -84,31 +84,17 @@ def paired_difference(
     resample as Student's t stretches the normal distribution, by t₍S₋₁₎ / z · √(S / (S − 1)): 9.2
     for two seeds, 2.7 for three, 1.6 for five.
 
-    Args:
-        mine: Of each object a number per seed and instance. Those that are not finite (missed)
-            are left out by the median.
-        baseline: Likewise, of the same objects and instances.
-        statistic: Of the numbers of all instances.
-        same_seeds: Whether row s of both methods is of one seed; then seeds are drawn in pairs,
-            else for each method by itself.
-        confidence: Share of resamples inside the interval.
-        num_resamples: Resamples.
-        few_seeds: Whether to stretch.
-        seed: Of the resamples.
+    Of numbers that are not finite (missed), the median leaves each out. With ``same_seeds``, row s
+    of both methods is of one seed and seeds are drawn in pairs, else for each method by itself;
+    ``confidence`` is the share of resamples inside the interval, ``seed`` theirs.
 
-    Returns:
-        The difference; None where a figure does not exist (a median over nothing).
-
-    Raises:
-        UserError: Objects, instances or paired seeds of the two differ in number, there are none,
-            a mean is over numbers that are not finite, or an option is out of its range.
+    The difference is None where a figure does not exist (a median over nothing). A
+    :class:`UserError`: objects, instances or paired seeds of the two differ in number, there are
+    none, or a mean is over numbers that are not finite.
     """
     mine = [np.asarray(values, np.float64) for values in mine]
     baseline = [np.asarray(values, np.float64) for values in baseline]
     _check(mine, baseline, statistic, same_seeds)
-    fewest = fewest_differing(confidence)
-    if num_resamples < 1:
-        raise UserError(f"num_resamples={num_resamples}", "1 or more", "draw some")
     compute = STATISTICS[statistic]
     figures = [np.mean([compute(v) for v in values], axis=0) for values in (mine, baseline)]
     if np.isnan(np.concatenate(figures)).any():
@@ -128,7 +114,7 @@ def paired_difference(
     value = float(figures[0].mean() - figures[1].mean())
     paired = same_seeds and len(figures[0]) > 1 and statistic == "mean"
     needed = seeds_to_tell(mine, baseline, confidence) if paired else None
-    num_differing = _num_differing(mine, baseline)
+    num_differing, fewest = _num_differing(mine, baseline), fewest_differing(confidence)
     return Difference(value, float(low), float(high), num_differing, fewest, needed)
 
 
@@ -164,11 +150,8 @@ def fewest_differing(confidence: float) -> int:
 
     If both are equally good, either wins a differing instance with probability ½; so all of k go
     to the same one with probability 2 · ½ᵏ (sign test). Below that the bootstrap is overconfident:
-    of one or two instances every resample looks alike. A confidence outside (0, 1) is a
-    :class:`UserError`.
+    of one or two instances every resample looks alike.
     """
-    if not 0 < confidence < 1:
-        raise UserError(f"confidence={confidence}", "a share in (0, 1)", "e.g. 0.95")
     return math.ceil(math.log2(2 / (1 - confidence)))
 
 
@@ -189,13 +172,9 @@ def _finite_median(values: Float[np.ndarray, "... n"]) -> Float[np.ndarray, "...
 STATISTICS: Final = {"mean": _mean, "median": _finite_median}
 """Functions of the last axis."""
 
-_Statistic = Callable[[Float[np.ndarray, "... n"]], Float[np.ndarray, "..."]]
-
 
 def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -> None:
     """Refuse what cannot be paired."""
-    if statistic not in STATISTICS:
-        raise UserError(f"statistic {statistic!r}", ", ".join(STATISTICS), "choose one of them")
     shapes = [[values.shape for values in method] for method in (mine, baseline)]
     plain = all(len(shape) == 2 and min(shape) > 0 for shape in [*shapes[0], *shapes[1]])
     seeds = [{shape[0] for shape in own} for own in shapes]
@@ -230,7 +209,7 @@ def _resampled_difference(
     compute: _Statistic,
     draws: Sequence[Draws],
     rng: np.random.Generator,
-) -> Resamples:
+) -> Float[np.ndarray, "resamples"]:
     """Return the difference in each resample, averaged over objects."""
     total = np.zeros(len(draws[0]))
     for one, other in zip(mine, baseline, strict=True):
@@ -252,7 +231,7 @@ def _stretching(
     draws: Sequence[Draws],
     same_seeds: bool,
     confidence: float,
-) -> Resamples:
+) -> Float[np.ndarray, "resamples"]:
     """Return what is added to each resample so that few seeds spread as much as they should."""
     if same_seeds:
         effects, weights = [figures[0] - figures[1]], [draws[0]]

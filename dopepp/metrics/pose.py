@@ -7,11 +7,11 @@ a new measure needs no new state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -20,19 +20,12 @@ from torchmetrics.utilities import dim_zero_cat
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.curves import accuracy_figure
-from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.metrics.assignment import (
-    Assignment,
-    PoseErrors,
-    PredictedPose,
-    TruePose,
-    assign,
-    symmetries,
-)
-from dopepp.metrics.functional import BOP_MSPD_THRESHOLDS, average_precision, average_recall
+from dopepp.geometry.rotation import Vector
+from dopepp.metrics.functional import average_precision, match
 from dopepp.metrics.references import REFERENCES, reference_rows
-from dopepp.metrics.row import PoseRow, finite_median, mean_row, summarise
+from dopepp.metrics.row import PoseErrors, PoseRow, finite_median, mean_row, summarise, symmetries
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
@@ -46,9 +39,74 @@ CurveMeasure = Literal["add", "add_s", "mssd"]
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
 """An error that every instance has; angles are in degrees, the others in metres."""
 
-_WIDTH: Final = 1 + 16 + 16 + 9 + 1 + 1 + 1
+_WIDTH: Final = 45
+_T_EST, _T_GT, _CAMERA = slice(1, 17), slice(17, 33), slice(33, 43)
+_VISIBLE, _SCORE = 43, 44
 """One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
 where unknown), visible fraction, score (NaN for a miss)."""
+
+
+class PredictedPose(Protocol):
+    """What the accumulator reads of a detection."""
+
+    @property
+    def object(self) -> str:
+        """Name of the part."""
+
+    @property
+    def score(self) -> float:
+        """Confidence; a better one is matched first."""
+
+    @property
+    def T_cam_obj(self) -> Transform:  # noqa: N802
+        """Estimated pose, metres."""
+
+
+class TruePose(Protocol):
+    """What the accumulator reads of a ground-truth instance."""
+
+    @property
+    def label(self) -> str:
+        """Name of the part."""
+
+    @property
+    def T_cam_obj(self) -> Transform:  # noqa: N802
+        """True pose, metres."""
+
+    @property
+    def visible_fraction(self) -> float:
+        """Visible share of the full silhouette, in [0, 1]."""
+
+
+def assign(
+    centre: Vector, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
+) -> Int[np.ndarray, "detections"]:
+    """Tell of one object on one image which instance each detection finds; −1 for none.
+
+    Instances that count are matched first; predictions left over may then explain themselves by
+    hidden ones. Matched are the centres of the object's cuboid (object frame, metres); see
+    :func:`~dopepp.metrics.functional.match`.
+    """
+    # Infinity times zero would warn; as NaN throughout, such a pose just matches nothing.
+    estimates = [np.asarray(d.T_cam_obj, np.float64) for d in detections]
+    predicted = [transform(np.where(np.isfinite(T), T, np.nan), centre) for T in estimates]
+    true = [transform(np.asarray(i.T_cam_obj, np.float64), centre) for i in instances]
+    offsets = np.reshape(predicted, (-1, 1, 3)) - np.reshape(true, (1, -1, 3))
+    distances = torch.from_numpy(np.linalg.norm(offsets, axis=2))
+    scores = torch.tensor([float(d.score) for d in detections], dtype=torch.float64)
+    counts = np.array([counted(i) for i in instances], bool)
+    found = np.full(len(detections), -1)
+    for group in (counts, ~counts):
+        left, numbers = np.flatnonzero(found < 0), np.flatnonzero(group)
+        matches = match(scores[left], distances[left][:, numbers]).numpy()
+        hit = matches >= 0
+        found[left[hit]] = numbers[matches[hit]]
+    return found
+
+
+def counted(instance: TruePose) -> bool:
+    """Tell whether enough of an instance is visible for it to count."""
+    return instance.visible_fraction >= MIN_VISIBLE_FRACTION
 
 
 class PoseMetrics(Metric):
@@ -103,30 +161,24 @@ class PoseMetrics(Metric):
                 )
         camera = _camera(K, width)
         for index, part in enumerate(self.parts.values()):
-            assignment = assign(
-                part.cuboid[CENTROID],
-                [d for d in detections if d.object == part.name],
-                [i for i in instances if i.label == part.name],
-                MIN_VISIBLE_FRACTION,
-            )
-            self._keep(index, assignment, camera)
+            own = [d for d in detections if d.object == part.name]
+            true = [i for i in instances if i.label == part.name]
+            found = assign(part.cuboid[CENTROID], own, true)
+            table = np.full((len(true), _WIDTH), np.nan)
+            table[:, 0], table[:, _CAMERA] = index, camera
+            for row, instance in zip(table, true, strict=True):
+                row[_T_GT], row[_VISIBLE] = np.ravel(instance.T_cam_obj), instance.visible_fraction
+            for number, detection in zip(found, own, strict=True):
+                if number >= 0:
+                    table[number, _T_EST] = np.ravel(detection.T_cam_obj)
+                    table[number, _SCORE] = detection.score
+            self._keep(self.poses, table[[counted(instance) for instance in true]])
+            strays = [(index, own[k].score) for k in np.flatnonzero(found < 0)]
+            self._keep(self.false_positives, np.array(strays, np.float64))
 
-    def _keep(self, index: int, found: Assignment, camera: Float[np.ndarray, "10"]) -> None:
-        """Add one object on one image to the state."""
-        n = len(found.T_gt)
-        if n:
-            columns = (
-                np.full((n, 1), index),
-                found.T_est.reshape(n, 16),
-                found.T_gt.reshape(n, 16),
-                np.tile(camera, (n, 1)),
-                found.visible_fractions[:, None],
-                found.scores[:, None],
-            )
-            self.poses.append(torch.from_numpy(np.hstack(columns).ravel()).to(self.device))
-        if len(found.false_positive_scores):
-            pairs = np.insert(found.false_positive_scores[:, None], 0, index, axis=1)
-            self.false_positives.append(torch.from_numpy(pairs.ravel()).to(self.device))
+    def _keep(self, state: list[Tensor], rows: Float[np.ndarray, "rows columns"]) -> None:
+        if rows.size:
+            state.append(torch.from_numpy(rows.ravel()).to(self.device))
 
     def compute(self) -> dict[str, PoseRow]:
         """Return a row per object, then their :data:`MEAN`; see :mod:`dopepp.metrics.row`.
@@ -137,8 +189,8 @@ class PoseMetrics(Metric):
         rows = {}
         for index, (name, part) in enumerate(self.parts.items()):
             false = false_positives[false_positives[:, 0] == index, 1]
-            self._gathered[name] = Gathered(part, poses[poses[:, 0] == index, 1:], false)
-            rows[name] = self._gathered[name].row(part, self.method)
+            self._gathered[name] = Gathered(part, poses[poses[:, 0] == index], false)
+            rows[name] = self._gathered[name].row(self.method)
         rows[MEAN] = mean_row(list(rows.values()), self.method)
         return rows
 
@@ -190,7 +242,7 @@ class Gathered:
         T_gt: True poses, metres.
         K: Camera matrices, pixels; NaN where unknown.
         visible_fractions: Visible share of each silhouette, in [0, 1].
-        scores: Score of each instance's prediction, (n, 1); NaN for a miss.
+        scores: Score of each instance's prediction; NaN for a miss.
         errors: Every error of each instance.
         false_positives: Scores of the false positives.
     """
@@ -198,34 +250,31 @@ class Gathered:
     def __init__(
         self,
         part: Part,
-        table: Float[Tensor, "n 44"],
+        table: Float[Tensor, "n 45"],
         false_positives: Float[Tensor, "false_positives"],
     ) -> None:
         self.part, self.false_positives = part, false_positives
-        T_est, T_gt, K, width, visible, self.scores = torch.split(table, [16, 16, 9, 1, 1, 1], 1)
-        self.visible_fractions = visible[:, 0]
-        self.T_gt, self.K = T_gt.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
-        self.errors = PoseErrors.of(part, T_est.reshape(-1, 4, 4), self.T_gt, self.K, width[:, 0])
+        T_est, self.T_gt = (table[:, place].reshape(-1, 4, 4) for place in (_T_EST, _T_GT))
+        self.visible_fractions, self.scores = table[:, _VISIBLE], table[:, _SCORE]
+        camera = table[:, _CAMERA]
+        self.K = camera[:, :9].reshape(-1, 3, 3)
+        self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9])
 
-    def row(self, part: Part, method: str) -> PoseRow:
+    def row(self, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""
-        errors, num_false = self.errors, len(self.false_positives)
+        part, errors, num_false = self.part, self.errors, len(self.false_positives)
         num_symmetries = len(symmetries(part))
-        counts: dict[str, Any] = {"false_positives": num_false, "num_symmetries": num_symmetries}
         if len(errors.add) == 0:
-            return PoseRow(part.name, method, 0, **counts)
-        row = summarise(
-            part.name, method, part.diameter, errors.add, errors.add_s, errors.mssd,
-            errors.rotation_deg, errors.rotation_s_deg, num_symmetries,
-        )  # fmt: skip
+            return PoseRow(
+                part.name, method, 0, false_positives=num_false, num_symmetries=num_symmetries
+            )
+        row = summarise(part.name, method, part.diameter, errors, num_symmetries)
         matched = int(errors.add.isfinite().sum())
         row.median_translation = finite_median(errors.translation)
         row.miss_rate = 1 - matched / len(errors.add)
         row.precision = matched / max(matched + num_false, 1)
         row.false_positives = num_false
         row.average_precision = self._average_precision(0.1 * part.diameter)
-        if errors.mspd is not None:
-            row.ar_mspd = average_recall(errors.mspd, BOP_MSPD_THRESHOLDS)
         return row
 
     def _average_precision(self, threshold: float) -> float:
@@ -234,9 +283,8 @@ class Gathered:
         So it depends neither on the order of images nor on which rank saw them.
         """
         right = self.errors.add < threshold
-        scores = self.scores[:, 0]
         wrong = ~right & self.errors.add.isfinite()
-        ordered = torch.cat([self.false_positives, scores[wrong], scores[right]])
+        ordered = torch.cat([self.false_positives, self.scores[wrong], self.scores[right]])
         correct = torch.arange(len(ordered)) >= len(ordered) - int(right.sum())
         return average_precision(ordered, correct, len(right))
 

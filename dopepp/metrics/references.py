@@ -23,9 +23,8 @@ from torch import Tensor
 
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import random_rotation
-from dopepp.metrics.assignment import extreme_points, symmetries
 from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
-from dopepp.metrics.row import PoseRow, summarise
+from dopepp.metrics.row import PoseErrors, PoseRow, extreme_points, summarise, symmetries
 from dopepp.parts.part import Part
 
 CHANCE_ALL: Final = "chance, all rotations"
@@ -48,11 +47,9 @@ def reference_rows(
 ) -> dict[str, PoseRow]:
     """Compute the three reference rows of one part on one test set.
 
-    The true poses are of its instances that count. The same seed gives the same draws.
-
-    Returns:
-        The rows by name, in the order of :data:`REFERENCES`. Without instances their measures are
-        None; with a single one, so is ``chance, test range``.
+    The true poses are of its instances that count. The same seed gives the same draws. The rows
+    are by name, in the order of :data:`REFERENCES`. Without instances their measures are None; with
+    a single one, so is ``chance, test range``.
     """
     rng = np.random.default_rng(seed)
     rotations = np.asarray(T_cam_obj, np.float64).reshape(-1, 4, 4)[:, :3, :3]
@@ -71,11 +68,10 @@ def reference_rows(
         guesses[BEST_CONSTANT] = _best_constant(rotations, few_points, 0.1 * part.diameter)
     rows = {}
     for name, guess in guesses.items():
-        rows[name] = PoseRow(object=part.name, method=name, num_instances=0)
+        rows[name] = PoseRow(part.name, name, 0, num_symmetries=len(symmetries(part)))
         if len(guess):
             rows[name] = _row(part, name, torch.from_numpy(guess), few_points, points)
         rows[name].num_instances = num_instances
-        rows[name].num_symmetries = len(symmetries(part))
     return rows
 
 
@@ -90,17 +86,16 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
     centre = torch.from_numpy(np.asarray(part.cuboid[CENTROID], np.float64))
     turned = Q[some], centre - Q[some] @ centre, identity[some], nowhere[some]
     group = symmetries(part)
-    return summarise(
-        part.name,
-        name,
-        part.diameter,
+    errors = PoseErrors(
         add=add(Q, nowhere, identity, nowhere, few_points),
         add_s=add_s(*about_centre, points),
         mssd=mssd(*turned, extreme_points(part), group),
+        mspd=None,
         rotation_deg=rotation_error_deg(Q, identity),
         rotation_s_deg=rotation_error_deg(Q[some], identity[some], group),
-        num_symmetries=len(group),
+        translation=nowhere[:, 0],
     )
+    return summarise(part.name, name, part.diameter, errors, len(group))
 
 
 def _other_poses(

@@ -1,7 +1,8 @@
-"""One row of a result table: every measure of one method on one object.
+"""Every error of one object's poses, and the row of a result table that sums them up.
 
-To add a measure, give :class:`PoseRow` a field, :func:`summarise` its formula and
-:data:`COLUMNS` its heading; tables, CSV and ``metrics.json`` follow.
+To add an error, give :class:`PoseErrors` a field and :meth:`PoseErrors.of` its function. To add a
+measure, give :class:`PoseRow` a field, :func:`summarise` its formula and :data:`COLUMNS` its
+heading; tables, CSV and ``metrics.json`` follow.
 """
 
 from __future__ import annotations
@@ -10,13 +11,92 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Final
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.metrics.functional import BOP_THRESHOLDS, auc, average_recall, pass_rate
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.metrics.functional import (
+    BOP_MSPD_THRESHOLDS,
+    BOP_THRESHOLDS,
+    add,
+    add_s,
+    auc,
+    average_recall,
+    mspd,
+    mssd,
+    pass_rate,
+    rotation_error_deg,
+    translation_error,
+)
+from dopepp.metrics.functional.distances import Errors
+from dopepp.parts.part import Part
 
 NOT_AVAILABLE: Final = "n/a"
+
+Poses = Float[Tensor, "n 4 4"]
+
+
+@dataclass
+class PoseErrors:
+    """Errors of N poses of one object, infinite where it was missed.
+
+    Attributes:
+        add: ADD, metres.
+        add_s: ADD-S, metres.
+        mssd: MSSD over the part's symmetries, metres.
+        mspd: MSPD over the part's symmetries, pixels of an image 640 wide; None where a camera is
+            not known.
+        rotation_deg: Angle between the orientations, degrees.
+        rotation_s_deg: The least such angle over the part's symmetries, degrees.
+        translation: Distance between the object frame's origins, metres.
+    """
+
+    add: Errors
+    add_s: Errors
+    mssd: Errors
+    mspd: Errors | None
+    rotation_deg: Errors
+    rotation_s_deg: Errors
+    translation: Errors
+
+    @classmethod
+    def of(
+        cls, part: Part, T_est: Poses, T_gt: Poses, K: Float[Tensor, "n 3 3"], width: Errors
+    ) -> PoseErrors:
+        """Compute them, of estimated poses (NaN for a miss) and true ones, metres.
+
+        Camera matrices and the images' widths are pixels, NaN where unknown.
+        """
+        poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
+        points = torch.from_numpy(np.asarray(part.points, np.float64))
+        vertices, group = extreme_points(part), symmetries(part)
+        has_cameras = bool(K.isfinite().all() & width.isfinite().all())
+        return cls(
+            add=add(*poses, points),
+            add_s=add_s(*poses, points),
+            mssd=mssd(*poses, vertices, group),
+            mspd=mspd(*poses, vertices, K, group) * (640 / width) if has_cameras else None,
+            rotation_deg=rotation_error_deg(poses[0], poses[2]),
+            rotation_s_deg=rotation_error_deg(poses[0], poses[2], group),
+            translation=translation_error(poses[1], poses[3]),
+        )
+
+
+def symmetries(part: Part) -> Float[Tensor, "s 4 4"]:
+    """Return the part's symmetry transforms, the identity first."""
+    group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+    return torch.from_numpy(group)
+
+
+def extreme_points(part: Part) -> Float[Tensor, "v 3"]:
+    """Return what MSSD and MSPD look at: the mesh's vertices as in BOP, else the ADD points.
+
+    The surface samples of a CAD part miss its corners, where the largest distances are.
+    """
+    points = part.points if part.mesh is None else part.mesh.vertices
+    return torch.from_numpy(np.asarray(points, np.float64))
 
 
 @dataclass
@@ -136,35 +216,27 @@ _TOTALS: Final = ("num_instances", "false_positives")
 
 
 def summarise(
-    name: str,
-    method: str,
-    diameter: float,
-    add: Float[Tensor, "n"],
-    add_s: Float[Tensor, "n"],
-    mssd: Float[Tensor, "n"],
-    rotation_deg: Float[Tensor, "n"],
-    rotation_s_deg: Float[Tensor, "n"],
-    num_symmetries: int,
+    name: str, method: str, diameter: float, errors: PoseErrors, num_symmetries: int
 ) -> PoseRow:
     """Fill the measures that follow from the errors of N >= 1 poses alone.
 
-    The errors are of each pose, infinite for a miss: metres and degrees. ``rotation_s_deg`` is to
-    the nearest symmetry; symmetries count with the identity.
+    Symmetries count with the identity.
     """
     return PoseRow(
         object=name,
         method=method,
-        num_instances=len(add),
-        add_01d=pass_rate(add, 0.1 * diameter),
-        pass_5cm=pass_rate(add, 0.05),
-        pass_10cm=pass_rate(add, 0.1),
-        auc_10cm=auc(add, 0.1),
-        add_s_01d=pass_rate(add_s, 0.1 * diameter),
-        auc_s_10cm=auc(add_s, 0.1),
-        median_rotation_deg=finite_median(rotation_deg),
-        mssd_01d=pass_rate(mssd, 0.1 * diameter),
-        ar_mssd=average_recall(mssd, [share * diameter for share in BOP_THRESHOLDS]),
-        median_rotation_s_deg=finite_median(rotation_s_deg),
+        num_instances=len(errors.add),
+        add_01d=pass_rate(errors.add, 0.1 * diameter),
+        pass_5cm=pass_rate(errors.add, 0.05),
+        pass_10cm=pass_rate(errors.add, 0.1),
+        auc_10cm=auc(errors.add, 0.1),
+        add_s_01d=pass_rate(errors.add_s, 0.1 * diameter),
+        auc_s_10cm=auc(errors.add_s, 0.1),
+        median_rotation_deg=finite_median(errors.rotation_deg),
+        mssd_01d=pass_rate(errors.mssd, 0.1 * diameter),
+        ar_mssd=average_recall(errors.mssd, [share * diameter for share in BOP_THRESHOLDS]),
+        ar_mspd=None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS),
+        median_rotation_s_deg=finite_median(errors.rotation_s_deg),
         num_symmetries=num_symmetries,
     )
 

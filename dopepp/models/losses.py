@@ -20,11 +20,7 @@ from dopepp.models.heads import Beliefs, Fields, Stage
 
 
 class MapLoss(nn.Module, ABC):
-    """A loss summed over the stages.
-
-    Attributes:
-        activation: Name of the belief activation that the network must be built with.
-    """
+    """A loss summed over the stages; its activation is what the network must be built with."""
 
     activation: ClassVar[str]
 

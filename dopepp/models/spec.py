@@ -11,10 +11,8 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.models import attention, backbones, heads, losses
-from dopepp.models.layers import find_activation
 from dopepp.models.network import PoseNetwork
 from dopepp.models.registry import Registry
 
@@ -36,8 +34,6 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
         keys = f"exactly {', '.join(SPEC_KEYS)}"
         raise UserError(f"a model spec with {got}", keys, "add or remove keys")
     activation, num_objects = spec["activation"], spec["num_objects"]
-    find_activation(activation)
-    check_integer("num_objects", num_objects, 1, heads.MAX_OBJECTS)
     backbone = BACKBONES.build(spec["backbone"])
     channels = backbone.out_channels
     return PoseNetwork(

@@ -1,9 +1,15 @@
-"""From the peaks of one object's maps to groups of keypoints, one group per instance."""
+"""From the peaks of one object's maps to groups of keypoints, one group per instance.
+
+Which corners belong together, an affine camera tells: from far enough away, a corner's image is
+c + A s with the centroid's c, a 2×3 matrix A and the corner's signs s, so any three corners no two
+of which are opposite predict the other five.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -11,8 +17,11 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.recovery.consensus import CornerPeaks, Corners, Evidence, predict
+from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, NUM_CORNERS, NUM_KEYPOINTS
+
+Evidence = Float[np.ndarray, "instances 8 peaks"]
+CornerPeaks = Float[np.ndarray, "8 peaks 2"]
+Corners = Float[np.ndarray, "instances 8 2"]
 
 LEAST_DEVIATION: Final = 0.05
 """Radians by which even a clear vector may be off its centroid's direction."""
@@ -25,6 +34,27 @@ LEAST_LENGTH: Final = 1e-3
 
 PREDICTION_PX: Final = 4.0
 """Deviation of a measured keypoint from where the other ones put it: half a cell of stride 8."""
+
+CANDIDATES: Final = 3
+"""Peaks of a corner that are tried: the likeliest ones by belief and direction."""
+
+PERSPECTIVE: Final = 0.1
+"""Deviation of corners from the affine camera, over their distance from the centroid: a part seen
+from five times its size away has corners ±10 % nearer or farther."""
+
+TRIPLES: Final = np.array(
+    [
+        triple
+        for triple in combinations(range(NUM_CORNERS), 3)
+        if abs(np.linalg.det(CORNER_SIGNS[list(triple)])) > 1
+    ]
+)
+"""Corners without an opposite pair, which would leave a direction open; (32, 3)."""
+
+WEIGHTS: Final = np.array(
+    [np.linalg.solve(CORNER_SIGNS[triple].T, CORNER_SIGNS.T).T for triple in TRIPLES]
+)
+"""Every corner as a sum of the triple's, relative to the centroid; (32, 8, 3)."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +102,43 @@ def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: floa
     within ``coincident_px`` of it has no direction, and any angle will do. Returned are
     log-likelihood ratios; −∞ where a pair is not allowed.
     """
-    evidence = np.empty((len(peaks.centroid), *peaks.score.shape))
-    _direction_evidence(
+    return _direction_evidence(
         peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score, max_angle,
-        coincident_px, evidence,
+        coincident_px,
     )  # fmt: skip
-    return evidence
+
+
+def associate(
+    peaks: ObjectPeaks, evidence: Evidence, expected: Corners | None = None
+) -> list[KeypointGroup]:
+    """Group peaks into instances, one per centroid.
+
+    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: that of
+    belief and direction, and that of the distance from where the instance's other corners put it.
+    The latter binds the corners together. A peak that nothing speaks for stays alone.
+
+    ``expected`` is where poses found before put the corners, pixels; NaN for an instance without a
+    pose. Before there are any, triples of corners predict the others.
+    """
+    deviation = np.full(len(evidence), PREDICTION_PX)
+    if expected is None:
+        expected, deviation = _predict(peaks, evidence)
+    gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)
+    count = len(evidence)
+    position = np.full((count, NUM_KEYPOINTS, 2), np.nan)
+    covariance = np.full((count, NUM_KEYPOINTS, 2, 2), np.nan)
+    score = np.zeros((count, NUM_KEYPOINTS))
+    position[:, CENTROID] = peaks.centroid
+    covariance[:, CENTROID] = peaks.centroid_covariance_px
+    score[:, CENTROID] = peaks.centroid_score
+    for k in range(NUM_CORNERS):
+        instance, peak = linear_sum_assignment(gain[:, k], maximize=True)
+        wanted = gain[instance, k, peak] > 0
+        instance, peak = instance[wanted], peak[wanted]
+        position[instance, k] = peaks.position[k, peak]
+        covariance[instance, k] = peaks.covariance_px[k, peak]
+        score[instance, k] = peaks.score[k, peak]
+    return [KeypointGroup(*group) for group in zip(position, score, covariance, strict=True)]
 
 
 @compiled()
@@ -89,10 +150,9 @@ def _direction_evidence(
     centroid_score: Array,
     max_angle: float,
     coincident_px: float,
-    evidence: Array,
-) -> None:
-    """Fill the evidence of every instance, corner and peak."""
-    evidence[:] = -math.inf
+) -> Array:
+    """Return the evidence of every instance, corner and peak."""
+    evidence = np.full((len(centroid), *score.shape), -math.inf)
     for i, k, m in np.ndindex(evidence.shape):
         if not score[k, m] > 0.0:
             continue
@@ -111,6 +171,7 @@ def _direction_evidence(
         elif angle > max_angle:
             continue
         evidence[i, k, m] = ratio + math.log(score[k, m]) + math.log(centroid_score[i])
+    return evidence
 
 
 @compiled()
@@ -142,36 +203,80 @@ def _gain(
     return gain
 
 
-def associate(
-    peaks: ObjectPeaks, evidence: Evidence, expected: Corners | None = None
-) -> list[KeypointGroup]:
-    """Group peaks into instances, one per centroid.
+def _predict(
+    peaks: ObjectPeaks, evidence: Evidence
+) -> tuple[Corners, Float[np.ndarray, "instances"]]:
+    """Find for each centroid the corners that the most and likeliest peaks agree on.
 
-    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: that of
-    belief and direction, and that of the distance from where the instance's other corners put it.
-    The latter binds the corners together. A peak that nothing speaks for stays alone.
-
-    ``expected`` is where poses found before put the corners, pixels; NaN for an instance without a
-    pose. Before there are any, triples of corners predict the others.
+    A peak that belongs to nobody may lie anywhere on the maps. Returned are the corners' expected
+    positions, NaN where no three peaks have a say, and the standard deviation from them, pixels.
     """
-    deviation = np.full(len(evidence), PREDICTION_PX)
-    if expected is None:
-        expected, deviation = predict(
-            peaks.position, evidence, peaks.centroid, PREDICTION_PX, peaks.area_px
-        )
-    gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)
-    count = len(evidence)
-    position = np.full((count, NUM_KEYPOINTS, 2), np.nan)
-    covariance = np.full((count, NUM_KEYPOINTS, 2, 2), np.nan)
-    score = np.zeros((count, NUM_KEYPOINTS))
-    position[:, CENTROID] = peaks.centroid
-    covariance[:, CENTROID] = peaks.centroid_covariance_px
-    score[:, CENTROID] = peaks.centroid_score
-    for k in range(NUM_CORNERS):
-        instance, peak = linear_sum_assignment(gain[:, k], maximize=True)
-        wanted = gain[instance, k, peak] > 0
-        instance, peak = instance[wanted], peak[wanted]
-        position[instance, k] = peaks.position[k, peak]
-        covariance[instance, k] = peaks.covariance_px[k, peak]
-        score[instance, k] = peaks.score[k, peak]
-    return [KeypointGroup(*group) for group in zip(position, score, covariance, strict=True)]
+    order = np.argsort(-evidence, axis=-1)[..., :CANDIDATES]
+    likeliest = np.take_along_axis(evidence, order, axis=-1)
+    candidates = np.take_along_axis(peaks.position[None], order[..., None], axis=2)
+    expected = np.full((len(evidence), NUM_CORNERS, 2), np.nan)
+    deviation = np.empty(len(evidence))
+    for i in range(len(evidence)):
+        deviation[i] = _best_triple(
+            candidates[i], likeliest[i], peaks.centroid[i], TRIPLES, WEIGHTS, PREDICTION_PX,
+            peaks.area_px, expected[i],
+        )  # fmt: skip
+    return expected, deviation
+
+
+@compiled()
+def _best_triple(
+    candidates: Array,
+    evidence: Array,
+    centroid: Array,
+    triples: Array,
+    weights: Array,
+    deviation_px: float,
+    area_px: float,
+    expected: Array,
+) -> float:
+    """Write the corners that the best three candidates predict; returns their deviation."""
+    best, best_deviation = -math.inf, deviation_px
+    # What speaks so much against a peak that no agreement makes up for it.
+    hopeless = -math.log(area_px / (2 * math.pi * deviation_px**2))
+    count = candidates.shape[1]
+    corners, arms = np.empty((8, 2)), np.empty((3, 2))
+    chosen = np.empty(3, np.int64)
+    usable = np.zeros(8, np.int64)
+    for k in range(8):
+        # Candidates come likeliest first.
+        while usable[k] < count and evidence[k, usable[k]] > hopeless:
+            usable[k] += 1
+    for number in range(len(triples)):
+        a, b, c = usable[triples[number, 0]], usable[triples[number, 1]], usable[triples[number, 2]]
+        for code in range(a * b * c):
+            chosen[0], chosen[1], chosen[2] = code % a, code // a % b, code // (a * b)
+            for i in range(3):
+                arms[i] = candidates[triples[number, i], chosen[i]] - centroid
+            size = 0.0
+            for k in range(8):
+                for axis in range(2):
+                    arm = 0.0
+                    for i in range(3):
+                        arm += weights[number, k, i] * arms[i, axis]
+                    corners[k, axis] = arm
+                size += math.hypot(corners[k, 0], corners[k, 1]) / 8
+            deviation = math.hypot(deviation_px, PERSPECTIVE * size)
+            gain = math.log(area_px / (2 * math.pi * deviation**2))
+            total = 0.0
+            for k in range(8):
+                most = 0.0
+                for m in range(count):
+                    dx = candidates[k, m, 0] - centroid[0] - corners[k, 0]
+                    dy = candidates[k, m, 1] - centroid[1] - corners[k, 1]
+                    miss = (dx * dx + dy * dy) / (2 * deviation**2)
+                    value = evidence[k, m] + gain - miss
+                    # A peak that does not exist has −∞ or NaN.
+                    if value > most:
+                        most = value
+                total += most
+            if total > best:
+                best, best_deviation = total, deviation
+                for k in range(8):
+                    expected[k] = corners[k] + centroid
+    return best_deviation

@@ -14,7 +14,6 @@ from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
-from dopepp.recovery.options import RecoveryOptions
 
 SIGMA_FLOOR_PX: Final = 1.0
 """No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
@@ -104,12 +103,11 @@ def pose_instances(
     peaks: ObjectPeaks,
     cuboid: Cuboid,
     K: CameraMatrix,
-    options: RecoveryOptions,
+    max_angle_deg: float,
     coincident_px: float,
 ) -> list[tuple[KeypointGroup, PnPResult]]:
     """Group keypoints and solve poses by turns, until the poses change no group any more."""
-    max_angle = math.radians(options.max_angle_deg)
-    evidence = direction_evidence(peaks, max_angle, coincident_px)
+    evidence = direction_evidence(peaks, math.radians(max_angle_deg), coincident_px)
     groups = associate(peaks, evidence)
     results = [solve_group(group, cuboid, K) for group in groups]
     for _ in range(ROUNDS):

@@ -13,9 +13,8 @@ from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.maps.encode import Beliefs, Fields, MapGeometry
 from dopepp.maps.peaks import find_peaks
 from dopepp.recovery.association import ObjectPeaks
-from dopepp.recovery.calibration import calibrated
+from dopepp.recovery.calibration import RecoveryOptions, calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
-from dopepp.recovery.options import RecoveryOptions
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -36,16 +35,10 @@ def recover(
 ) -> list[Detection]:
     """Recover the poses of all objects on one image from its maps.
 
-    Args:
-        belief: 9·C belief maps, peaks of 1.
-        field: 16·C vector-field maps.
-        cuboids: Nine keypoints of each object, metres.
-        K: Camera matrix of the network's input, pixels.
-        stride: Input pixels per cell.
-        names: The objects' names; their indices where not given.
-        **options: Fields of :class:`RecoveryOptions`.
-
-    Returns the detections of all objects, best score first.
+    Of C objects there are 9·C belief maps (peaks of 1), 16·C vector-field maps, and nine keypoints
+    each, metres; without names, their indices stand for them. K is the camera matrix of the
+    network's input, pixels, of which ``stride`` make a cell. The options are fields of
+    :class:`RecoveryOptions`. Returned are the detections of all objects, best score first.
     """
     return recover_batch(
         belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, **options
@@ -135,7 +128,7 @@ def _recover_object(
         return [], [f"{name}: no centroid's belief reaches {options.centroid_threshold:g}"]
     detections: list[Detection] = []
     reasons: list[str] = []
-    for group, result in pose_instances(peaks, cuboid, K, options, float(stride)):
+    for group, result in pose_instances(peaks, cuboid, K, options.max_angle_deg, float(stride)):
         detection = make_detection(group, result, cuboid, K, name)
         x, y = group.position[CENTROID]
         size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input

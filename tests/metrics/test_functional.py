@@ -72,7 +72,7 @@ def test_add_s_runs_from_true_points_to_estimated_ones():
 def test_chunks_change_nothing(monkeypatch):
     pose, points = poses(9, 4), cloud(64)
     whole = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
-    monkeypatch.setattr("dopepp.metrics.functional.inputs._CHUNK_POINTS", 128)
+    monkeypatch.setattr("dopepp.metrics.functional.distances._CHUNK_POINTS", 128)
     parts = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
     for a, b in zip(whole, parts, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=0)

@@ -10,7 +10,9 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project, trans
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.recovery.calibration import (
+    DISTANCE_FACTORS,
     FEATURES,
+    RecoveryOptions,
     calibrated,
     detection_features,
     fit_distance_factor,
@@ -18,7 +20,6 @@ from dopepp.recovery.calibration import (
     score,
 )
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.options import DISTANCE_FACTORS, RecoveryOptions
 
 K = camera_matrix(600, 600, 320, 240)
 CUBOID = cuboid_keypoints(np.array([-0.05, -0.03, -0.02]), np.array([0.05, 0.03, 0.02]))

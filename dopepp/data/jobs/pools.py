@@ -24,9 +24,8 @@ from queue import SimpleQueue
 from threading import Timer
 from typing import Any, Final
 
-from dopepp.core.futures import completed, connect, spread
+from dopepp.core.futures import THREAD_LIMITS, completed, connect, spread
 from dopepp.core.interrupts import StoppedError
-from dopepp.core.machine import THREAD_LIMITS
 from dopepp.data.jobs.work import Outcome, Task, Worker
 from dopepp.virtual.renderers.photoreal.variant import THREADS_SETTING
 

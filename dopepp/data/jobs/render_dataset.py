@@ -25,8 +25,8 @@ from rich.progress import Task as ShownTask
 from rich.text import Text
 
 from dopepp.core.errors import UserError
+from dopepp.core.futures import available_cores
 from dopepp.core.interrupts import stopped
-from dopepp.core.machine import available_cores
 from dopepp.data.jobs.folder import begin, is_begun
 from dopepp.data.jobs.job import Job
 from dopepp.data.jobs.pools import ClusterPool, Pool, ProcessPool

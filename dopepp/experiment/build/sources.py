@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.core.machine import available_cores
+from dopepp.core.futures import available_cores
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.ycb_video.frame import read_classes

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.core.machine import cache_folder
+from dopepp.core.files import cache_folder
 from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.ndds.source import NddsSource
 from dopepp.data.formats.webdataset.source import WebdatasetSource

@@ -20,8 +20,7 @@ from omegaconf import DictConfig, open_dict
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import require
-from dopepp.core.futures import completed, connect, spread
-from dopepp.core.machine import THREAD_LIMITS, available_cores
+from dopepp.core.futures import THREAD_LIMITS, available_cores, completed, connect, spread
 from dopepp.experiment.runs import display, record
 
 _MOST: Final = 1024

@@ -25,7 +25,7 @@ from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.assignment import PredictedPose
+from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.parts.part import Parts
 

@@ -22,11 +22,10 @@ from torch import Tensor
 
 from dopepp.drawing.curves import RateCurve
 from dopepp.experiment.config.data import DataConfig
-from dopepp.metrics.assignment import symmetries
 from dopepp.metrics.bootstrap import Difference
 from dopepp.metrics.functional import wilson_interval
 from dopepp.metrics.pose import MEAN, Gathered
-from dopepp.metrics.row import COLUMNS, Column, PoseRow
+from dopepp.metrics.row import COLUMNS, Column, PoseRow, symmetries
 from dopepp.parts.part import Parts
 
 Row = dict[str, str]

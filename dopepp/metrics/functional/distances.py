@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dopepp.metrics.functional.inputs import (
-    Errors,
-    Points,
-    Positions,
-    Rotations,
-    Symmetries,
-    check_cameras,
-    check_poses,
-    check_symmetries,
-    chunks,
-    nan_is_miss,
-    to_float64,
-)
-from dopepp.metrics.functional.nearest import NearestPoints
-from dopepp.metrics.functional.symmetric import least_farthest
+from dopepp.metrics.functional.search import least_farthest, mean_nearest
 
-_CHUNK_PAIRS: Final = 1 << 26
-"""Pairs of points held at once on a GPU: 0.5 GB in float64."""
+Rotations = Float[Tensor, "n 3 3"]
+Positions = Float[Tensor, "n 3"]
+Points = Float[Tensor, "v 3"]
+Symmetries = Float[Tensor, "s 4 4"]
+Errors = Float[Tensor, "n"]
+"""Of N poses and one object's V points: metres, object frame; errors infinite for a miss."""
+
+_CHUNK_POINTS: Final = 1 << 17
+"""Transformed points held at once: 3 MB in float64, which stays in a CPU's cache."""
 
 
 def add(
     R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
 ) -> Errors:
     """Average distance between corresponding points at both poses (ADD, paper Eq. 1), metres."""
-    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
     # R_est·x + t_est − R_gt·x − t_gt needs one product instead of two.
     rotation, translation = R_est - R_gt, t_est - t_gt
     errors = t_est.new_empty(len(t_est))
-    for chunk in chunks(len(t_est), len(points)):
+    for chunk in _chunks(len(t_est), len(points)):
         errors[chunk] = _lengths(rotation[chunk], translation[chunk], points).mean(dim=1)
     return nan_is_miss(errors)
 
@@ -46,41 +40,15 @@ def add_s(
 ) -> Errors:
     """Average distance from each true point to the nearest ESTIMATED point (ADD-S), metres.
 
-    Exact, for symmetric objects: one tree over the object's points serves all poses on a CPU; on a
-    GPU every pair of points is compared.
+    Exact, for symmetric objects; one tree over the object's points serves all poses.
     """
-    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
     everything = torch.cat([R_est.flatten(1), t_est, R_gt.flatten(1), t_gt], dim=1)
     valid = everything.isfinite().all(dim=1).nonzero()[:, 0]
     errors = torch.full_like(t_est[:, 0], torch.inf)
-    if t_est.device.type == "cpu":
-        nearest = NearestPoints(points.numpy())
-        distances = nearest.mean_distances(
-            *(tensor[valid].numpy() for tensor in (R_est, R_gt, t_gt - t_est))
-        )
-        errors[valid] = torch.from_numpy(distances)
-    else:
-        errors[valid] = compare_all_pairs(R_est[valid], R_gt[valid], (t_gt - t_est)[valid], points)
-    return errors
-
-
-def compare_all_pairs(
-    R_est: Rotations, R_gt: Rotations, offset: Positions, points: Points
-) -> Errors:
-    """Average the distances to the nearest points by comparing every pair: ADD-S for a GPU.
-
-    ``offset`` is the true minus the estimated translation, metres.
-    """
-    errors = offset.new_empty(len(offset))
-    rows = max(1, _CHUNK_PAIRS // len(points))
-    for n in range(len(offset)):
-        estimated, true = points @ R_est[n].mT, points @ R_gt[n].mT + offset[n]
-        total = offset.new_zeros(())
-        for part in torch.split(true, rows):
-            # The matrix product's shortcut loses half of the digits of a small distance.
-            pairs = torch.cdist(part, estimated, compute_mode="donot_use_mm_for_euclid_dist")
-            total += pairs.amin(dim=1).sum()
-        errors[n] = total / len(points)
+    poses = (tensor[valid].cpu().numpy() for tensor in (R_est, R_gt, t_gt - t_est))
+    distances = mean_nearest(points.cpu().numpy(), *poses)
+    errors[valid] = torch.from_numpy(distances).to(errors)
     return errors
 
 
@@ -99,8 +67,8 @@ def mssd(
     The transforms S are taken as they are: put the identity among them, as
     :func:`dopepp.geometry.symmetry.symmetry_group` does. (S, 3, 3) are rotations.
     """
-    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
-    group = check_symmetries(symmetries, t_est)
+    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    group = _check_symmetries(symmetries, t_est)
     return least_farthest((R_est, t_est), (R_gt, t_gt), points, group, perspective=False)
 
 
@@ -125,10 +93,10 @@ def reprojection_error(
     One K serves all poses, or each has its own. A point at or behind the camera in either pose
     makes the error infinite.
     """
-    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
-    K = check_cameras(K, len(R_est))
+    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    K = _check_cameras(K, len(R_est))
     errors = t_est.new_empty(len(t_est))
-    for chunk in chunks(len(t_est), len(points)):
+    for chunk in _chunks(len(t_est), len(points)):
         estimated = _project(R_est[chunk], t_est[chunk], points, K[chunk])
         true = _project(R_gt[chunk], t_gt[chunk], points, K[chunk])
         errors[chunk] = (estimated - true).norm(dim=2).mean(dim=1)
@@ -150,9 +118,9 @@ def mspd(
     it infinite. K is one camera matrix, or one for every pose, pixels; symmetries are as of
     :func:`dopepp.metrics.functional.mssd`.
     """
-    R_est, t_est, R_gt, t_gt, points = check_poses(R_est, t_est, R_gt, t_gt, points)
-    K = check_cameras(K, len(R_est))
-    group = check_symmetries(symmetries, t_est)
+    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    K = _check_cameras(K, len(R_est))
+    group = _check_symmetries(symmetries, t_est)
     # Pixels are the first two of K·x over x's depth, whatever the last row of K holds.
     to_pixels = K.clone()
     to_pixels[:, 2] = K.new_tensor([0.0, 0.0, 1.0])
@@ -185,7 +153,7 @@ def rotation_error_deg(
     if R_est.shape != R_gt.shape or R_est.shape[1:] != (3, 3):
         shapes = f"{tuple(R_est.shape)} and {tuple(R_gt.shape)}"
         raise ValueError(f"rotations must be (N, 3, 3) and (N, 3, 3), got {shapes}")
-    turns, _ = check_symmetries(symmetries, R_est)
+    turns, _ = _check_symmetries(symmetries, R_est)
     errors = torch.full_like(R_est[:, 0, 0], torch.inf)
     for turn in turns:
         errors = torch.fmin(errors, _angles_deg(R_est @ (R_gt @ turn).mT))
@@ -203,3 +171,63 @@ def _angles_deg(Q: Rotations) -> Errors:
 def translation_error(t_est: Positions, t_gt: Positions) -> Errors:
     """Distance between the two positions of the object's origin, metres."""
     return nan_is_miss((to_float64(t_est) - to_float64(t_gt)).norm(dim=1))
+
+
+def to_float64(array: Tensor) -> Tensor:
+    """Return any array as a float64 tensor on its own device."""
+    return torch.as_tensor(array, dtype=torch.float64)
+
+
+def _check_poses(
+    R_est: Tensor, t_est: Tensor, R_gt: Tensor, t_gt: Tensor, points: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Cast to float64 and insist on the shapes that broadcasting would otherwise hide.
+
+    A wrong shape, or no points, are a ``ValueError``.
+    """
+    R_est, t_est, R_gt, t_gt, points = map(to_float64, (R_est, t_est, R_gt, t_gt, points))
+    n = len(t_est)
+    shapes = [tuple(tensor.shape) for tensor in (R_est, t_est, R_gt, t_gt)]
+    if shapes != [(n, 3, 3), (n, 3), (n, 3, 3), (n, 3)]:
+        raise ValueError(f"poses must be (N, 3, 3), (N, 3), (N, 3, 3), (N, 3), got {shapes}")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points must be (V, 3) with V >= 1, got {tuple(points.shape)}")
+    return R_est, t_est, R_gt, t_gt, points
+
+
+def _check_cameras(K: Tensor, num_poses: int) -> Rotations:
+    """Return one camera matrix for every pose; K must be (3, 3) or (N, 3, 3)."""
+    K = to_float64(K)
+    if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (num_poses,)):
+        raise ValueError(f"K must be (3, 3) or (N, 3, 3) of N = {num_poses}, got {tuple(K.shape)}")
+    return K.expand(num_poses, 3, 3)
+
+
+def _check_symmetries(
+    symmetries: Tensor | None, like: Tensor
+) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
+    """Split (S, 4, 4) or (S, 3, 3) transforms into rotations and translations.
+
+    None is the identity alone; any other shape is a ``ValueError``.
+    """
+    if symmetries is None:
+        return torch.eye(3, dtype=like.dtype, device=like.device)[None], like.new_zeros(1, 3)
+    symmetries = to_float64(symmetries).to(like.device)
+    if symmetries.ndim != 3 or symmetries.shape[1:] not in ((4, 4), (3, 3)) or not len(symmetries):
+        raise ValueError(
+            f"symmetries must be (S, 4, 4) or (S, 3, 3) with S >= 1, got {tuple(symmetries.shape)}"
+        )
+    if symmetries.shape[1] == 3:
+        return symmetries, symmetries.new_zeros(len(symmetries), 3)
+    return symmetries[:, :3, :3], symmetries[:, :3, 3]
+
+
+def _chunks(num_poses: int, num_points: int) -> Iterator[slice]:
+    """Cut poses into slices that need little memory with ``num_points`` points each."""
+    step = max(1, _CHUNK_POINTS // num_points)
+    return (slice(i, min(i + step, num_poses)) for i in range(0, num_poses, step))
+
+
+def nan_is_miss(errors: Tensor) -> Tensor:
+    """Turn NaN into an infinite error."""
+    return errors.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.metrics.functional.inputs import Errors, nan_is_miss, to_float64
+from dopepp.metrics.functional.distances import Errors, nan_is_miss, to_float64
 
 AucMethod = Literal["exact", "voc"]
 
@@ -81,11 +81,9 @@ def wilson_interval(passed: int, num: int, confidence: float = 0.95) -> tuple[fl
     With z the two-sided normal quantile and p = passed / num, the ends are
     (p + z²/2n ± z·√(p(1 − p)/n + z²/4n²)) / (1 + z²/n).
 
-    Without trials they are (0, 1). A ``ValueError``: ``passed`` is not in 0 … ``num``, or the
-    confidence, the chance that the interval holds the true rate, not strictly between 0 and 1.
+    The confidence is the chance that the interval holds the true rate. Without trials the ends are
+    (0, 1).
     """
-    if not 0 <= passed <= num or not 0 < confidence < 1:
-        raise ValueError(f"passed={passed}, num={num}, confidence={confidence}")
     if num == 0:
         return 0.0, 1.0
     z = NormalDist().inv_cdf((1 + confidence) / 2)

@@ -76,7 +76,10 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
             "a checkpoint written by `dopepp release`", "get the file again",
         )  # fmt: skip
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
-    weights = {name: _single(value) for name, value in tensors.items()}
+    weights = {
+        name: value.float() if value.is_floating_point() else value
+        for name, value in tensors.items()
+    }
     size = sum(value.numel() * value.element_size() for value in weights.values())
     return {"state_dict": weights, KEY: payload}, size
 
@@ -160,10 +163,6 @@ def _half(name: str, value: Tensor) -> Tensor:
             "train again: such weights come from a run that diverged",
         )
     return half
-
-
-def _single(value: Tensor) -> Tensor:
-    return value.float() if value.is_floating_point() else value
 
 
 def _portable(value: Any, key: str = "") -> Any:

@@ -71,7 +71,14 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
     partial = partial_path(path)
     try:
         with partial.open("wb") as stream:
-            _serialise(payload, stream)
+            try:
+                torch.save(dict(payload), stream)
+            except RuntimeError as error:
+                # What ends the writing (no space, Ctrl-C) is hidden by torch's complaint about the
+                # file that was not completed.
+                if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
+                    raise error.__context__ from None
+                raise
             stream.flush()
             os.fsync(stream.fileno())
         if previous is not None and path.is_file():
@@ -86,17 +93,6 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
             os.fsync(folder)
         finally:
             os.close(folder)
-
-
-def _serialise(payload: Mapping[str, Any], stream: IO[bytes]) -> None:
-    try:
-        torch.save(dict(payload), stream)
-    except RuntimeError as error:
-        # What ends the writing (no space, Ctrl-C) is hidden by torch's complaint about the file
-        # that was not completed.
-        if isinstance(error.__context__, (OSError, KeyboardInterrupt)):
-            raise error.__context__ from None
-        raise
 
 
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:

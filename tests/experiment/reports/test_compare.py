@@ -28,7 +28,7 @@ from dopepp.experiment.reports.tables import DELTA, read_csv
 from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
 from dopepp.metrics.pose import MEAN
-from dopepp.metrics.row import PoseRow, mean_row, summarise
+from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 
 DIAMETER = 0.1
 
@@ -42,7 +42,7 @@ def report(
     for number in range(num_objects):
         part = f"part{number}"
         e, a = torch.from_numpy(errors), torch.from_numpy(angles)
-        rows[part] = summarise(part, name, DIAMETER, e, e, e, a, a, 1)
+        rows[part] = summarise(part, name, DIAMETER, PoseErrors(e, e, e, None, a, a, e), 1)
         rows[part].miss_rate = float(np.isinf(errors).mean())
     parts = list(rows)
     rows[MEAN] = mean_row(list(rows.values()), name)

@@ -20,7 +20,7 @@ from dopepp.experiment.runs import record
 from dopepp.experiment.runs.sweep import CompareJobs
 from dopepp.experiment.train import do_job
 from dopepp.metrics.pose import MEAN
-from dopepp.metrics.row import mean_row, summarise
+from dopepp.metrics.row import PoseErrors, mean_row, summarise
 
 FOLDER = Path(__file__).parents[3] / "conf" / "experiment"
 EXPERIMENTS = sorted(
@@ -40,7 +40,8 @@ def job(
         record.write_json(folder / record.FAILURE_FILE, {"reason": "no memory"})
         return
     e = torch.tensor(errors, dtype=torch.float64)
-    rows = {part: summarise(part, "x", 0.1, e, e, e, 1000 * e, 1000 * e, 1)}
+    errors_of = PoseErrors(e, e, e, None, 1000 * e, 1000 * e, e)
+    rows = {part: summarise(part, "x", 0.1, errors_of, 1)}
     rows[MEAN] = mean_row(list(rows.values()), "x")
     report = Report(
         "x", rows, {"best constant pose": rows}, {part: np.array(errors)}, Cost(), len(errors),

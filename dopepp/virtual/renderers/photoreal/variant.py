@@ -29,7 +29,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError, require
-from dopepp.core.machine import available_cores, cache_folder
+from dopepp.core.files import cache_folder
+from dopepp.core.futures import available_cores
 
 _log = logging.getLogger(__name__)
 
