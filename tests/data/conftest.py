@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +17,7 @@ HALF = np.array([0.04, 0.03, 0.02])
 
 
 @pytest.fixture
-def box() -> Part:
+def box():
     cuboid = cuboid_keypoints(-HALF, HALF)
     return Part("003_box", cuboid, float(2 * np.linalg.norm(HALF)), cuboid[:8], mesh_hash="box")
 
@@ -63,7 +61,7 @@ class FakeSource:
 
 
 @pytest.fixture
-def fake_source() -> type[FakeSource]:
+def fake_source():
     return FakeSource
 
 
@@ -121,15 +119,15 @@ class YcbTree:
 
 
 @pytest.fixture
-def ycb_tree(tmp_path: Path) -> YcbTree:
+def ycb_tree(tmp_path):
     return YcbTree(tmp_path / "ycb")
 
 
 @pytest.fixture(scope="session")
-def contents() -> Callable[[Path], dict[str, bytes]]:
+def contents():
     """Read every file of a folder, and every folder as an empty one."""
 
-    def read(root: Path) -> dict[str, bytes]:
+    def read(root):
         return {
             str(path.relative_to(root)): path.read_bytes() if path.is_file() else b""
             for path in root.rglob("*")

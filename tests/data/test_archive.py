@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import io
 import os
 import struct
 import tarfile
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,11 +10,10 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.data.archive import Limits, safe_extract
 
-Members = Sequence[tuple[str | tarfile.TarInfo, bytes]]
-GOOD: Members = [("set/a.txt", b"hello" * 1000), ("set/deep/b.bin", bytes(range(256))), ("c", b"")]
+GOOD = [("set/a.txt", b"hello" * 1000), ("set/deep/b.bin", bytes(range(256))), ("c", b"")]
 
 
-def pack(members: Members, mode: str = "w") -> bytes:
+def pack(members, mode: str = "w") -> bytes:
     """Make an archive: tarfile's mode, or "zip"."""
     file = io.BytesIO()
     if mode == "zip":
@@ -25,7 +21,7 @@ def pack(members: Members, mode: str = "w") -> bytes:
             for name, content in members:
                 archive.writestr(str(name), content)
         return file.getvalue()
-    with tarfile.open(fileobj=file, mode=mode) as tar:  # type: ignore[call-overload]
+    with tarfile.open(fileobj=file, mode=mode) as tar:
         for name, content in members:
             info = tarfile.TarInfo(name) if isinstance(name, str) else name
             info.size = len(content)
@@ -48,7 +44,7 @@ def refused(folder: Path, content: bytes, message: str, limits: Limits | None = 
 
 
 @pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
-def test_every_format_is_unpacked_completely(tmp_path: Path, mode: str) -> None:
+def test_every_format_is_unpacked_completely(tmp_path, mode):
     folder = unpack(tmp_path, pack(GOOD, mode))
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
     assert files == {str(name): data for name, data in GOOD if "." in str(name)}
@@ -56,21 +52,21 @@ def test_every_format_is_unpacked_completely(tmp_path: Path, mode: str) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["archive", "out"]
 
 
-def test_folders_may_come_after_their_files_and_twice(tmp_path: Path) -> None:
+def test_folders_may_come_after_their_files_and_twice(tmp_path):
     again = tarfile.TarInfo("set")
     again.type = tarfile.DIRTYPE
     folder = unpack(tmp_path, pack([("./set/a", b"1"), (again, b""), (again, b"")]))
     assert (folder / "set" / "a").read_bytes() == b"1"
 
 
-def test_permissions_and_owners_are_not_taken_over(tmp_path: Path) -> None:
+def test_permissions_and_owners_are_not_taken_over(tmp_path):
     info = tarfile.TarInfo("run")
     info.mode, info.uid = 0o6777, 0
     folder = unpack(tmp_path, pack([(info, b"#!")]))
     assert (folder / "run").stat().st_mode & 0o6111 == 0
 
 
-def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path: Path) -> None:
+def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path):
     (tmp_path / "out").mkdir()
     unpack(tmp_path, pack(GOOD))
     with pytest.raises(UserError, match=r"out, which is in use; allowed: a new or empty folder"):
@@ -82,7 +78,7 @@ def test_an_empty_folder_is_used_and_another_one_left_alone(tmp_path: Path) -> N
     "name", ["../x", "set/../../x", "/etc/x", "set\\..\\x", "C:x", "a\nb", "x" * 300, "d/" * 900]
 )
 @pytest.mark.parametrize("mode", ["w", "zip"])
-def test_a_path_out_of_the_folder_is_refused(tmp_path: Path, name: str, mode: str) -> None:
+def test_a_path_out_of_the_folder_is_refused(tmp_path, name, mode):
     folder = tmp_path / "inner"
     folder.mkdir()
     message = "leads out of the folder|no name that every system can write"
@@ -90,35 +86,20 @@ def test_a_path_out_of_the_folder_is_refused(tmp_path: Path, name: str, mode: st
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "message"),
-    [
-        ("a", "a", "two members 'a'"),
-        ("Photo.jpg", "photo.JPG", "two members"),
-        ("a", "a/b", "'a/b' below or instead of a file"),
-        ("a/b", "a", "two members 'a'"),
-    ],
-)
-def test_two_members_at_one_place_are_refused(
-    tmp_path: Path, one: str, other: str, message: str
-) -> None:
-    refused(tmp_path, pack([(one, b"1"), (other, b"1")]), message)
-
-
 @pytest.mark.parametrize("mode", ["w:gz", "w:bz2", "w:xz", "zip"])
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, mode: str) -> None:
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, mode):
     content = pack([("zeros", bytes(60_000_000))], mode)
     refused(tmp_path, content, "more than 10000000 bytes to unpack")
 
 
-def test_limits(tmp_path: Path) -> None:
+def test_limits(tmp_path):
     content = pack([(f"file{number}", bytes(10)) for number in range(10)])
     refused(tmp_path, content, "more than 9 members", Limits(num_members=9))
     refused(tmp_path, content, "more than 99 bytes", Limits(total_bytes=99))
     assert unpack(tmp_path, content, Limits(num_members=10, total_bytes=100)).is_dir()
 
 
-def test_a_zip_that_lies_about_a_size_is_refused(tmp_path: Path) -> None:
+def test_a_zip_that_lies_about_a_size_is_refused(tmp_path):
     content = pack([("a", b"hello" * 1000)], "zip")
     record = content.rfind(b"PK\x01\x02")  # its size field is 24 bytes on
     lie = content[: record + 24] + struct.pack("<I", 10) + content[record + 28 :]
@@ -126,21 +107,21 @@ def test_a_zip_that_lies_about_a_size_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["w", "w:gz", "w:bz2", "w:xz", "zip"])
-def test_a_damaged_archive_is_refused(tmp_path: Path, mode: str) -> None:
+def test_a_damaged_archive_is_refused(tmp_path, mode):
     content = pack([("a", os.urandom(5000)), ("b", os.urandom(5000))], mode)
     for length in (0, 1, 7, 300, 4000, 7000):
         refused(tmp_path, content[:length], "damaged")
     refused(tmp_path, b"junk" * 500, "damaged")
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_file_is_refused(tmp_path):
     for archive in (tmp_path, tmp_path / "gone.tar"):
         with pytest.raises(UserError, match="no such file"):
             safe_extract(archive, tmp_path / "out")
 
 
-def test_an_interrupt_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
+def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("dopepp.data.archive._unpack", interrupted)

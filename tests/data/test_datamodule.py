@@ -1,6 +1,4 @@
-from __future__ import annotations
-
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.data.batch import Batch
+from dopepp.data.batch import PADDING, Batch, collate
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.loader import EpochSampler, SampleDataset
 from dopepp.data.sources.cache import CachedSource
@@ -21,9 +19,9 @@ from dopepp.virtual.backgrounds import ProceduralBackgrounds
 
 
 @pytest.fixture
-def build(fake_source: Any) -> Any:
-    def build(**changes: Any) -> PoseDataModule:
-        options: dict[str, Any] = {
+def build(fake_source):
+    def build(**changes):
+        options = {
             "train": fake_source(12),
             "val": fake_source(5),
             "test": fake_source(3, size=(96, 72)),
@@ -41,7 +39,7 @@ def build(fake_source: Any) -> Any:
 
 def batches(datamodule: PoseDataModule, epoch: int) -> list[Batch]:
     loader = datamodule.train_dataloader()
-    loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+    loader.sampler.set_epoch(epoch)
     return list(loader)
 
 
@@ -57,8 +55,8 @@ def assert_same(first: list[Batch], second: list[Batch]) -> None:
 
 
 @pytest.mark.parametrize("cached", [False, True])
-def test_workers_do_not_change_the_batches(build: Any, fake_source: Any, cached: bool) -> None:
-    def train() -> Any:
+def test_workers_do_not_change_the_batches(build, fake_source, cached):
+    def train():
         return CachedSource(fake_source(12), (64, 64)) if cached else fake_source(12)
 
     alone = build(train=train())
@@ -69,7 +67,7 @@ def test_workers_do_not_change_the_batches(build: Any, fake_source: Any, cached:
         assert_same(batches(alone, epoch), list(loader))
 
 
-def test_epochs_differ_and_repeat(build: Any) -> None:
+def test_epochs_differ_and_repeat(build):
     datamodule = build()
     first, second = batches(datamodule, 0), batches(datamodule, 1)
     assert_same(first, batches(datamodule, 0))
@@ -83,9 +81,7 @@ def test_epochs_differ_and_repeat(build: Any) -> None:
     assert [batch.keys for batch in reseeded] != [batch.keys for batch in first]
 
 
-def test_cached_images_keep_their_epoch_but_not_their_augmentation(
-    build: Any, fake_source: Any
-) -> None:
+def test_cached_images_keep_their_epoch_but_not_their_augmentation(build, fake_source):
     datamodule = build(train=CachedSource(fake_source(12), (64, 64)))
     first, second = datamodule.train_item(0, 3), datamodule.train_item(1, 3)
     assert first.key == second.key == "0/3"
@@ -93,12 +89,12 @@ def test_cached_images_keep_their_epoch_but_not_their_augmentation(
     np.testing.assert_array_equal(first.instances[0].keypoints, second.instances[0].keypoints)
 
 
-def test_padding_is_neither_augmented_nor_masked(build: Any) -> None:
+def test_padding_is_neither_augmented_nor_masked(build):
     for index in range(12):
         assert not build().train_item(0, index).image[48:].any()
 
 
-def test_validation_is_untouched_and_test_is_native(build: Any, fake_source: Any) -> None:
+def test_validation_is_untouched_and_test_is_native(build, fake_source):
     datamodule = build()
     keys = []
     for batch in datamodule.val_dataloader():
@@ -112,7 +108,7 @@ def test_validation_is_untouched_and_test_is_native(build: Any, fake_source: Any
 
 @pytest.mark.parametrize("shuffle", [True, False])
 @pytest.mark.parametrize("num_items", [12, 13])
-def test_ranks_share_the_items(fake_source: Any, shuffle: bool, num_items: int) -> None:
+def test_ranks_share_the_items(fake_source, shuffle, num_items):
     dataset = SampleDataset(lambda epoch, index: fake_source().sample(index, epoch), num_items)
     ranks = [EpochSampler(dataset, 0, shuffle, rank, 3) for rank in range(3)]
     for sampler in ranks:
@@ -129,17 +125,12 @@ def test_ranks_share_the_items(fake_source: Any, shuffle: bool, num_items: int) 
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_users_mistake_arrives_as_one_line(
-    build: Any, fake_source: Any, num_workers: int
-) -> None:
+def test_a_users_mistake_arrives_as_one_line(build, fake_source, num_workers):
     error = UserError("frame 7", "complete frames", "download it again")
     source = fake_source(12, bad=lambda index: error if index == 7 else None)
     with pytest.raises(UserError, match=r"^got frame 7; allowed: complete frames") as caught:
         batches(build(train=source, num_workers=num_workers), 0)
     assert "\n" not in str(caught.value)
-
-
-# --- with Lightning --------------------------------------------------------------------------
 
 
 class Recorder(pl.LightningModule):
@@ -179,9 +170,7 @@ class SaveAt(pl.Callback):
 
 # An epoch has three batches: in the first, at its end, and inside the second.
 @pytest.mark.parametrize(("stop", "num_workers"), [(1, 0), (3, 0), (4, 2), (5, 0)])
-def test_lightning_resumes_where_it_stopped(
-    build: Any, tmp_path: Path, stop: int, num_workers: int
-) -> None:
+def test_lightning_resumes_where_it_stopped(build, tmp_path, stop, num_workers):
     expected = [(e, batch.keys) for e in range(3) for batch in batches(build(), e)]
     path, first, second = tmp_path / "last.ckpt", Recorder(), Recorder()
     trainer = trainer_of(tmp_path, max_epochs=3, callbacks=[SaveAt(path, stop)])
@@ -195,10 +184,7 @@ def test_lightning_resumes_where_it_stopped(
     assert second.train_keys == expected[stop:]
 
 
-# --- start-up --------------------------------------------------------------------------------
-
-
-def test_summary_and_fingerprint(build: Any, fake_source: Any) -> None:
+def test_summary_and_fingerprint(build, fake_source):
     rows = build().summary()
     images = [(row.split, row.source, row.num_images) for row in rows]
     assert images == [("train", "fake", 12), ("val", "fake", 5), ("test", "fake", 3)]
@@ -210,15 +196,63 @@ def test_summary_and_fingerprint(build: Any, fake_source: Any) -> None:
     assert build(val=fake_source(6)).fingerprint() != fingerprint
 
 
-def test_an_object_without_any_instance_fails_at_start(build: Any) -> None:
+def test_an_object_without_any_instance_fails_at_start(build):
     build().check_objects()
     with pytest.raises(UserError, match=r"no instance of can in the training data \(fake\)"):
         build(object_names=["box", "can"]).check_objects()
 
 
-def test_wrong_options(build: Any) -> None:
+def test_wrong_options(build):
     with pytest.raises(UserError, match="12 training images for batches of 13"):
         build(batch_size=13)
     with pytest.raises(ValueError, match="masking needs backgrounds"):
         build(backgrounds=None)
     assert build(masking=None, augment=None, backgrounds=None).train_item(0, 0).size == (64, 64)
+
+
+def test_collate_pads_instances(fake_source):
+    source = fake_source()
+    one, none, two = source.sample(0), source.sample(1), source.sample(2)
+    none.instances = []
+    two.instances.append(replace(two.instances[0], label="can", masked_fraction=0.25))
+    batch = collate([one, none, two], {"can": 0, "box": 1})
+    assert batch.object_index.tolist() == [[1, PADDING], [PADDING] * 2, [1, 0]]
+    assert batch.images.dtype == torch.uint8
+    assert batch.images.shape == (3, 3, 48, 64)
+    assert batch.images.is_contiguous(memory_format=torch.channels_last)
+    np.testing.assert_array_equal(batch.images[2].permute(1, 2, 0).numpy(), two.image)
+    np.testing.assert_allclose(batch.K[0].numpy(), one.K)
+    np.testing.assert_allclose(batch.T_cam_obj[2, 1].numpy(), two.instances[1].T_cam_obj, rtol=1e-6)
+    np.testing.assert_allclose(batch.keypoints[0, 0].numpy(), one.instances[0].keypoints, rtol=1e-6)
+    padding = batch.object_index == PADDING
+    assert batch.keypoints[padding].isnan().all()
+    assert not batch.keypoints[~padding].isnan().any()
+    assert (batch.T_cam_obj[padding] == torch.eye(4)).all()
+    assert batch.visible_fraction[padding].eq(0).all()
+    assert batch.masked_fraction[2].tolist() == [0.0, 0.25]
+    assert batch.keys == ["0/0", "0/1", "0/2"]
+    assert batch.sources == ["fake"] * 3
+    assert len(batch) == 3
+
+
+def test_a_batch_without_instances_keeps_one_padding_slot(fake_source):
+    sample = fake_source().sample(0)
+    sample.instances = []
+    assert collate([sample, sample], {"box": 0}).object_index.tolist() == [[PADDING], [PADDING]]
+
+
+def test_to_moves_tensors_and_keeps_the_rest(fake_source):
+    batch = collate([fake_source().sample(0)], {"box": 0})
+    moved = batch.to("meta", non_blocking=True)
+    assert isinstance(moved, Batch)
+    assert moved.images.device.type == moved.object_index.device.type == "meta"
+    assert moved.object_index.dtype == torch.int64
+    assert moved.keys == batch.keys
+
+
+def test_wrong_sizes_and_labels_are_refused(fake_source):
+    samples = [fake_source(size=(64, 48)).sample(0), fake_source(size=(48, 48)).sample(0)]
+    with pytest.raises(ValueError, match="images of one size"):
+        collate(samples, {"box": 0})
+    with pytest.raises(ValueError, match=r"\['box'\] are not among \['can'\]"):
+        collate(samples[:1], {"can": 0})

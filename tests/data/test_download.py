@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import hashlib
 import io
 import logging
@@ -7,7 +5,6 @@ import socket
 import tarfile
 import threading
 import urllib.request
-from collections.abc import Iterator
 from http.client import HTTPMessage
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path, PurePosixPath
@@ -17,7 +14,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data import download as downloads
-from dopepp.data.download import SOURCES, DownloadSource, _Redirects, download, fetch
+from dopepp.data.download import DownloadSource, _Redirects, download, fetch
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -37,7 +34,7 @@ class Handler(BaseHTTPRequestHandler):
     """What the path says: good, and every way to be bad."""
 
     def do_GET(self) -> None:
-        server: Server = self.server  # type: ignore[assignment]
+        server: Server = self.server
         server.ranges.append(self.headers.get("Range"))
         kind, content = self.path.strip("/"), server.content
         if kind == "gone":
@@ -77,7 +74,7 @@ class Server(ThreadingHTTPServer):
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(monkeypatch):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with Server(("127.0.0.1", 0), Handler) as server:
         server.ranges = []
@@ -94,8 +91,8 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_arrives_whole(server: Server, tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
+def test_a_file_arrives_whole(server, tmp_path):
+    seen = []
     path = tmp_path / "new" / "file.bin"
     fetch(url(server, "good"), path, len(CONTENT), SHA256, lambda *at: seen.append(at))
     assert path.read_bytes() == CONTENT
@@ -105,13 +102,13 @@ def test_a_file_arrives_whole(server: Server, tmp_path: Path) -> None:
     assert len(server.ranges) == 1  # a whole file is not fetched again
 
 
-def test_redirections_within_http_are_followed(server: Server, tmp_path: Path) -> None:
+def test_redirections_within_http_are_followed(server, tmp_path):
     address = url(server, f"redirect:{url(server, 'good')}")
     fetch(address, tmp_path / "f", len(CONTENT), SHA256)
     assert (tmp_path / "f").read_bytes() == CONTENT
 
 
-def test_a_broken_connection_is_resumed(server: Server, tmp_path: Path) -> None:
+def test_a_broken_connection_is_resumed(server, tmp_path):
     path, half = tmp_path / "f", len(CONTENT) // 2
     with pytest.raises(UserError, match=rf"broke after {half} of 3000000 bytes; .*goes on"):
         fetch(url(server, "cut"), path, len(CONTENT), SHA256)
@@ -123,13 +120,13 @@ def test_a_broken_connection_is_resumed(server: Server, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("there", [1000, len(CONTENT), len(CONTENT) + 5])
-def test_any_partial_file_ends_well(server: Server, tmp_path: Path, there: int) -> None:
+def test_any_partial_file_ends_well(server, tmp_path, there):
     (tmp_path / "f.partial").write_bytes((CONTENT + bytes(5))[:there])
     fetch(url(server, "no-range"), tmp_path / "f", len(CONTENT), SHA256)
     assert (tmp_path / "f").read_bytes() == CONTENT
 
 
-def test_a_server_that_goes_on_elsewhere_is_refused(server: Server, tmp_path: Path) -> None:
+def test_a_server_that_goes_on_elsewhere_is_refused(server, tmp_path):
     (tmp_path / "f.partial").write_bytes(CONTENT[:1000])
     with pytest.raises(UserError, match=r"goes on at 'bytes 0-.* instead of byte 1000"):
         fetch(url(server, "wrong-range"), tmp_path / "f", len(CONTENT), SHA256)
@@ -146,9 +143,7 @@ def test_a_server_that_goes_on_elsewhere_is_refused(server: Server, tmp_path: Pa
         ("redirect:ftp://127.0.0.1/x", "unknown url type: ftp"),
     ],
 )
-def test_what_is_not_the_file_leaves_nothing(
-    server: Server, tmp_path: Path, kind: str, message: str
-) -> None:
+def test_what_is_not_the_file_leaves_nothing(server, tmp_path, kind, message):
     with pytest.raises(UserError, match=message) as caught:
         fetch(url(server, kind), tmp_path / "f", len(CONTENT), SHA256)
     assert "\n" not in str(caught.value)
@@ -156,7 +151,7 @@ def test_what_is_not_the_file_leaves_nothing(
 
 
 @pytest.mark.parametrize("target", ["http://127.0.0.1/x", "HTTP://127.0.0.1/x", "ftp://a/x"])
-def test_https_is_never_left(target: str) -> None:
+def test_https_is_never_left(target):
     request = urllib.request.Request("https://host/file.tar")
     with pytest.raises(UserError, match=r"file\.tar: redirected to .*, which is not https"):
         _Redirects().redirect_request(request, io.BytesIO(), 302, "", HTTPMessage(), target)
@@ -165,7 +160,7 @@ def test_https_is_never_left(target: str) -> None:
     assert followed.full_url == safe
 
 
-def test_no_network_is_one_line(tmp_path: Path) -> None:
+def test_no_network_is_one_line(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -176,18 +171,13 @@ def test_no_network_is_one_line(tmp_path: Path) -> None:
         fetch("file:///etc/passwd", tmp_path / "f", 1, SHA256)
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(server: Server, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_one_line(server, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match=r"file/f, which cannot be written"):
         fetch(url(server, "good"), tmp_path / "file" / "f", len(CONTENT), SHA256)
 
 
-def test_a_data_set_is_unpacked_once(
-    server: Server,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_data_set_is_unpacked_once(server, tmp_path, monkeypatch, caplog):
     server.content = make_tar()
     digest = hashlib.sha256(server.content).hexdigest()
     photos = PurePosixPath("set/photos")
@@ -205,10 +195,6 @@ def test_a_data_set_is_unpacked_once(
     assert len(server.ranges) == 1
 
 
-def test_voc2007_is_known_by_size_and_checksum() -> None:
-    source = SOURCES["voc2007"]
-    assert source.num_bytes == 460_032_000
-    assert len(source.sha256) == 64
-    assert source.filename == "VOCtrainval_06-Nov-2007.tar"
+def test_an_unknown_data_set_lists_the_known_ones():
     with pytest.raises(UserError, match=r"unknown data set 'voc'; allowed: voc2007"):
         download("voc", ".")

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +13,13 @@ from dopepp.parts.part import Part
 
 
 @pytest.fixture
-def stl(tmp_path: Path) -> Path:
+def stl(tmp_path):
     path = tmp_path / "block.stl"
     trimesh.creation.box((30, 20, 10)).apply_translation((5, 0, 0)).export(path)
     return path
 
 
-def test_the_command_prints_an_entry_that_training_reads(stl: Path, tmp_path: Path) -> None:
+def test_the_command_prints_an_entry_that_training_reads(stl, tmp_path):
     result = CliRunner().invoke(app, ["symmetries", str(stl), "--unit", "mm"])
     assert result.exit_code == 0
     entry = json.loads(result.stdout)
@@ -42,7 +39,7 @@ def test_the_command_prints_an_entry_that_training_reads(stl: Path, tmp_path: Pa
         assert np.allclose(read.symmetries_discrete, found.symmetries_discrete, atol=1e-12)
 
 
-def test_nothing_is_found_or_taken_away_unless_asked(stl: Path) -> None:
+def test_nothing_is_found_or_taken_away_unless_asked(stl):
     part = load_part(stl, "mm")
     assert choose_symmetries([part], None) == [part]
     assert part.symmetries_discrete is None
@@ -53,7 +50,7 @@ def test_nothing_is_found_or_taken_away_unless_asked(stl: Path) -> None:
     assert bare.symmetries_continuous == ()
 
 
-def test_mistakes_are_named(stl: Path, tmp_path: Path) -> None:
+def test_mistakes_are_named(stl, tmp_path):
     part = load_part(stl, "mm")
     with pytest.raises(UserError, match=r"data.symmetries=gone.json, no such file.*none, auto"):
         choose_symmetries([part], "gone.json")
@@ -68,7 +65,7 @@ def test_mistakes_are_named(stl: Path, tmp_path: Path) -> None:
         assert CliRunner().invoke(app, ["symmetries", *arguments]).exit_code == 2
 
 
-def test_a_round_part_has_its_axis_in_millimetres(tmp_path: Path) -> None:
+def test_a_round_part_has_its_axis_in_millimetres(tmp_path):
     path = tmp_path / "can.stl"
     trimesh.creation.cylinder(33, 100, sections=48).apply_translation((0, 12, 0)).export(path)
     entry = json.loads(CliRunner().invoke(app, ["symmetries", str(path)]).stdout)

@@ -8,7 +8,7 @@ from dopepp.drawing.pictures import read_image, read_rgb
 
 
 @pytest.fixture
-def image() -> np.ndarray:
+def image():
     noise = np.random.default_rng(1).integers(0, 256, (40, 60, 3), np.uint8)
     return cv2.GaussianBlur(noise, (5, 5), 2)
 
@@ -47,10 +47,8 @@ def test_a_truncated_file_is_an_error(tmp_path, image, suffix, share):
         read_image(path)
 
 
-def test_damage_missing_and_other_formats(tmp_path, image):
+def test_damage_and_other_formats(tmp_path, image):
     path = tmp_path / "image.png"
-    with pytest.raises(UserError, match=r"image\.png: No such file"):
-        read_image(path)
     Image.fromarray(image).save(path)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1

@@ -14,13 +14,11 @@ PARTS = pytest.mark.parametrize("build", SIZES, ids=lambda build: build.__name__
 
 
 def to_trimesh(part: Part) -> trimesh.Trimesh:
-    assert part.mesh is not None
     return trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
 
 
 def to_solid(part: Part, centre: np.ndarray) -> Manifold:
     """Millimetres about ``centre`` (metres)."""
-    assert part.mesh is not None
     vertices = np.ascontiguousarray(1000 * (part.mesh.vertices - centre))
     solid = Manifold(Mesh64(vertices, part.mesh.faces.astype(np.uint64)))
     assert solid.status() == Error.NoError
@@ -38,7 +36,6 @@ def test_has_the_papers_size_about_the_origin(build):
     part = build()
     half = np.array(SIZES[build]) / 2
     assert part.name == build.__name__
-    assert part.mesh is not None
     np.testing.assert_allclose(part.mesh.vertices.max(axis=0), half, rtol=0, atol=1e-15)
     np.testing.assert_allclose(part.mesh.vertices.min(axis=0), -half, rtol=0, atol=1e-15)
     np.testing.assert_allclose(part.cuboid[0], half * [1, -1, 1], rtol=0, atol=1e-15)
@@ -77,25 +74,6 @@ def test_no_rotation_maps_it_onto_itself(build, about):
     tried = Rotation.concatenate([turns, flips, anything])
     far = tried[tried.magnitude() > np.radians(9)] if about == "centre of mass" else anything
     assert min(share_moved(solid, R) for R in far.as_matrix()) > 0.1
-
-
-@PARTS
-def test_front_and_back_differ_where_both_are_solid(build):
-    # Depth maps of both faces over one grid: raised features in front, recesses behind.
-    part = build()
-    solid = to_solid(part, part.cuboid[8])
-    areas = {z: solid.slice(z).area() for z in (-3.4, -2.0, 0.0, 1.0, 3.4)}
-    assert areas[3.4] < areas[1.0] < 0.6 * areas[0.0]
-    assert areas[-3.4] < 0.95 * areas[0.0]
-
-
-@PARTS
-def test_walls_of_features_are_visible_from_straight_above_and_below(build):
-    mesh = to_trimesh(build())
-    tilt = mesh.face_normals[:, 2]
-    sloping = (np.abs(tilt) > 0.2) & (np.abs(tilt) < 0.98)
-    assert mesh.area_faces[sloping & (tilt > 0)].sum() > 2e-4  # square metres
-    assert mesh.area_faces[sloping & (tilt < 0)].sum() > 5e-5
 
 
 def test_has_one_hash_in_every_process():

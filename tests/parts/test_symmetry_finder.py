@@ -61,19 +61,14 @@ def moved(shape: trimesh.Trimesh, seed: int) -> trimesh.Trimesh:
 
 
 CASES = [
-    (name, drawn) for name in SHAPES for drawn in (True, False) if name not in SLOW or not drawn
+    pytest.param(name, drawn, marks=[pytest.mark.slow] * (name in ("cube", "triangular prism")))
+    for name in SHAPES
+    for drawn in (True, False)
+    if name not in SLOW or not drawn
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "as_drawn"),
-    [
-        pytest.param(*case, marks=pytest.mark.slow)
-        if case[0] in ("cube", "triangular prism")
-        else case
-        for case in CASES
-    ],
-)
+@pytest.mark.parametrize(("name", "as_drawn"), CASES)
 def test_the_group_of_a_known_shape_is_found(name, as_drawn):
     shape, num_discrete, num_axes = SHAPES[name]
     mesh = as_mesh(shape if as_drawn else moved(shape, seed=len(name)))

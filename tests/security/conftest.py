@@ -1,7 +1,5 @@
 """What every attack has in common: a tripwire, a bound on memory, a good file to spoil."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import os
@@ -25,14 +23,6 @@ MOST_MB = 400
 
 _SPARE_BYTES = 6 * 2**30
 """A safety belt for the machine the tests run on, where a bomb goes off after all."""
-
-SPEC: dict[str, Any] = {
-    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.125},
-    "attention": {"_target_": "dopepp.models.attention.CBAM"},
-    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.125},
-    "activation": "exp",
-    "num_objects": 1,
-}
 
 
 class Call:
@@ -79,24 +69,24 @@ def one_line(match: str) -> Iterator[None]:
 
 
 @pytest.fixture(name="Call", scope="session")
-def call_class() -> type[Call]:
+def call_class():
     return Call
 
 
 @pytest.fixture(scope="session")
-def bounded() -> Callable[..., contextlib.AbstractContextManager[None]]:
+def bounded():
     """See :func:`within`."""
     return within
 
 
 @pytest.fixture(scope="session")
-def refused() -> Callable[[str], contextlib.AbstractContextManager[None]]:
+def refused():
     """See :func:`one_line`."""
     return one_line
 
 
 @pytest.fixture
-def canary(tmp_path: Path) -> Iterator[str]:
+def canary(tmp_path):
     """A command that leaves a trace; at the end of the test there must be none."""
     trace = tmp_path / "canary"
     yield f"touch {trace}"
@@ -105,29 +95,30 @@ def canary(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def content() -> dict[str, Any]:
+def content(tiny_spec):
     """What is in a good checkpoint's file; to be copied before it is changed."""
+    spec = tiny_spec | {"attention": {"_target_": "dopepp.models.attention.CBAM", "reduction": 4}}
     vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.05, 0], [0, 0, 0.02]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
     part = make_part("bracket", Mesh(vertices, faces), vertices)
-    weights = build_network(SPEC).state_dict()
+    weights = build_network(spec).state_dict()
     return Checkpoint(
-        SPEC, weights, [part], (64, 64), 8, 1.0, {"centroid_threshold": 0.05}
+        spec, weights, [part], (64, 64), 8, 1.0, {"centroid_threshold": 0.05}
     ).to_file()
 
 
 @pytest.fixture
-def good(content: dict[str, Any], tmp_path: Path) -> Path:
+def good(content, tmp_path):
     """A good checkpoint."""
     write_atomic(content, tmp_path / "good.ckpt")
     return tmp_path / "good.ckpt"
 
 
 @pytest.fixture
-def saved(content: dict[str, Any], tmp_path: Path) -> Callable[..., Path]:
+def saved(content, tmp_path):
     """Write a good checkpoint that a function has changed."""
 
-    def save(edit: Callable[[dict[str, Any]], object]) -> Path:
+    def save(edit):
         spoilt = copy.deepcopy(content)
         edit(spoilt)
         torch.save(spoilt, tmp_path / "bad.ckpt")
@@ -137,10 +128,10 @@ def saved(content: dict[str, Any], tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def rejected() -> Callable[[Path, str], None]:
+def rejected():
     """Expect that a checkpoint is not loaded, and one line for the user."""
 
-    def load(path: Path, match: str) -> None:
+    def load(path, match):
         with one_line(match):
             PoseEstimator.load(path)
 

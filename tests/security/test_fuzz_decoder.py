@@ -1,7 +1,5 @@
 """The decoder on maps that no sound network makes: finite detections or a documented error."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np
@@ -124,7 +122,7 @@ def sound(case: dict[str, Any]) -> bool:
 @example(PLAIN)
 @example({**PLAIN, "objects": 0})  # found: a reshape of nothing
 @example({**PLAIN, "focal": 1e200})  # found: a determinant beyond all numbers
-def test_any_maps(case: dict[str, Any]) -> None:
+def test_any_maps(case):
     check(case)
 
 
@@ -134,7 +132,7 @@ def test_any_maps(case: dict[str, Any]) -> None:
     max_examples=THOROUGH, deadline=None, database=None, suppress_health_check=list(HealthCheck)
 )
 @given(CASES)
-def test_many_maps(case: dict[str, Any]) -> None:
+def test_many_maps(case):
     check(case)
 
 
@@ -149,7 +147,7 @@ WRONG: Final = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_maps_of_other_shapes(name: str) -> None:
+def test_maps_of_other_shapes(name):
     belief, field, objects = WRONG[name]
     box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)
     K = camera_matrix(60, 60, 50, 50)

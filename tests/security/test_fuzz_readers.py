@@ -5,10 +5,8 @@ take about ten minutes together with ``test_fuzz_decoder.py``. What such runs fi
 of its own, by the attack it would make.
 """
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -172,9 +170,7 @@ def images(path: Path) -> tuple[Callable[[Path], object], ...]:
 
 
 @pytest.fixture(scope="session")
-def targets(
-    tmp_path_factory: pytest.TempPathFactory, content: dict[str, Any]
-) -> Mapping[str, Target]:
+def targets(tmp_path_factory, content):
     """Good files of every kind."""
     root = tmp_path_factory.mktemp("good")
     return {**_files(root, content), **_datasets(root)}
@@ -326,16 +322,16 @@ def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_files(name: str, targets: Mapping[str, Target], tmp_path: Path) -> None:
+def test_damaged_files(name, targets, tmp_path):
     fuzz(targets[name], tmp_path, QUICK, repeat=True)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", NAMES)
-def test_many_damaged_files(name: str, targets: Mapping[str, Target], tmp_path: Path) -> None:
+def test_many_damaged_files(name, targets, tmp_path):
     fuzz(targets[name], tmp_path, THOROUGH, repeat=False)
 
 
-def test_every_good_file_is_tried(targets: Mapping[str, Target]) -> None:
+def test_every_good_file_is_tried(targets):
     assert set(targets) == set(NAMES)

@@ -1,7 +1,5 @@
 """Checkpoints whose archive lies, and checkpoints whose plain values ask for too much."""
 
-from __future__ import annotations
-
 import struct
 import zipfile
 from collections.abc import Callable
@@ -16,10 +14,6 @@ from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
 
 pytestmark = pytest.mark.timeout(60)
-
-Rejected = Callable[[Path, str], None]
-Saved = Callable[..., Path]
-Edit = Callable[[dict[str, Any]], object]
 
 
 def members(path: Path) -> dict[str, bytes]:
@@ -36,9 +30,7 @@ def pack(path: Path, content: list[tuple[str, bytes]], method: int = zipfile.ZIP
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("again", ["good/data.pkl", "GOOD/DATA.PKL", "good/data/0"])
-def test_two_members_of_one_name(
-    again: str, good: Path, tmp_path: Path, rejected: Rejected
-) -> None:
+def test_two_members_of_one_name(again, good, tmp_path, rejected):
     """One reader takes the first of them, another one the last."""
     folder = next(iter(members(good))).split("/")[0]
     content = [(name.replace(folder, "good"), data) for name, data in members(good).items()]
@@ -46,13 +38,13 @@ def test_two_members_of_one_name(
     rejected(path, "two members of one name")
 
 
-def test_two_pickles_in_two_folders(good: Path, tmp_path: Path, rejected: Rejected) -> None:
+def test_two_pickles_in_two_folders(good, tmp_path, rejected):
     content = list(members(good).items())
     path = pack(tmp_path / "bad.ckpt", [("other/data.pkl", b"\x80\x02N."), *content])
     rejected(path, "2 members FOLDER/data.pkl")
 
 
-def test_an_archive_behind_something_else(good: Path, tmp_path: Path, rejected: Rejected) -> None:
+def test_an_archive_behind_something_else(good, tmp_path, rejected):
     """torch would read what comes first, which nobody has looked at."""
     path = tmp_path / "bad.ckpt"
     for first in (b"\x80\x02}.", b"#!/bin/sh\n", bytes(512)):
@@ -61,9 +53,7 @@ def test_an_archive_behind_something_else(good: Path, tmp_path: Path, rejected: 
 
 
 @pytest.mark.parametrize("name", ["../data.pkl", "/etc/data.pkl", "a/../../data.pkl"])
-def test_members_that_lead_out_of_the_archive(
-    name: str, good: Path, tmp_path: Path, rejected: Rejected
-) -> None:
+def test_members_that_lead_out_of_the_archive(name, good, tmp_path, rejected):
     content = [*members(good).items(), (name, b"\x80\x02N.")]
     path = pack(tmp_path / "bad.ckpt", content)
     rejected(path, "bad.ckpt, which torch refuses to load")
@@ -71,13 +61,13 @@ def test_members_that_lead_out_of_the_archive(
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_zip_bomb(method: int, tmp_path: Path, rejected: Rejected) -> None:
+def test_a_zip_bomb(method, tmp_path, rejected):
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(50_000_000))], method)
     assert path.stat().st_size < 100_000
     rejected(path, "which unpacks to 50000000 bytes")
 
 
-def test_a_declared_size_that_lies(tmp_path: Path, rejected: Rejected) -> None:
+def test_a_declared_size_that_lies(tmp_path, rejected):
     """The directory says 10 bytes, or 10 terabytes, of a member of a thousand."""
     path = pack(tmp_path / "bad.ckpt", [("a/data.pkl", bytes(1000))])
     content = bytearray(path.read_bytes())
@@ -88,7 +78,7 @@ def test_a_declared_size_that_lies(tmp_path: Path, rejected: Rejected) -> None:
         rejected(path, r"bad\.ckpt, which")
 
 
-def test_overlapping_members(tmp_path: Path, rejected: Rejected) -> None:
+def test_overlapping_members(tmp_path, rejected):
     """A thousand entries of the directory that share one member's bytes."""
     path = pack(tmp_path / "one.ckpt", [("a/data/0", bytes(100_000))])
     content = path.read_bytes()
@@ -122,7 +112,7 @@ def endless() -> list[Any]:
     return value
 
 
-VALUES: dict[str, Callable[[], object]] = {
+VALUES = {
     "a billion laughs": laughs,
     "lists within lists": nested,
     "a list that holds itself": endless,
@@ -130,7 +120,7 @@ VALUES: dict[str, Callable[[], object]] = {
     "a huge mapping key": lambda: {(1, 2): 3},
     "a tensor": lambda: torch.zeros(3),
 }
-FIELDS: dict[str, Callable[[dict[str, Any], object], object]] = {
+FIELDS = {
     "width": lambda c, bad: c["dopepp"]["spec"]["backbone"].update(width=bad),
     "num_objects": lambda c, bad: c["dopepp"]["spec"].update(num_objects=bad),
     "input_size": lambda c, bad: c["dopepp"].update(input_size=[bad, 64]),
@@ -146,12 +136,12 @@ FIELDS: dict[str, Callable[[dict[str, Any], object], object]] = {
     ("field", "value"),
     [(field, "a billion laughs") for field in FIELDS] + [("data", value) for value in VALUES],
 )
-def test_values_that_explode(field: str, value: str, saved: Saved, rejected: Rejected) -> None:
+def test_values_that_explode(field, value, saved, rejected):
     bad = VALUES[value]()
     rejected(saved(lambda c: FIELDS[field](c, bad)), r"bad\.ckpt")
 
 
-def test_a_payload_nested_very_deep(tmp_path: Path, rejected: Rejected) -> None:
+def test_a_payload_nested_very_deep(tmp_path, rejected):
     deep = b"]" * 100_000 + b"a" * 99_999
     pickled = b"\x80\x02}X\x06\x00\x00\x00dopepp}X\x04\x00\x00\x00data" + deep + b"ss."
     torch.save({}, tmp_path / "empty.ckpt")
@@ -177,27 +167,25 @@ TARGETS = (
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: repr(target)[:60])
-def test_a_target_outside_of_the_list(
-    target: object, saved: Saved, canary: str, rejected: Rejected
-) -> None:
+def test_a_target_outside_of_the_list(target, saved, canary, rejected):
     node = {"_target_": target, "command": canary, "_args_": [canary], "width": 0.125}
     path = saved(lambda c: c["dopepp"]["spec"].update(backbone=node))
     rejected(path, r"backbone _target_ .*bad\.ckpt")
 
 
-def spec(part: str, **arguments: object) -> Edit:
+def spec(part: str, **arguments: object):
     return lambda c: c["dopepp"]["spec"][part].update(arguments)
 
 
-def payload(**fields: object) -> Edit:
+def payload(**fields: object):
     return lambda c: c["dopepp"].update(fields)
 
 
-def part(**fields: object) -> Edit:
+def part(**fields: object):
     return lambda c: c["dopepp"]["parts"][0].update(fields)
 
 
-TOO_MUCH: dict[str, tuple[Edit, str]] = {
+TOO_MUCH = {
     "a million channels": (spec("backbone", width=1e6), "width=1000000"),
     "endless channels": (spec("backbone", width=float("inf")), "width=inf"),
     "no width": (spec("head", width=float("nan")), "width=nan"),
@@ -228,7 +216,7 @@ TOO_MUCH: dict[str, tuple[Edit, str]] = {
 }  # fmt: skip
 
 
-def weight(make: Callable[[torch.Tensor], object]) -> Edit:
+def weight(make: Callable[[torch.Tensor], object]):
     def edit(content: dict[str, Any]) -> None:
         name = next(name for name in content["state_dict"] if name.endswith("weight"))
         content["state_dict"][name] = make(content["state_dict"][name])
@@ -236,7 +224,7 @@ def weight(make: Callable[[torch.Tensor], object]) -> Edit:
     return edit
 
 
-WEIGHTS: dict[str, Callable[[torch.Tensor], object]] = {
+WEIGHTS = {
     "one number repeated to any size": lambda w: torch.zeros(()).expand(10**6, 10**6),
     "overlapping rows": lambda w: torch.zeros(w.numel()).as_strided(
         (w.numel() // 2, w.numel() // 2), (1, 1)
@@ -252,9 +240,7 @@ TOO_MUCH |= {name: (weight(make), "weights that do not fit") for name, make in W
 
 
 @pytest.mark.parametrize("name", TOO_MUCH)
-def test_a_spec_a_table_or_weights_that_ask_for_too_much(
-    name: str, saved: Saved, canary: str, rejected: Rejected
-) -> None:
+def test_a_spec_a_table_or_weights_that_ask_for_too_much(name, saved, canary, rejected):
     edit, message = TOO_MUCH[name]
     rejected(saved(edit), message)
 
@@ -263,10 +249,8 @@ def test_a_spec_a_table_or_weights_that_ask_for_too_much(
     "value",
     [float("nan"), *(pytest.param(v, marks=pytest.mark.slow) for v in (-float("inf"), 3e38))],
 )
-def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(
-    value: float, saved: Saved, bounded: Callable[..., Any]
-) -> None:
-    def spoil(content: dict[str, Any]) -> None:
+def test_weights_that_are_no_numbers_find_nothing_and_crash_nothing(value, saved, bounded):
+    def spoil(content):
         for tensor in content["state_dict"].values():
             if tensor.is_floating_point():
                 tensor.fill_(value)

@@ -1,7 +1,5 @@
 """Pictures, meshes, archives, tables and records from anybody: attacks beside plain damage."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json
@@ -12,7 +10,6 @@ import struct
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +32,6 @@ from dopepp.parts import read_mesh
 from dopepp.parts.mesh.read import ycb_part
 
 pytestmark = pytest.mark.timeout(60)
-
-Refused = Callable[..., Any]
 
 
 def chunk(name: bytes, data: bytes) -> bytes:
@@ -75,7 +70,7 @@ def tiff(**fields: tuple[int, int, int]) -> bytes:
 TIFF_SIZE = {"t256": (4, 1, 10**9), "t257": (4, 1, 10**9), "t258": (3, 1, 8), "t259": (3, 1, 1)}
 SMALL = Image.new("RGB", (16, 16))
 
-PICTURES: dict[str, bytes] = {
+PICTURES = {
     "a PNG of terapixels": png(2**31 - 1, 2**31 - 1, chunk(b"IDAT", zlib.compress(bytes(9)))),
     "a PNG of gigapixels in one row": png(2**31 - 1, 1, chunk(b"IDAT", zlib.compress(bytes(9)))),
     "a PNG without pixels": png(0, 0, chunk(b"IDAT", b"")),
@@ -116,12 +111,10 @@ PICTURES: dict[str, bytes] = {
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures_that_explode_or_are_none(
-    name: str, suffix: str, tmp_path: Path, refused: Refused, bounded: Callable[..., Any]
-) -> None:
+def test_pictures_that_explode_or_are_none(name, suffix, tmp_path, refused, bounded):
     path = tmp_path / f"image{suffix}"
     path.write_bytes(PICTURES[name])
-    reads: tuple[Callable[[], object], ...] = (
+    reads = (
         lambda: read_rgb(path),
         lambda: decode_rgb(PICTURES[name], "image"),
         lambda: decode_depth(PICTURES[name], "image", 1.0, (4, 4)),
@@ -136,7 +129,7 @@ def test_pictures_that_explode_or_are_none(
 
 
 @pytest.mark.parametrize("kind", ["PNG", "WEBP", "TIFF"])
-def test_an_animation_is_its_first_picture(kind: str, tmp_path: Path) -> None:
+def test_an_animation_is_its_first_picture(kind, tmp_path):
     frames = [Image.new("RGB", (16, 12), (level, 0, 0)) for level in (200, 100, 50)]
     options = {"lossless": True} if kind == "WEBP" else {}
     content = encoded(kind, frames[0], save_all=True, append_images=frames[1:], **options)
@@ -146,7 +139,7 @@ def test_an_animation_is_its_first_picture(kind: str, tmp_path: Path) -> None:
     assert read_picture(path).shape == (12, 16, 3)
 
 
-def test_a_picture_that_is_no_file(tmp_path: Path, refused: Refused) -> None:
+def test_a_picture_that_is_no_file(tmp_path, refused):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     for name in ("folder.png", "loop.png", "x" * 300 + ".png", "none.png"):
@@ -168,7 +161,7 @@ def ply(form: str = "ascii", vertices: object = 3, faces: object = 1, count: str
 VERTICES = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0]], "<f4").tobytes()
 TRIANGLE = "v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n"
 
-MESHES: dict[str, bytes] = {
+MESHES = {
     "a.ply|a billion vertices": ply(vertices=10**9),
     "b.ply|a billion vertices in binary": ply("binary_little_endian", 10**9, body=VERTICES),
     "c.ply|vertices beyond any number": ply(vertices="9" * 5000),
@@ -203,7 +196,7 @@ MESHES: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_meshes_that_lie_or_reach_out(name: str, tmp_path: Path, refused: Refused) -> None:
+def test_meshes_that_lie_or_reach_out(name, tmp_path, refused):
     path = tmp_path / "deep" / name.split("|")[0]
     path.parent.mkdir()
     path.write_bytes(MESHES[name])
@@ -211,7 +204,7 @@ def test_meshes_that_lie_or_reach_out(name: str, tmp_path: Path, refused: Refuse
         read_mesh(path, "mm")
 
 
-def test_a_material_that_reaches_out(tmp_path: Path, refused: Refused) -> None:
+def test_a_material_that_reaches_out(tmp_path, refused):
     Image.new("RGB", (4, 4)).save(tmp_path / "secret.png")
     folder = tmp_path / "part"
     folder.mkdir()
@@ -225,7 +218,7 @@ def test_a_material_that_reaches_out(tmp_path: Path, refused: Refused) -> None:
             read_mesh(folder / "a.obj", "mm")
 
 
-def test_points_of_gigabytes(tmp_path: Path, refused: Refused) -> None:
+def test_points_of_gigabytes(tmp_path, refused):
     model = tmp_path / "models" / "box"
     model.mkdir(parents=True)
     with (model / "points.xyz").open("wb") as file:
@@ -258,7 +251,7 @@ def pax(records: dict[str, str]) -> bytes:
     return head + data + entry("a.txt").tobuf() + bytes(10_240)
 
 
-ARCHIVES: dict[str, bytes] = {
+ARCHIVES = {
     "a path out": tar(entry("../../canary")),
     "an absolute path": tar(entry("/tmp/canary")),
     "a path of Windows": tar(entry("..\\canary")),
@@ -283,7 +276,9 @@ ARCHIVES: dict[str, bytes] = {
         {"GNU.sparse.map": "0,1099511627776", "GNU.sparse.size": "1099511627776"}
     ),
     "a file and a folder": tar(entry("a"), entry("a/b")),
+    "a folder and a file": tar(entry("a/b"), entry("a")),
     "a name twice": tar(entry("a"), entry("a")),
+    "a name twice where letters have no case": tar(entry("Photo"), entry("PHOTO")),
     "a gzip bomb": gzip.compress(tar(entry("a", size=10**8), content=bytes(10**8))),
     "gzip in gzip": gzip.compress(gzip.compress(bytes(10**6))),
     "a name with a screen's commands": tar(entry("\x1b[2Jcanary")),
@@ -291,7 +286,7 @@ ARCHIVES: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
-def test_archives_that_reach_out_or_explode(name: str, tmp_path: Path, refused: Refused) -> None:
+def test_archives_that_reach_out_or_explode(name, tmp_path, refused):
     archive, folder = tmp_path / "in" / "a.tar", tmp_path / "in" / "out" / "folder"
     archive.parent.mkdir()
     archive.write_bytes(ARCHIVES[name])
@@ -301,8 +296,8 @@ def test_archives_that_reach_out_or_explode(name: str, tmp_path: Path, refused: 
     assert not list(tmp_path.rglob("*canary*"))
 
 
-@pytest.mark.parametrize("name", [name for name in ARCHIVES if name != "a file and a folder"])
-def test_shards_that_reach_out_or_explode(name: str, tmp_path: Path, bounded: Any) -> None:
+@pytest.mark.parametrize("name", [name for name in ARCHIVES if "folder" not in name])
+def test_shards_that_reach_out_or_explode(name, tmp_path, bounded):
     """A shard is never unpacked; what is in it may be refused or passed over."""
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(ARCHIVES[name])
@@ -315,7 +310,7 @@ def test_shards_that_reach_out_or_explode(name: str, tmp_path: Path, bounded: An
     assert "\n" not in line
 
 
-def test_an_encrypted_zip_and_one_of_links(tmp_path: Path, refused: Refused) -> None:
+def test_an_encrypted_zip_and_one_of_links(tmp_path, refused):
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
         info = zipfile.ZipInfo("a")
@@ -338,7 +333,7 @@ def mat(**fields: object) -> bytes:
 
 
 GOOD_META = {"cls_indexes": [[2.0]], "poses": np.eye(3, 4)[..., None], "factor_depth": 10000}
-METAS: dict[str, bytes] = {
+METAS = {
     "a matrix that explodes": mat(**{**GOOD_META, "poses": np.zeros((3, 4, 300_000))}),
     "objects": mat(**{**GOOD_META, "poses": np.array([{"a": 1}], object)}),
     "text": mat(**{**GOOD_META, "factor_depth": "os.system"}),
@@ -351,7 +346,7 @@ METAS: dict[str, bytes] = {
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time\n"
 POSE = "1 0 0 0 1 0 0 0 1,0 0 900,1"
-TABLES: dict[str, bytes] = {
+TABLES = {
     "a formula of a spreadsheet": f"{HEADER}=cmd|'/c calc'!A1,1,1,1,{POSE}".encode(),
     "an image of a million digits": f"{HEADER}{'9' * 5000},1,2,1,{POSE}".encode(),
     "a line of megabytes": (HEADER + "1" * 5_000_000).encode(),
@@ -363,7 +358,7 @@ TABLES: dict[str, bytes] = {
 }
 
 
-RECORDS: dict[str, bytes] = {
+RECORDS = {
     "nested brackets": b'{"1": ' + b"[" * 100_000,
     "a number of a million digits": b'{"1": {"diameter": ' + b"9" * 1_000_000 + b"}}",
     "a number beyond all": b'{"1": {"diameter": 1e999}}',
@@ -377,7 +372,7 @@ RECORDS: dict[str, bytes] = {
 }
 
 
-READERS: dict[str, tuple[Callable[[Path], object], dict[str, bytes]]] = {
+READERS = {
     "meta.mat": (read_meta, METAS),
     "method_set-test.csv": (lambda path: read_results(path, {2}), TABLES),
     "models/models_info.json": (lambda path: read_models(path.parents[1]), RECORDS),
@@ -387,9 +382,7 @@ READERS: dict[str, tuple[Callable[[Path], object], dict[str, bytes]]] = {
 @pytest.mark.parametrize(
     ("file", "name"), [(file, name) for file, (_, table) in READERS.items() for name in table]
 )
-def test_numbers_tables_and_records_of_anybody(
-    file: str, name: str, tmp_path: Path, refused: Refused
-) -> None:
+def test_numbers_tables_and_records_of_anybody(file, name, tmp_path, refused):
     read, table = READERS[file]
     path = tmp_path / file
     path.parent.mkdir(exist_ok=True)
@@ -400,7 +393,7 @@ def test_numbers_tables_and_records_of_anybody(
 
 RENDER = "render servoholder --out out -n 1"
 BOMB = PICTURES["a PNG of terapixels"]
-ARGUMENTS: dict[str, tuple[str, dict[str, bytes]]] = {
+ARGUMENTS = {
     "check: a folder of records that nest": ("check set", {
         "set/_camera_settings.json": b"[" * 100_000,
         "set/000000.json": b"[" * 100_000,
@@ -436,9 +429,7 @@ ARGUMENTS: dict[str, tuple[str, dict[str, bytes]]] = {
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_the_command_line_ends_in_a_line(
-    name: str, good: Path, tmp_path: Path, bounded: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_line_ends_in_a_line(name, good, tmp_path, bounded, monkeypatch):
     arguments, files = ARGUMENTS[name]
     monkeypatch.chdir(good.parent)
     for file, content in files.items():

@@ -1,7 +1,5 @@
 """Checkpoints whose pickle runs code, or asks torch for more than the file holds."""
 
-from __future__ import annotations
-
 import builtins
 import importlib
 import operator
@@ -23,9 +21,6 @@ from dopepp.models.backbones import VGG19
 
 pytestmark = pytest.mark.timeout(60)
 
-Edit = Callable[[dict[str, Any], Any], None]
-Rejected = Callable[[Path, str], None]
-Write = Callable[[str, object], Path]
 SIZE = 10**9
 """Bytes that a bomb asks for: seen at once, and borne by the machine if it goes off."""
 
@@ -34,7 +29,7 @@ def first_weight(content: dict[str, Any]) -> str:
     return next(name for name in content["state_dict"] if name.endswith("weight"))
 
 
-PLACES: dict[str, Edit] = {
+PLACES = {
     "state_dict itself": lambda c, bad: c.update(state_dict=bad),
     "a weight": lambda c, bad: c["state_dict"].update({first_weight(c): bad}),
     "another weight": lambda c, bad: c["state_dict"].update({"loss.weight": bad}),
@@ -51,20 +46,18 @@ PLACES: dict[str, Edit] = {
 
 
 @pytest.fixture
-def write(saved: Callable[..., Path]) -> Write:
+def write(saved):
     """Write a checkpoint with something bad at a place."""
     return lambda place, bad: saved(lambda content: PLACES[place](content, bad))
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_os_system_anywhere(
-    place: str, write: Write, Call: type, canary: str, rejected: Rejected
-) -> None:
+def test_os_system_anywhere(place, write, Call, canary, rejected):
     path = write(place, Call(os.system, canary))
     rejected(path, r"bad\.ckpt, which torch refuses to load .*the name 'posix\.system'")
 
 
-CALLS: dict[str, Callable[[Any, str], object]] = {
+CALLS = {
     "exec": lambda call, command: call(builtins.exec, f"import os; os.system({command!r})"),
     "eval": lambda call, command: call(builtins.eval, f"__import__('os').system({command!r})"),
     "Popen": lambda call, command: call(subprocess.Popen, command.split()),
@@ -78,15 +71,11 @@ CALLS: dict[str, Callable[[Any, str], object]] = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_other_ways_to_run_code(
-    name: str, write: Write, Call: type, canary: str, rejected: Rejected
-) -> None:
+def test_other_ways_to_run_code(name, write, Call, canary, rejected):
     rejected(write("data", CALLS[name](Call, canary)), "which torch refuses to load .*the name '")
 
 
-def test_torch_load_inside_of_a_checkpoint(
-    write: Write, Call: type, canary: str, rejected: Rejected, tmp_path: Path
-) -> None:
+def test_torch_load_inside_of_a_checkpoint(write, Call, canary, rejected, tmp_path):
     (tmp_path / "second.pkl").write_bytes(pickle.dumps(Call(os.system, canary)))
     path = write("data", Call(torch.load, str(tmp_path / "second.pkl")))
     rejected(path, r"the name 'torch\.serialization\.load'")
@@ -96,15 +85,13 @@ class Subclass(torch.Tensor):
     """A tensor of somebody's own class."""
 
 
-def test_a_tensor_of_another_class(write: Write, rejected: Rejected) -> None:
+def test_a_tensor_of_another_class(write, rejected):
     rejected(
         write("another weight", torch.ones(3).as_subclass(Subclass)), "which torch refuses to load"
     )
 
 
-def test_methods_set_on_a_tensor(
-    write: Write, Call: type, content: dict[str, Any], rejected: Rejected
-) -> None:
+def test_methods_set_on_a_tensor(write, Call, content, rejected):
     """``_rebuild_from_type_v2`` sets any attribute, as one that a check would ask for."""
     weight = content["state_dict"][first_weight(content)]
     make, arguments, *_ = weight.__reduce_ex__(2)
@@ -113,7 +100,7 @@ def test_methods_set_on_a_tensor(
     rejected(path, "_rebuild_from_type_v2")
 
 
-BOMBS: dict[str, Callable[[Any], object]] = {
+BOMBS = {
     "bytearray": lambda call: call(bytearray, SIZE),
     "bytes": lambda call: call(bytes, SIZE),
     "storage": lambda call: call(torch.UntypedStorage, SIZE),
@@ -127,9 +114,7 @@ BOMBS: dict[str, Callable[[Any], object]] = {
 
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("place", ["data", "optimizer state"])
-def test_a_call_that_fills_the_memory(
-    name: str, place: str, write: Write, Call: type, rejected: Rejected
-) -> None:
+def test_a_call_that_fills_the_memory(name, place, write, Call, rejected):
     """torch's own list of harmless calls has some that allocate what their argument says."""
     try:
         path = write(place, BOMBS[name](Call))
@@ -147,11 +132,11 @@ def repacked(source: Path, target: Path, edit: Callable[[str, bytes], bytes]) ->
     return target
 
 
-def test_a_storage_that_reaches_beyond_its_bytes(tmp_path: Path, rejected: Rejected) -> None:
+def test_a_storage_that_reaches_beyond_its_bytes(tmp_path, rejected):
     """Some versions of torch would read on in memory."""
     torch.save({"dopepp": torch.arange(200.0)}, tmp_path / "good.ckpt")
 
-    def enlarge(name: str, content: bytes) -> bytes:
+    def enlarge(name, content):
         # BININT1 200 becomes BININT2 65535, in the storage and in the tensor.
         return content.replace(b"K\xc8", b"M\xff\xff") if name.endswith(".pkl") else content
 
@@ -185,9 +170,7 @@ OPERATIONS = {
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_operations_that_no_checkpoint_needs(
-    name: str, good: Path, tmp_path: Path, rejected: Rejected
-) -> None:
+def test_operations_that_no_checkpoint_needs(name, good, tmp_path, rejected):
     path = repacked(
         good, tmp_path / "bad.ckpt",
         lambda member, old: pickled(OPERATIONS[name]) if member.endswith(".pkl") else old,
@@ -209,9 +192,7 @@ def legacy(content: bytes) -> bytes:
     return magic + pickle.dumps(1001, 2) + machine + content + pickle.dumps(["0"], 2) + bytes(8)
 
 
-def test_a_legacy_file_is_no_checkpoint(
-    tmp_path: Path, Call: type, canary: str, rejected: Rejected
-) -> None:
+def test_a_legacy_file_is_no_checkpoint(tmp_path, Call, canary, rejected):
     path = tmp_path / "old.ckpt"
     torch.save({"dopepp": {}}, path, _use_new_zipfile_serialization=False)
     rejected(path, "not a torch file")
@@ -219,7 +200,7 @@ def test_a_legacy_file_is_no_checkpoint(
     rejected(path, "not a torch file")
 
 
-LEGACY: dict[str, Callable[[Any, str], bytes]] = {
+LEGACY = {
     "code in its content": lambda call, command: legacy(pickle.dumps(call(os.system, command), 2)),
     "code in place of its magic number": lambda call, command: pickle.dumps(
         call(os.system, command), 2
@@ -231,9 +212,7 @@ LEGACY: dict[str, Callable[[Any, str], bytes]] = {
 
 
 @pytest.mark.parametrize("name", LEGACY)
-def test_hostile_pretrained_weights(
-    name: str, tmp_path: Path, Call: type, canary: str, refused: Callable[..., Any]
-) -> None:
+def test_hostile_pretrained_weights(name, tmp_path, Call, canary, refused):
     """Pretrained backbones come from anywhere, and torchvision's own is of the old format."""
     path = tmp_path / "vgg19.pth"
     path.write_bytes(LEGACY[name](Call, canary))

@@ -1,17 +1,9 @@
 """Run folders from somebody else: what resuming, evaluating and comparing them may do."""
 
-from __future__ import annotations
-
-import contextlib
-import io
 import json
 import os
 import pickle
-import runpy
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -23,28 +15,19 @@ from dopepp.experiment.runs.resume import read_overrides
 pytestmark = pytest.mark.timeout(120)
 
 ROOT = Path(__file__).parents[2]
-Refused = Callable[..., Any]
-Told = Callable[..., str]
-RunFolder = Callable[[str], Path]
 
 
 @pytest.fixture
-def told(bounded: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Told:
+def told(bounded, in_process, tmp_path, monkeypatch):
     """Run ``train.py`` or ``evaluate.py`` and return the one line that it ends in."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
 
-    def run(script: str, *arguments: str) -> str:
-        out, err = io.StringIO(), io.StringIO()
-        monkeypatch.setattr(sys, "argv", [str(ROOT / script), *arguments])
-        with (
-            bounded(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err),
-            pytest.raises(SystemExit) as end,
-        ):  # fmt: skip
-            runpy.run_path(str(ROOT / script), run_name="__main__")
-        assert end.value.code == 2, err.getvalue()[-3000:]
-        assert "Traceback" not in err.getvalue()
-        line = err.getvalue().rstrip("\n").rpartition("\n")[2]
+    def run(script, *arguments):
+        with bounded():
+            code, _, err = in_process(ROOT / script, *arguments)
+        assert code == 2, err[-3000:]
+        assert "Traceback" not in err
+        line = err.rstrip("\n").rpartition("\n")[2]
         assert line.startswith("got ")
         return line
 
@@ -52,10 +35,10 @@ def told(bounded: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.fixture
-def run_folder(tmp_path: Path, good: Path) -> RunFolder:
+def run_folder(tmp_path, good):
     """Make a run folder to resume, with the text of its overrides."""
 
-    def make(overrides: str) -> Path:
+    def make(overrides):
         run = tmp_path / "run"
         (run / ".hydra").mkdir(parents=True)
         (run / "checkpoints").mkdir()
@@ -88,9 +71,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_overrides_that_are_no_options_of_ours(
-    name: str, run_folder: RunFolder, told: Told, canary: str, tmp_path: Path, Call: type
-) -> None:
+def test_overrides_that_are_no_options_of_ours(name, run_folder, told, canary, tmp_path, Call):
     hostile = tmp_path / "job.pickle"
     hostile.write_bytes(pickle.dumps(Call(os.system, canary)))
     overrides = [text.format(command=f"'{canary}'", pickle=hostile) for text in COMMANDS[name]]
@@ -130,7 +111,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_overrides_that_are_no_list_of_text(name: str, tmp_path: Path, refused: Refused) -> None:
+def test_overrides_that_are_no_list_of_text(name, tmp_path, refused):
     path = tmp_path / ".hydra" / "overrides.yaml"
     path.parent.mkdir()
     path.write_text(TEXTS[name])
@@ -138,7 +119,7 @@ def test_overrides_that_are_no_list_of_text(name: str, tmp_path: Path, refused: 
         read_overrides(tmp_path)
 
 
-def test_the_files_that_hydra_writes_are_read(tmp_path: Path) -> None:
+def test_the_files_that_hydra_writes_are_read(tmp_path):
     path = tmp_path / ".hydra" / "overrides.yaml"
     path.parent.mkdir()
     path.write_text(
@@ -151,13 +132,13 @@ def test_the_files_that_hydra_writes_are_read(tmp_path: Path) -> None:
     assert read_yaml(path) == {"a": {"b": [1, 2.5, None, True]}, "c": "x"}
 
 
-def test_a_run_folder_that_is_no_file_of_text(run_folder: RunFolder, told: Told) -> None:
+def test_a_run_folder_that_is_no_file_of_text(run_folder, told):
     run = run_folder("")
     (run / ".hydra" / "overrides.yaml").write_bytes(b"\xff\xfe\x00")
     assert "overrides.yaml" in told("train.py", f"resume={run}")
 
 
-STORED: dict[str, object] = {
+STORED = {
     "nothing": None,
     "text": "os.system",
     "an empty mapping": {},
@@ -169,9 +150,7 @@ STORED: dict[str, object] = {
 
 
 @pytest.mark.parametrize("name", STORED)
-def test_a_checkpoint_whose_data_are_none(
-    name: str, saved: Callable[..., Path], told: Told, tmp_path: Path
-) -> None:
+def test_a_checkpoint_whose_data_are_none(name, saved, told, tmp_path):
     """``evaluate.py`` takes the data from the checkpoint: what is wrong there is one line, too."""
     data = {"name": "x", "seed": 0, "config": STORED[name]}
     path = saved(lambda content: content["dopepp"].update(data=data))
@@ -198,7 +177,7 @@ RECORDS = {
 
 
 @pytest.mark.parametrize("name", RECORDS)
-def test_metrics_of_somebody_else(name: str, tmp_path: Path, bounded: Callable[..., Any]) -> None:
+def test_metrics_of_somebody_else(name, tmp_path, bounded):
     run = tmp_path / "run"
     run.mkdir()
     (run / "metrics.json").write_text(RECORDS[name])

@@ -1,11 +1,6 @@
 """Safetensors files whose header lies, and those that are written and read as they should be."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import safetensors.torch
@@ -18,7 +13,6 @@ from dopepp.models.checkpoint.released import MAX_HEADER_BYTES, read_safetensors
 
 pytestmark = pytest.mark.timeout(60)
 
-Refused = Callable[..., Any]
 A = {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}
 
 
@@ -28,7 +22,7 @@ def packed(header: object, data: bytes = bytes(8), length: int | None = None) ->
     return (len(text) if length is None else length).to_bytes(8, "little") + text + data
 
 
-FILES: dict[str, bytes] = {
+FILES = {
     "nothing": b"",
     "half a length": b"\x10\x00\x00",
     "a header longer than the file": packed({"a": A}, length=10_000),
@@ -79,21 +73,21 @@ FILES: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_header_that_lies(name: str, tmp_path: Path, refused: Refused) -> None:
+def test_a_header_that_lies(name, tmp_path, refused):
     path = tmp_path / "a.safetensors"
     path.write_bytes(FILES[name])
     with refused(r"a\.safetensors: .*allowed: a whole safetensors file"):
         read_safetensors(path)
 
 
-def test_a_header_of_megabytes_is_not_parsed(tmp_path: Path, refused: Refused) -> None:
+def test_a_header_of_megabytes_is_not_parsed(tmp_path, refused):
     path = tmp_path / "a.safetensors"
     path.write_bytes(packed(b'{"a":"' + b" " * (MAX_HEADER_BYTES + 1) + b'"}', b""))
     with refused("a header of 8000009 bytes, over 8000000"):
         read_safetensors(path)
 
 
-def test_a_huge_file_and_what_is_no_file(tmp_path: Path, refused: Refused) -> None:
+def test_a_huge_file_and_what_is_no_file(tmp_path, refused):
     path = tmp_path / "a.safetensors"
     for place in (path, tmp_path):
         with refused(r"No such file|Is a directory"):
@@ -112,9 +106,7 @@ def test_a_huge_file_and_what_is_no_file(tmp_path: Path, refused: Refused) -> No
     ),
     text=st.text(st.characters(exclude_categories=["Cs"])),
 )
-def test_what_is_written_is_read_by_us_and_by_the_library(
-    array: Any, text: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_what_is_written_is_read_by_us_and_by_the_library(array, text, tmp_path_factory):
     path = tmp_path_factory.mktemp("any") / "a.safetensors"
     tensors = {"a": torch.from_numpy(array.copy()), "b.c": torch.ones(2, 3)}
     write_safetensors(path, tensors, {"text": text})
@@ -128,7 +120,7 @@ def test_what_is_written_is_read_by_us_and_by_the_library(
             assert other.numpy().tobytes() == tensor.numpy().tobytes()
 
 
-def test_views_and_shared_tensors_are_written_as_they_look(tmp_path: Path) -> None:
+def test_views_and_shared_tensors_are_written_as_they_look(tmp_path):
     base = torch.arange(12.0).view(3, 4)
     tensors = {"t": base.T, "again": base, "row": base[1], "repeated": torch.ones(1).expand(5)}
     write_safetensors(tmp_path / "a.safetensors", tensors, {})
@@ -137,7 +129,7 @@ def test_views_and_shared_tensors_are_written_as_they_look(tmp_path: Path) -> No
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
 
 
-def test_a_header_too_long_to_be_read_is_not_written(tmp_path: Path) -> None:
+def test_a_header_too_long_to_be_read_is_not_written(tmp_path):
     path = tmp_path / "a.safetensors"
     write_safetensors(path, {"a": torch.ones(2)}, {"x": "y"})
     before = path.read_bytes()

@@ -1,8 +1,5 @@
 """Solids and scenes that the tests of the virtual factory share."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +8,10 @@ import trimesh
 
 from dopepp.geometry.camera import camera_matrix
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.virtual import Ambient, Light, Scene, SceneObject, Surface, make_surface
+from dopepp.parts.part import Mesh, make_part
+from dopepp.virtual import Ambient, Light, Scene, make_surface
+
+LAMP = Light((0.2, -0.4, -0.2))
 
 
 def mesh_of(solid: trimesh.Trimesh) -> Mesh:
@@ -20,38 +19,37 @@ def mesh_of(solid: trimesh.Trimesh) -> Mesh:
 
 
 @pytest.fixture(scope="session")
-def surface_of() -> Callable[[trimesh.Trimesh], Surface]:
+def surface_of():
     return lambda solid: make_surface(mesh_of(solid))
 
 
 @pytest.fixture(scope="session")
-def sized_box() -> Callable[[str, float], Part]:
+def sized_box():
     """Make a box-shaped part, 10 cm long at size 1."""
     mesh = mesh_of(trimesh.creation.box((0.10, 0.06, 0.02)))
     return lambda name, size: make_part(name, replace(mesh, vertices=mesh.vertices * size))
 
 
 @pytest.fixture(scope="session")
-def box_part(sized_box: Callable[[str, float], Part]) -> Part:
+def box_part(sized_box):
     return sized_box("box", 1.0)
 
 
 @pytest.fixture(scope="session")
-def box_surface(box_part: Part) -> Surface:
-    assert box_part.mesh is not None
+def box_surface(box_part):
     return make_surface(box_part.mesh)
 
 
 @pytest.fixture(scope="session")
-def parts() -> list[Part]:
+def parts():
     return [servoholder(), pivconnector()]
 
 
 @pytest.fixture(scope="session")
-def sheet() -> Callable[..., Mesh]:
+def sheet():
     """Make a square in the xy plane whose uv grow with x and y; its front looks along +z."""
 
-    def make(size: float, texture: np.ndarray | None = None) -> Mesh:
+    def make(size, texture=None):
         corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], float)
         faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
         return Mesh(corners * size / 2, faces, (corners[:, :2] + 1) / 2, texture)
@@ -60,16 +58,10 @@ def sheet() -> Callable[..., Mesh]:
 
 
 @pytest.fixture(scope="session")
-def scene_of() -> Callable[..., Scene]:
+def scene_of():
     """Make a 160×120 scene with a principal point off the pixel grid and a grey background."""
 
-    def make(
-        *objects: SceneObject,
-        size: tuple[int, int] = (160, 120),
-        focal: float = 160.0,
-        lights: tuple[Light, ...] = (Light((0.2, -0.4, -0.2)),),
-        ambient: Ambient | None = None,
-    ) -> Scene:
+    def make(*objects, size=(160, 120), focal=160.0, lights=(LAMP,), ambient=None):
         K = camera_matrix(focal, 1.02 * focal, size[0] / 2 - 0.8, size[1] / 2 + 0.3)
         background = np.full((size[1], size[0], 3), 90, np.uint8)
         return Scene(K, background, objects, lights, ambient or Ambient())

@@ -24,7 +24,6 @@ def test_a_box_rests_on_six_faces_as_often_as_its_centre_sees_them(surface_of):
 
 def test_the_stable_faces_are_trimeshs():
     mesh = pivconnector().mesh
-    assert mesh is not None
     hull = make_hull(make_surface(mesh))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     np.testing.assert_allclose(hull.centre, solid.center_mass, atol=1e-9)
@@ -71,7 +70,6 @@ def test_a_flat_sheet_lies_on_either_side(sheet):
 
 def test_a_stretched_hull_is_the_stretched_bodys_hull():
     mesh = pivconnector().mesh
-    assert mesh is not None
     body, scale = Body(make_surface(mesh)), np.array([0.5, 1.2, 3.0])
     stretched = body.stretched(scale)
     fresh = make_hull(stretched.surface)

@@ -10,20 +10,8 @@ from hypothesis import strategies as st
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Mesh
-from dopepp.virtual import (
-    Ambient,
-    Grooves,
-    Light,
-    Material,
-    Plane,
-    Rendered,
-    Scene,
-    SceneObject,
-    make_surface,
-    render,
-    silhouette,
-    visible_fractions,
-)  # fmt: skip
+from dopepp.virtual import Rendered, make_surface, render, silhouette, visible_fractions
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject
 
 FLOOR = Plane((0.0, -1.0, 0.0), -0.3)
 

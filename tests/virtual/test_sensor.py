@@ -17,7 +17,7 @@ from dopepp.virtual.sensor import Sensors, add_noise, capture, compress, defocus
 
 
 @pytest.fixture(scope="module")
-def picture() -> np.ndarray:
+def picture():
     noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
     return cv2.GaussianBlur(noise, (9, 9), 2)
 

@@ -1,11 +1,8 @@
 """What the tests of every layout share: rendered samples, and what is asked of a set of files."""
 
-from __future__ import annotations
-
+import io
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+import tarfile
 
 import cv2
 import numpy as np
@@ -13,8 +10,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
-from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
+from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 from dopepp.virtual.factory import Factory
@@ -22,22 +19,20 @@ from dopepp.virtual.presets.preset import PRESETS
 
 
 @pytest.fixture(scope="session")
-def parts() -> list[Part]:
+def parts():
     return [servoholder(), pivconnector()]
 
 
 @pytest.fixture(scope="session")
-def samples(parts: list[Part]) -> list[Sample]:
+def samples(parts):
     """Four images of bins, with many instances each."""
     factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=4)
     return [rendered_sample(factory.render(0, i), "virtual", str(i)) for i in range(4)]
 
 
 @pytest.fixture(scope="session")
-def write_set() -> Callable[..., Path]:
-    def write(
-        writer_class: Any, root: Path, parts: list[Part], samples: list[Sample], first: int = 0
-    ) -> Path:
+def write_set():
+    def write(writer_class, root, parts, samples, first=0):
         """Write samples from an index on, finalize every chunk, and return the folder."""
         writer = writer_class(root, parts)
         writer.prepare()
@@ -53,8 +48,8 @@ def write_set() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def assert_read_back() -> Callable[[Sample, Sample], None]:
-    def compare(read: Sample, sample: Sample) -> None:
+def assert_read_back():
+    def compare(read, sample):
         """Compare what was read with what was written; depth has steps of 0.1 mm."""
         np.testing.assert_array_equal(read.image, sample.image)
         np.testing.assert_array_equal(read.K, sample.K)
@@ -70,8 +65,8 @@ def assert_read_back() -> Callable[[Sample, Sample], None]:
 
 
 @pytest.fixture(scope="session")
-def assert_found() -> Callable[[Path, str], None]:
-    def compare(root: Path, *expected: str) -> None:
+def assert_found():
+    def compare(root, *expected):
         """Check a damaged set: each damage is among the defects, with its file and field."""
         report = check_dataset(root)
         lines = [str(defect) for defect in report.defects]
@@ -83,8 +78,8 @@ def assert_found() -> Callable[[Path, str], None]:
 
 
 @pytest.fixture(scope="session")
-def spoilt() -> Callable[[bytes, str, Any], bytes | None]:
-    def change(content: bytes, keys: str, value: Any) -> bytes | None:
+def spoilt():
+    def change(content, keys, value):
         """Return a file with another content, or with another value in its JSON.
 
         ``keys`` lead to the value (``"0.1.obj_id"``). None takes it away, a function changes it.
@@ -107,11 +102,11 @@ def spoilt() -> Callable[[bytes, str, Any], bytes | None]:
 
 
 @pytest.fixture(scope="session")
-def assert_refused() -> Callable[[Callable[[], Any], str], None]:
-    def compare(make_source: Callable[[], Any], expected: str) -> None:
+def assert_refused():
+    def compare(make_source, expected):
         """Read a damaged set: a source says in one line what a check finds, with file and field."""
 
-        def read() -> None:
+        def read():
             source = make_source()
             for index in range(len(source)):
                 source.sample(index)
@@ -124,3 +119,27 @@ def assert_refused() -> Callable[[Callable[[], Any], str], None]:
         assert len(line) < 800
 
     return compare
+
+
+@pytest.fixture(scope="session")
+def block():
+    """Make a 40 × 20 × 10 mm block called as BOP's files are."""
+    half = np.array([0.02, 0.01, 0.005])
+    cuboid, diameter = cuboid_keypoints(-half, half), float(2 * np.linalg.norm(half))
+    return lambda number: Part(f"obj_{number:06d}", cuboid, diameter, cuboid[:8])
+
+
+@pytest.fixture(scope="session")
+def write_shard():
+    """Write a tar file of pairs (name or TarInfo, content); return its path."""
+
+    def write(path, files, **options):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(path, "w", **options) as archive:
+            for name, content in files:
+                info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
+                info.size = len(content) if info.isreg() else 0
+                archive.addfile(info, io.BytesIO(content))
+        return path
+
+    return write

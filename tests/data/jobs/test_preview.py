@@ -1,23 +1,18 @@
 """The sheet that a user looks at before rendering thousands."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.jobs import preview
-from dopepp.data.jobs.job import Job, make_job
+from dopepp.data.jobs.job import make_job
 from dopepp.data.jobs.preview import preview_sheet, scene_tiles, write_preview
 
 SMALL = ("width=96", "height=72")
 
 
-def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images() -> None:
+def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images():
     factory = make_job(["servoholder", "pivconnector"], changes=SMALL).factory
     sheet = preview_sheet(factory, num_scenes=2)
     assert sheet.shape == (2 * (240 + 18) + 3 * 6, 4 * 320 + 5 * 6, 3)
@@ -27,7 +22,7 @@ def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images() -> No
     assert np.abs(small - image).mean() < 4
 
 
-def test_panels_say_what_they_show() -> None:
+def test_panels_say_what_they_show():
     job = make_job(
         ["servoholder"], preset="bin", changes=["targets_per_image=[5,5]"], size="160x120"
     )
@@ -44,7 +39,7 @@ def test_panels_say_what_they_show() -> None:
     assert changed[rendered.instances >= 0].mean() > 2 * changed[rendered.instances < 0].mean()
 
 
-def test_no_target_is_said_so() -> None:
+def test_no_target_is_said_so():
     job = make_job(["servoholder"], changes=["targets_per_image=[0,0]", *SMALL])
     _, posed, masks, depth = scene_tiles(job.factory.render(0, 0), "image 0")
     assert posed.caption == "no target"
@@ -52,9 +47,7 @@ def test_no_target_is_said_so() -> None:
     assert depth.caption == "no depth"
 
 
-def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(
-    small_job: Callable[..., Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_sheet_lies_beside_the_folder_or_where_it_is_wanted(small_job, tmp_path, monkeypatch):
     sheet = np.zeros((5, 7, 3), np.uint8)
     monkeypatch.setattr(preview, "preview_sheet", lambda factory: sheet)
     assert write_preview(small_job(), tmp_path / "data") == tmp_path / "data.preview.png"

@@ -1,12 +1,9 @@
 """Render jobs in one process: resuming, shards, records, a full disk. Processes: see the others."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from io import StringIO
 from pathlib import Path
@@ -24,15 +21,12 @@ from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.jobs.folder import RECORD_FILE
-from dopepp.data.jobs.job import WRITERS, Job, make_job, named_part
+from dopepp.data.jobs.job import WRITERS, make_job, named_part
 from dopepp.data.jobs.pools import Pool
 from dopepp.data.jobs.render_dataset import ProgressDisplay, RenderReport, render_dataset
 from dopepp.data.jobs.work import Outcome, Shard, Task, Worker, plan
 
 NUM = 10
-Make = Callable[..., Job]
-Check = Callable[[Path], None]
-Contents = Callable[[Path], dict[str, bytes]]
 
 
 class InlinePool(Pool):
@@ -62,7 +56,7 @@ def inline(content: bytes, num_tasks: int) -> Pool:
 
 
 @pytest.fixture(scope="module", params=WRITERS)
-def layout(request: pytest.FixtureRequest) -> Iterator[str]:
+def layout(request):
     """Each layout in turn, with small chunks."""
     module, name = WRITERS[request.param]
     with pytest.MonkeyPatch.context() as patch:
@@ -71,52 +65,43 @@ def layout(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def job(layout: str, small_job: Make) -> Job:
+def job(layout, small_job):
     return small_job(layout)
 
 
 @pytest.fixture(scope="module")
-def assert_whole(job: Job, contents: Contents, tmp_path_factory: pytest.TempPathFactory) -> Check:
-    """Compare a folder with the files of a job that nobody stopped."""
+def whole(job, contents, tmp_path_factory):
+    """Read the files of a job that nobody stopped."""
     root = tmp_path_factory.mktemp("whole")
     report = render_dataset(job, root, NUM, inline)
     assert (report.num_images, report.num_rendered) == (NUM, NUM)
-    whole = contents(root)
-
-    def compare(folder: Path) -> None:
-        assert contents(folder) == whole
-
-    return compare
+    return contents(root)
 
 
-def test_whatever_stops_a_job_it_ends_with_the_same_files(
-    job: Job, tmp_path: Path, assert_whole: Check
-) -> None:
+def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, contents, whole):
     for dies_after in (0, 2, 3):
         with pytest.raises(KeyboardInterrupt):
             render_dataset(job, tmp_path, NUM, lambda work, _: InlinePool(work, dies_after))  # noqa: B023
     last = render_dataset(job, tmp_path, NUM, inline)
     assert 0 < last.num_rendered < NUM
-    assert_whole(tmp_path)
+    assert contents(tmp_path) == whole
     again = render_dataset(job, tmp_path, NUM, inline)
     assert again.num_rendered == 0
     assert str(again) == f"all {NUM} images were there"
-    assert_whole(tmp_path)
+    assert contents(tmp_path) == whole
 
 
-def test_a_job_grows(job: Job, tmp_path: Path, assert_whole: Check) -> None:
+def test_a_job_grows(job, tmp_path, contents, whole):
     for num in (2, 5, 3, NUM):
         render_dataset(job, tmp_path, num, inline)
-    assert_whole(tmp_path)
+    assert contents(tmp_path) == whole
 
 
-def test_shards_share_a_folder_at_the_same_time(
-    job: Job, tmp_path: Path, assert_whole: Check
-) -> None:
+def test_shards_share_a_folder_at_the_same_time(job, tmp_path, contents, whole):
     # They begin and end within chunks: the last to finish finalizes what it shares with others.
-    others: list[RenderReport] = []
+    others = []
 
-    def run_others(done: int, total: int) -> None:
+    def run_others(done, total):
         if done == 2 and not others:  # the first shard has begun
             for number in (2, 1):
                 others.append(RenderReport(0))
@@ -124,48 +109,43 @@ def test_shards_share_a_folder_at_the_same_time(
 
     first = render_dataset(job, tmp_path, NUM, inline, Shard(0, 3), run_others)
     assert [report.num_rendered for report in (first, *others)] == [3, 4, 3]
-    assert_whole(tmp_path)
+    assert contents(tmp_path) == whole
 
 
-def test_shards_of_separate_folders_are_merged_by_copying(
-    job: Job, tmp_path: Path, assert_whole: Check
-) -> None:
+def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, contents, whole):
     for number in range(2):  # each finalizes a chunk of its own, and they share one
         render_dataset(job, tmp_path / str(number), NUM, inline, Shard(number, 2))
         shutil.copytree(tmp_path / str(number), tmp_path / "merged", dirs_exist_ok=True)
     assert render_dataset(job, tmp_path / "merged", NUM, inline).num_rendered == 0
-    assert_whole(tmp_path / "merged")
+    assert contents(tmp_path / "merged") == whole
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_job: Make, contents: Contents
-) -> None:
-    job, write = small_job("ndds"), Path.write_bytes
-    render_dataset(job, tmp_path / "whole", 10, inline)
-    room = [20_000]
+    job, tmp_path, monkeypatch, contents, whole
+):
+    # Room for the parts' meshes, and for half of all else.
+    write = Path.write_bytes
+    room = [sum(len(whole[name]) for name in whole if not name.startswith("models")) // 2]
 
-    def write_what_fits(path: Path, content: bytes) -> int:
-        room[0] -= len(content)
+    def write_what_fits(path, content):
+        room[0] -= 0 if path.parent.name == "models" else len(content)
         if room[0] < 0:
             write(path, content[: len(content) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return write(path, content)
 
-    root = tmp_path / "full"
-    monkeypatch.setattr(Path, "write_bytes", write_what_fits)
-    with pytest.raises(StoppedError, match=r"no space left for .*full: free some; the same comm"):
-        render_dataset(job, root, 10, inline)
-    there, whole = contents(root), contents(tmp_path / "whole")
-    assert 2 < len(there) < len(whole)
-    assert all(whole[name] == content for name, content in there.items())
-    monkeypatch.setattr(Path, "write_bytes", write)
-    render_dataset(job, root, 10, inline)
-    assert contents(root) == whole
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write_what_fits)
+        message = rf"no space left for {tmp_path}: free some; the same comm"
+        with pytest.raises(StoppedError, match=message):
+            render_dataset(job, tmp_path, NUM, inline)
+    assert len(contents(tmp_path)) > 2
+    assert not list(tmp_path.rglob("*.partial"))
+    assert 0 < render_dataset(job, tmp_path, NUM, inline).num_rendered < NUM
+    assert contents(tmp_path) == whole
 
 
-def test_another_job_in_the_folder_is_refused_by_its_field(
-    tmp_path: Path, small_job: Make, contents: Contents
-) -> None:
+def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path, small_job, contents):
     render_dataset(small_job("ndds"), tmp_path, 2, inline)
     before = contents(tmp_path)
     for change, field in (
@@ -181,15 +161,15 @@ def test_another_job_in_the_folder_is_refused_by_its_field(
     assert contents(tmp_path) == before
 
 
-def test_changed_photos_and_meshes_are_another_job(tmp_path: Path, small_job: Make) -> None:
+def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
     photos, mesh = tmp_path / "photos", tmp_path / "box.stl"
     photos.mkdir()
     picture = np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
 
-    def write_mesh(scale: float) -> None:
+    def write_mesh(scale):
         trimesh.creation.box(np.array([90, 80, 70]) * scale).export(mesh)
 
-    def render(unit: str = "mm") -> None:
+    def render(unit="mm"):
         options = {"preset": "quickstart", "size": "32x24", "layout": "ndds", "unit": unit}
         job = make_job([str(mesh)], backgrounds=photos, **options)
         render_dataset(job, tmp_path / "out", 1, inline)
@@ -211,20 +191,20 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path: Path, small_job: Ma
 @pytest.mark.parametrize(
     "content", ["", "[1]", '{"seed": NaN}', '{"seed": 1, "seed": 2}', "[" * 100_000, "{}"]
 )
-def test_a_damaged_record_is_a_user_error(content: str, tmp_path: Path, small_job: Make) -> None:
+def test_a_damaged_record_is_a_user_error(content, tmp_path, small_job):
     (tmp_path / RECORD_FILE).write_text(content)
     with pytest.raises(UserError, match=RECORD_FILE):
         render_dataset(small_job(), tmp_path, 2, inline)
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path: Path, small_job: Make) -> None:
+def test_a_folder_with_something_else_is_refused(tmp_path, small_job):
     (file := tmp_path / "thesis.pdf").touch()
     for folder, message in (tmp_path, r"holds 'thesis\.pdf' and no"), (file / "x", "Not a dir"):
         with pytest.raises(UserError, match=message):
             render_dataset(small_job(), folder, 2, inline)
 
 
-def test_only_abandoned_partial_files_are_removed(tmp_path: Path, small_job: Make) -> None:
+def test_only_abandoned_partial_files_are_removed(tmp_path, small_job):
     job = small_job("ndds")
     render_dataset(job, tmp_path, 2, inline)
     mine = partial_path(tmp_path / "000009.png")
@@ -240,18 +220,18 @@ def test_only_abandoned_partial_files_are_removed(tmp_path: Path, small_job: Mak
 
 
 @given(st.integers(1, 300), st.integers(1, 40))
-def test_shards_cover_every_image_once(num_items: int, total: int) -> None:
+def test_shards_cover_every_image_once(num_items, total):
     spans = [Shard(number, total).span(num_items) for number in range(total)]
     assert [index for span in spans for index in span] == list(range(num_items))
     assert max(map(len, spans)) - min(map(len, spans)) <= 1
 
 
 @given(st.integers(1, 60), st.integers(1, 5), st.sets(st.integers(0, 70)))
-def test_a_plan_has_what_is_missing(num_items: int, total: int, written: set[int]) -> None:
+def test_a_plan_has_what_is_missing(num_items, total, written):
     writer = NddsWriter(Path("unused"), [])
     size = writer.chunk_size
-    writer.written = lambda chunk: {i for i in written if i // size == chunk}  # type: ignore[method-assign]
-    planned: list[int] = []
+    writer.written = lambda chunk: {i for i in written if i // size == chunk}
+    planned = []
     for number in range(total):
         chunks = list(plan(writer, Shard(number, total), num_items))
         planned += [index for chunk in chunks for index in chunk.missing]
@@ -261,19 +241,19 @@ def test_a_plan_has_what_is_missing(num_items: int, total: int, written: set[int
 
 
 @pytest.mark.parametrize("text", ["3/2", "2/2", "1", "-1/2", "1/0", "0/0", "a/b", "", "1/2/3"])
-def test_a_shard_that_is_none(text: str) -> None:
+def test_a_shard_that_is_none(text):
     with pytest.raises(UserError, match="i/n with 0 <= i < n"):
         Shard.parse(text)
 
 
 @pytest.mark.parametrize("num", [0, -5, 10**9 + 1])
-def test_a_count_that_cannot_be(num: int, tmp_path: Path, small_job: Make) -> None:
+def test_a_count_that_cannot_be(num, tmp_path, small_job):
     with pytest.raises(UserError, match=f"-n {num}; allowed: 1 to 1,000,000,000"):
         render_dataset(small_job(), tmp_path / "out", num, inline)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_part_can_be_given_a_name(tmp_path: Path) -> None:
+def test_a_part_can_be_given_a_name(tmp_path):
     assert named_part("left=servoholder", None).name == "left"
     names = [part.name for part in make_job(["a=servoholder", "b=pivconnector"]).factory.parts]
     assert names == ["a", "b"]
@@ -290,16 +270,15 @@ def test_a_part_can_be_given_a_name(tmp_path: Path) -> None:
         (["lighting.tint=0.1", "lighting.tint=0.2"], "after another --set"),
         (["lighting.tint=0.1", "lighting=1"], "after another --set"),
         (["width=64", "width.x=1"], "after another --set"),
-        (["lighting.colour=1"], "'colour' in"),
         (["lighting.tint=blue"], "'blue' for tint"),
     ],
 )
-def test_changes_that_cannot_be_made(changes: list[str], message: str) -> None:
+def test_changes_that_cannot_be_made(changes, message):
     with pytest.raises(UserError, match=message):
         make_job(["servoholder"], changes=changes)
 
 
-def test_changes_reach_the_preset(small_job: Make) -> None:
+def test_changes_reach_the_preset(small_job):
     preset = small_job(changes=["lighting.num_lights=[2,3]", "min_visible_fraction=0.25"])
     assert preset.factory.preset.lighting.num_lights == (2, 3)
     assert preset.factory.preset.min_visible_fraction == 0.25
@@ -307,15 +286,13 @@ def test_changes_reach_the_preset(small_job: Make) -> None:
     json.dumps(preset.record, allow_nan=False)
 
 
-def test_a_defect_comes_with_its_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_job: Make
-) -> None:
+def test_a_defect_comes_with_its_traceback(tmp_path, monkeypatch, small_job):
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
     with pytest.raises(RuntimeError, match=r"(?s)test_render_dataset\.py.*KeyError: 'defect'"):
         render_dataset(small_job("ndds"), tmp_path, 2, inline)
 
 
-def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path: Path, small_job: Make) -> None:
+def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path, small_job):
     small = ["horizontal_fov_deg=5", "placement.lateral=0", "min_visible_fraction=0.95"]
     job = small_job(preset="paper", changes=small)
     with pytest.raises(UserError, match="part servoholder"):
@@ -323,7 +300,7 @@ def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path: Path, small_jo
     assert not (tmp_path / "out").exists()
 
 
-def test_the_bar_shows_count_rate_and_time_left() -> None:
+def test_the_bar_shows_count_rate_and_time_left():
     console = Console(file=StringIO(), force_terminal=True, width=120)
     with ProgressDisplay(console) as progress:
         progress(3, 10)
@@ -332,9 +309,7 @@ def test_the_bar_shows_count_rate_and_time_left() -> None:
     assert all(text in console.file.getvalue() for text in ("7/10", "left"))
 
 
-def test_without_a_terminal_lines_go_to_the_log(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_terminal_lines_go_to_the_log(caplog, monkeypatch):
     clock = iter([100.0, 110.0, 140.0, 145.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     with caplog.at_level("INFO"), ProgressDisplay(Console(file=StringIO())) as progress:

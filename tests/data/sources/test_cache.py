@@ -1,10 +1,6 @@
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import os
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +24,7 @@ def assert_same(first: Sample, second: Sample) -> None:
             np.testing.assert_array_equal(one.mask, other.mask)
 
 
-def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source: Any) -> None:
+def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source):
     source = fake_source(num_items=3)
     cached = CachedSource(source, (64, 64))
     for epoch in (0, 5, 2):
@@ -37,7 +33,7 @@ def test_keeps_every_field_renders_once_and_ignores_the_epoch(fake_source: Any) 
     assert source.calls == [(0, 0), (0, 1), (0, 2)]
 
 
-def test_without_mask_and_without_instance(fake_source: Any) -> None:
+def test_without_mask_and_without_instance(fake_source):
     source = fake_source(num_items=2)
     bare = source.sample(1)
     bare.instances[0].mask = None
@@ -50,7 +46,7 @@ def test_without_mask_and_without_instance(fake_source: Any) -> None:
         assert_same(cached.sample(1), bare)
 
 
-def test_a_returned_sample_is_a_copy(fake_source: Any) -> None:
+def test_a_returned_sample_is_a_copy(fake_source):
     cached = CachedSource(fake_source(), (64, 64))
     sample = cached.sample(0)
     sample.image[:] = 0
@@ -59,19 +55,19 @@ def test_a_returned_sample_is_a_copy(fake_source: Any) -> None:
     assert_same(cached.sample(0), fake_source().sample(0))
 
 
-def test_images_are_kept_at_the_input_size(fake_source: Any) -> None:
+def test_images_are_kept_at_the_input_size(fake_source):
     cached = CachedSource(fake_source(size=(640, 480)), (64, 64))
     expected = resize_sample(fake_source(size=(640, 480)).sample(1), (64, 64))
     assert_same(cached.sample(1), expected)
     assert cached.num_bytes < 12 * 64 * 64 * 6
 
 
-def test_forked_processes_fill_one_cache(fake_source: Any) -> None:
+def test_forked_processes_fill_one_cache(fake_source):
     source = fake_source(num_items=8)
     cached = CachedSource(source, (64, 64))
     context = multiprocessing.get_context("fork")
 
-    def fill(indices: list[int]) -> None:
+    def fill(indices):
         for index in indices:
             cached.sample(index)
 
@@ -89,7 +85,7 @@ def test_forked_processes_fill_one_cache(fake_source: Any) -> None:
     assert source.calls == [(0, 0)]  # this process rendered the first item only
 
 
-def test_too_large_and_too_many_instances(fake_source: Any) -> None:
+def test_too_large_and_too_many_instances(fake_source):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
     with pytest.raises(ValueError, match="max_instances=0"):
@@ -98,7 +94,7 @@ def test_too_large_and_too_many_instances(fake_source: Any) -> None:
         CachedSource(fake_source(), (64, 64), max_instances=256)
 
 
-def test_what_does_not_fit_a_slot_is_refused(fake_source: Any) -> None:
+def test_what_does_not_fit_a_slot_is_refused(fake_source):
     with pytest.raises(ValueError, match="more than 64 characters"):
         CachedSource(fake_source(label="x" * 65), (64, 64))
     source = fake_source()
@@ -111,7 +107,7 @@ def test_what_does_not_fit_a_slot_is_refused(fake_source: Any) -> None:
         cached.sample(1)
 
 
-def test_a_file_lasts_and_is_told_apart(fake_source: Any, tmp_path: Path) -> None:
+def test_a_file_lasts_and_is_told_apart(fake_source, tmp_path):
     first = fake_source(num_items=4)
     kept = CachedSource(first, (64, 64), tmp_path, identity="a")
     for index in range(3):
@@ -133,7 +129,7 @@ def test_a_file_lasts_and_is_told_apart(fake_source: Any, tmp_path: Path) -> Non
         assert other.folder != kept.folder
 
 
-def test_a_torn_slot_is_filled_again(fake_source: Any, tmp_path: Path) -> None:
+def test_a_torn_slot_is_filled_again(fake_source, tmp_path):
     kept = CachedSource(fake_source(num_items=4), (64, 64), tmp_path)
     kept.sample(2)
     path = kept.folder / "slots.bin"
@@ -145,7 +141,7 @@ def test_a_torn_slot_is_filled_again(fake_source: Any, tmp_path: Path) -> None:
     assert (0, 2) in source.calls
 
 
-def test_native_size_keeps_depth(fake_source: Any, tmp_path: Path) -> None:
+def test_native_size_keeps_depth(fake_source, tmp_path):
     source = fake_source()
     sample = source.sample(1)
     sample.depth = np.linspace(0, 1, 48 * 64, dtype=np.float32).reshape(48, 64)
@@ -155,10 +151,8 @@ def test_native_size_keeps_depth(fake_source: Any, tmp_path: Path) -> None:
     assert CachedSource(source, (64, 64)).sample(1).depth is None
 
 
-def test_no_room_is_one_line(
-    fake_source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
+def test_no_room_is_one_line(fake_source, tmp_path, monkeypatch):
+    def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
@@ -167,7 +161,7 @@ def test_no_room_is_one_line(
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_describes_itself_as_cached(fake_source: Any) -> None:
+def test_describes_itself_as_cached(fake_source):
     source = fake_source()
     (info,), (plain,) = CachedSource(source, (64, 64)).describe(), source.describe()
     assert info.identity == {**plain.identity, "cached": True}

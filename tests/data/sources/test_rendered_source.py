@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -11,11 +9,11 @@ from dopepp.virtual.presets.preset import PRESETS
 
 
 @pytest.fixture(scope="module")
-def factory() -> Factory:
+def factory():
     return Factory([servoholder()], PRESETS["quickstart"], seed=3)
 
 
-def test_sample_agrees_with_the_scene(factory: Factory) -> None:
+def test_sample_agrees_with_the_scene(factory):
     sample = RenderedSource(factory, 4).sample(2, epoch=1)
     rendered = factory.render(1, 2)
     np.testing.assert_array_equal(sample.image, rendered.image)
@@ -30,7 +28,6 @@ def test_sample_agrees_with_the_scene(factory: Factory) -> None:
         None,
     )
     np.testing.assert_allclose(instance.keypoints, expected[:, 0], atol=1e-6)
-    assert instance.mask is not None
     assert instance.visible_fraction == rendered.visible_fractions[target]
     # What is seen of the part lies inside the hull of its cuboid's corners.
     hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
@@ -43,7 +40,7 @@ def test_sample_agrees_with_the_scene(factory: Factory) -> None:
     assert (sample.source, sample.key) == ("virtual", "train/1/2")
 
 
-def test_splits_are_disjoint_and_only_training_has_epochs(factory: Factory) -> None:
+def test_splits_are_disjoint_and_only_training_has_epochs(factory):
     sources = {split: RenderedSource(factory, 3, split) for split in FIRST_INDEX}
     images = {
         (split, epoch): source.sample(0, epoch).image
@@ -59,7 +56,7 @@ def test_splits_are_disjoint_and_only_training_has_epochs(factory: Factory) -> N
     assert min(np.diff(firsts)) >= MAX_ITEMS
 
 
-def test_bounds_description_and_objects(factory: Factory) -> None:
+def test_bounds_description_and_objects(factory):
     source = RenderedSource(factory, 3)
     with pytest.raises(IndexError, match="item 3 of 3"):
         source.sample(3)
@@ -73,7 +70,7 @@ def test_bounds_description_and_objects(factory: Factory) -> None:
     assert other.identity != info.identity
 
 
-def test_another_scale_is_the_same_test_set_from_elsewhere(factory: Factory) -> None:
+def test_another_scale_is_the_same_test_set_from_elsewhere(factory):
     usual, near = (RenderedSource(factory, 2, "test", scale=scale) for scale in (1.0, 0.5))
     one, other = usual.sample(1), near.sample(1)
     assert one.key == other.key

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from typing import Any
 
 import cv2
@@ -15,7 +13,7 @@ OFF = dict.fromkeys([*STRENGTHS, *(f"{name}_probability" for name in ("blur", "n
 
 
 @pytest.fixture(scope="module")
-def image() -> np.ndarray:
+def image():
     noise = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
     return cv2.GaussianBlur(noise, (5, 5), 2)
 
@@ -26,7 +24,7 @@ def only(**options: Any) -> Photometric:
 
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**31), epoch=st.integers(0, 100))
-def test_pure_function_of_the_generator(seed: int, epoch: int) -> None:
+def test_pure_function_of_the_generator(seed, epoch):
     image = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)
     before, augment = image.copy(), Photometric()
     first = augment(image, np.random.default_rng([seed, epoch]))
@@ -36,11 +34,11 @@ def test_pure_function_of_the_generator(seed: int, epoch: int) -> None:
     assert (first.dtype, first.shape) == (image.dtype, image.shape)
 
 
-def test_everything_off_changes_nothing(image: np.ndarray) -> None:
+def test_everything_off_changes_nothing(image):
     np.testing.assert_array_equal(only()(image, np.random.default_rng(0)), image)
 
 
-def test_brightness_and_contrast_stay_in_their_range() -> None:
+def test_brightness_and_contrast_stay_in_their_range():
     grey = np.full((8, 8, 3), 128, np.uint8)
     dark, light = np.full((8, 8, 3), 90, np.uint8), np.full((8, 8, 3), 160, np.uint8)
     offsets, gains = [], []
@@ -56,7 +54,7 @@ def test_brightness_and_contrast_stay_in_their_range() -> None:
     assert 1.2 < max(gains) < 1.32
 
 
-def test_hue_and_saturation_keep_the_luma(image: np.ndarray) -> None:
+def test_hue_and_saturation_keep_the_luma(image):
     soft = (image // 2 + 64).astype(np.uint8)  # away from clipping
     changed = only(hue=0.5, saturation=0.3)(soft, np.random.default_rng(2))
     assert np.abs(changed.astype(int) - soft).max() > 3
@@ -66,7 +64,7 @@ def test_hue_and_saturation_keep_the_luma(image: np.ndarray) -> None:
     np.testing.assert_allclose(only(hue=1.0, saturation=0.5)(grey, np.random.default_rng(0)), 77)
 
 
-def test_noise_has_the_asked_spread() -> None:
+def test_noise_has_the_asked_spread():
     grey = np.full((200, 200, 3), 128, np.uint8)
     augment = only(noise_probability=1, noise_sigma=(6.0, 6.0))
     noise = augment(grey, np.random.default_rng(0)).astype(float) - 128
@@ -77,7 +75,7 @@ def test_noise_has_the_asked_spread() -> None:
         assert np.abs(augment(flat, np.random.default_rng(0)).astype(int) - value).max() < 40
 
 
-def test_blur_and_jpeg_against_opencv(image: np.ndarray) -> None:
+def test_blur_and_jpeg_against_opencv(image):
     blurred = only(blur_probability=1, blur_sigma=(1.0, 1.0))(image, np.random.default_rng(0))
     np.testing.assert_array_equal(blurred, cv2.GaussianBlur(image, (0, 0), 1.0))
     mild = only(jpeg_probability=1, jpeg_quality=(95, 95))(image, np.random.default_rng(0))
@@ -90,6 +88,6 @@ def test_blur_and_jpeg_against_opencv(image: np.ndarray) -> None:
     "options",
     [{"brightness": -0.1}, {"noise_sigma": (5, 1)}, {"blur_probability": 1.2}, {"hue": -1}],
 )
-def test_wrong_ranges_are_refused(options: dict[str, Any]) -> None:
+def test_wrong_ranges_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Photometric(**options)

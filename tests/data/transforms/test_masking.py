@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -57,7 +53,7 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     st.floats(0.1, 1.0),
     st.integers(0, 10_000),
 )
-def test_bounds_share_and_origin_of_the_patch(mask: np.ndarray, limit: float, seed: int) -> None:
+def test_bounds_share_and_origin_of_the_patch(mask, limit, seed):
     sample = sample_of(mask, seed=seed)
     before = sample.image.copy()
     result = RandomMask(1.0, limit, limit)(sample, np.random.default_rng(seed), Stripes())
@@ -85,7 +81,7 @@ def test_bounds_share_and_origin_of_the_patch(mask: np.ndarray, limit: float, se
         assert patch.reshape(-1, 3).std(axis=0).max() > 0
 
 
-def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box() -> None:
+def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box():
     """Equation 4: 0.8 of the height and 0.8 of the width."""
     mask = np.zeros(SIZE, bool)
     mask[10:50, 20:70] = True
@@ -97,7 +93,7 @@ def test_unless_told_otherwise_a_patch_has_at_most_the_papers_share_of_the_box()
     assert np.max(sizes, axis=0).tolist() == [32, 40]
 
 
-def test_the_crop_is_a_piece_of_the_own_background() -> None:
+def test_the_crop_is_a_piece_of_the_own_background():
     mask = ellipse(30, 40, 12, 12)
     sample, other = sample_of(mask), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(3), other)
@@ -111,7 +107,7 @@ def test_the_crop_is_a_piece_of_the_own_background() -> None:
     assert not mask[row : row + last - first, column : column + stop - start].any()
 
 
-def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken() -> None:
+def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken():
     # Three columns of background are left: no patch of this part is so narrow.
     mask = np.ones(SIZE, bool)
     mask[:, :3] = False
@@ -126,7 +122,7 @@ def test_where_no_window_fits_a_smaller_one_of_the_own_background_is_taken() -> 
         assert not changed[~mask].any()
 
 
-def test_a_part_that_fills_the_frame_takes_another_picture() -> None:
+def test_a_part_that_fills_the_frame_takes_another_picture():
     sample, other = sample_of(np.ones(SIZE, bool)), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(0), other)
     assert other.calls == 1
@@ -135,7 +131,7 @@ def test_a_part_that_fills_the_frame_takes_another_picture() -> None:
     assert result.instances[0].masked_fraction == changed.mean()
 
 
-def test_a_solid_background_is_never_pasted() -> None:
+def test_a_solid_background_is_never_pasted():
     sample, other = sample_of(ellipse(30, 40, 12, 12), contrast=False), Stripes()
     result = RandomMask(1.0)(sample, np.random.default_rng(0), other)
     assert other.calls >= 1
@@ -145,7 +141,7 @@ def test_a_solid_background_is_never_pasted() -> None:
     assert untouched.instances[0].masked_fraction == 0
 
 
-def test_a_patch_counts_for_every_instance_it_covers() -> None:
+def test_a_patch_counts_for_every_instance_it_covers():
     left, right = ellipse(30, 30, 20, 15), ellipse(30, 45, 20, 15)
     right &= ~left
     sample = sample_of(left, right)
@@ -155,7 +151,7 @@ def test_a_patch_counts_for_every_instance_it_covers() -> None:
         assert instance.masked_fraction == (gone & mask).sum() / mask.sum()
 
 
-def test_probability_and_empty_masks() -> None:
+def test_probability_and_empty_masks():
     sample = sample_of(ellipse(30, 40, 12, 12))
     hits = [
         RandomMask(0.3)(sample, np.random.default_rng(seed), Stripes()).instances[0].masked_fraction
@@ -167,7 +163,7 @@ def test_probability_and_empty_masks() -> None:
     assert masked.instances[0] == hidden.instances[0]
 
 
-def test_without_a_mask_the_cuboids_hull_stands_in(fake_source: Any) -> None:
+def test_without_a_mask_the_cuboids_hull_stands_in(fake_source):
     sample = fake_source().sample(0)
     instance = sample.instances[0]
     instance.mask = None
@@ -181,6 +177,6 @@ def test_without_a_mask_the_cuboids_hull_stands_in(fake_source: Any) -> None:
 
 
 @pytest.mark.parametrize("field", ["probability", "max_height", "max_width"])
-def test_shares_outside_0_to_1_are_refused(field: str) -> None:
+def test_shares_outside_0_to_1_are_refused(field):
     with pytest.raises(ValueError, match=f"{field}=1.5"):
         RandomMask(**{field: 1.5})

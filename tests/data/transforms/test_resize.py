@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,9 +17,7 @@ from dopepp.geometry.cuboid import cuboid_keypoints
     shape=st.tuples(st.integers(1, 50), st.integers(1, 50)),
     target=st.tuples(st.integers(1, 70), st.integers(1, 70)),
 )
-def test_nearest_is_the_source_pixel_under_the_target_centre(
-    shape: tuple[int, int], target: tuple[int, int]
-) -> None:
+def test_nearest_is_the_source_pixel_under_the_target_centre(shape, target):
     image = np.arange(shape[0] * shape[1]).reshape(shape)
     result = nearest(image, *target)
     assert result.shape == target[::-1]
@@ -34,7 +29,7 @@ def test_nearest_is_the_source_pixel_under_the_target_centre(
             assert result[row, column] == image[v, u]
 
 
-def test_nearest_against_opencvs_exact_rule() -> None:
+def test_nearest_against_opencvs_exact_rule():
     image = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     for width, height in ((416, 312), (128, 96), (640, 480), (1280, 960), (37, 301)):
         expected = cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
@@ -65,9 +60,7 @@ def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:
     size=st.sampled_from([(640, 480), (480, 640), (300, 200), (100, 100)]),
     target=st.sampled_from([(416, 416), (128, 128), (256, 160), (416, 96)]),
 )
-def test_a_bright_dot_moves_with_its_keypoint(
-    x: float, y: float, size: tuple[int, int], target: tuple[int, int]
-) -> None:
+def test_a_bright_dot_moves_with_its_keypoint(x, y, size, target):
     sample = dot_sample(size, (x * size[0], y * size[1]))
     result = letterbox_sample(sample, target)
     assert result.size == target
@@ -84,7 +77,7 @@ def test_a_bright_dot_moves_with_its_keypoint(
 
 @settings(deadline=None, max_examples=30)
 @given(width=st.integers(50, 700), height=st.integers(50, 700), side=st.sampled_from([128, 416]))
-def test_keypoints_and_camera_follow_one_rule(width: int, height: int, side: int) -> None:
+def test_keypoints_and_camera_follow_one_rule(width, height, side):
     K = np.array([[1.1 * width, 0, 0.4 * width], [0, 1.2 * width, 0.6 * height], [0, 0, 1]])
     T = np.eye(4)
     T[:3, 3] = (0.01, -0.02, 0.4)
@@ -96,7 +89,7 @@ def test_keypoints_and_camera_follow_one_rule(width: int, height: int, side: int
     np.testing.assert_allclose(result.instances[0].keypoints, expected, atol=1e-9)
 
 
-def test_padding_is_zero_on_the_right_and_at_the_bottom(fake_source: Any) -> None:
+def test_padding_is_zero_on_the_right_and_at_the_bottom(fake_source):
     sample = fake_source(size=(64, 48)).sample(0)
     result = letterbox_sample(sample, (64, 64))
     np.testing.assert_array_equal(result.image[:48], sample.image)

@@ -1,9 +1,6 @@
 """The shading protocol's patches, against what brute force finds in the picture."""
 
-from __future__ import annotations
-
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,7 +56,7 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     st.floats(0, 1),
     st.integers(0, 10_000),
 )
-def test_the_share_is_reached_inside_the_box(mask: np.ndarray, share: float, seed: int) -> None:
+def test_the_share_is_reached_inside_the_box(mask, share, seed):
     sample = addressed(mask)
     before = sample.image.copy()
     (shaded,) = shade(sample, [share], seed, 3)
@@ -83,7 +80,7 @@ def test_the_share_is_reached_inside_the_box(mask: np.ndarray, share: float, see
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_patches_are_several_crops_of_the_own_background(seed: int) -> None:
+def test_patches_are_several_crops_of_the_own_background(seed):
     mask = ellipse(36, 40, 20, 28)
     sample = addressed(mask)
     (shaded,) = shade(sample, [0.8], seed, 0)
@@ -104,7 +101,7 @@ def test_patches_are_several_crops_of_the_own_background(seed: int) -> None:
         assert np.ptp(columns[place]) + 1 <= 0.5 * (stop - start)
 
 
-def test_more_shading_contains_less_and_depends_on_nothing_else() -> None:
+def test_more_shading_contains_less_and_depends_on_nothing_else():
     sample = addressed(ellipse(36, 40, 20, 28))
     together = shade(sample, SHARES, 5, 7)
     for share, one in zip(SHARES, together, strict=True):
@@ -127,9 +124,7 @@ def test_more_shading_contains_less_and_depends_on_nothing_else() -> None:
     ),
     seed=st.integers(0, 10_000),
 )  # fmt: skip
-def test_every_instance_is_covered_by_its_own_patches_alone(
-    masks: list[tuple[float, float, float, float]], seed: int
-) -> None:
+def test_every_instance_is_covered_by_its_own_patches_alone(masks, seed):
     taken, visible = np.zeros(SIZE, bool), []
     for one in masks:  # the first lies in front
         visible.append(ellipse(*one) & ~taken)
@@ -146,7 +141,7 @@ def test_every_instance_is_covered_by_its_own_patches_alone(
                 assert abs(reached - shaded.share) <= TOLERANCE
 
 
-def test_what_cannot_be_shaded_is_left_alone() -> None:
+def test_what_cannot_be_shaded_is_left_alone():
     mask = ellipse(36, 30, 15, 15)
     sample = addressed(mask, np.zeros(SIZE, bool))
     corners = np.array([[60, 20], [90, 20], [60, 60], [90, 60]] * 2 + [[75, 40]], np.float64)
@@ -162,7 +157,7 @@ def test_what_cannot_be_shaded_is_left_alone() -> None:
     assert not (inside & (taken_from[:, 1] >= 60) & (taken_from[:, 1] <= 90)).any()
 
 
-def test_a_solid_background_covers_nothing_and_says_so() -> None:
+def test_a_solid_background_covers_nothing_and_says_so():
     sample = addressed(ellipse(36, 40, 20, 28))
     sample.image[~is_object(sample.image)] = 9
     (shaded,) = shade(sample, [0.4], 0, 0)
@@ -170,7 +165,7 @@ def test_a_solid_background_covers_nothing_and_says_so() -> None:
     assert shaded.reached == (0.0,)
 
 
-def test_little_room_gives_smaller_crops_and_a_smooth_background_is_no_solid_one() -> None:
+def test_little_room_gives_smaller_crops_and_a_smooth_background_is_no_solid_one():
     mask = np.ones(SIZE, bool)
     mask[:, :6] = mask[:6] = False
     smooth = addressed(seen := ellipse(36, 40, 8, 12))
@@ -180,7 +175,7 @@ def test_little_room_gives_smaller_crops_and_a_smooth_background_is_no_solid_one
         assert shaded.reached[0] == pytest.approx(share, abs=TOLERANCE)
 
 
-def test_the_only_crops_with_contrast_are_found() -> None:
+def test_the_only_crops_with_contrast_are_found():
     sample = addressed(mask := ellipse(30, 30, 20, 20))
     sample.image[~mask] = 77
     sample.image[60:72, 84:96] = np.random.default_rng(0).integers(0, 200, (12, 12, 3))
@@ -191,12 +186,12 @@ def test_the_only_crops_with_contrast_are_found() -> None:
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_outside_0_to_1_is_refused(share: float) -> None:
+def test_a_share_outside_0_to_1_is_refused(share):
     with pytest.raises(ValueError, match=r"shares must be in \[0, 1\]"):
         shade(addressed(), [0.2, share], 0, 0)
 
 
-def test_real_frames_are_shaded_to_the_share(ycb_root: Path) -> None:
+def test_real_frames_are_shaded_to_the_share(ycb_root):
     names = ["003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle"]
     parts = [ycb_part(ycb_root, name) for name in names]
     sample = YcbVideoSource(ycb_root, parts, frames=["0050/000003"]).sample(0)

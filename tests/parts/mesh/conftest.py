@@ -1,9 +1,5 @@
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
+import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.parts import read_mesh
@@ -11,11 +7,23 @@ from dopepp.parts import read_mesh
 Content = str | bytes
 
 
+@pytest.fixture(scope="session")
+def volume():
+    """Return a mesh's volume, after checking that it is a solid that faces outwards."""
+
+    def measure(mesh):
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert solid.is_volume
+        return float(solid.volume)
+
+    return measure
+
+
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[[str, Content], Path]:
+def write(tmp_path):
     """Write a file into the test's folder."""
 
-    def write(name: str, content: Content) -> Path:
+    def write(name, content):
         path = tmp_path / name
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
@@ -24,10 +32,10 @@ def write(tmp_path: Path) -> Callable[[str, Content], Path]:
 
 
 @pytest.fixture
-def refused(write: Callable[[str, Content], Path]) -> Callable[[str, Content, str], None]:
+def refused(write):
     """Read a file that must be refused in one line that names it."""
 
-    def refused(name: str, content: Content, match: str) -> None:
+    def refused(name, content, match):
         path = write(name, content)
         with pytest.raises(UserError, match=match) as caught:
             read_mesh(path, "mm")

@@ -27,7 +27,6 @@ def distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
 
 def test_a_part_keeps_its_shape():
     mesh = servoholder().mesh
-    assert mesh is not None
     vertices, faces = subdivided(mesh, 0.0015)
     assert len(faces) > 100_000
     fewer, kept, uv, moved = decimate(vertices, faces, None, 20_000)
@@ -99,7 +98,6 @@ def test_texture_coordinates_stay_on_their_side_of_a_seam():
         np.stack([corner + right, corner + up + right, corner + up], axis=1),
     ])  # fmt: skip
     fewer, kept, coordinates, _ = decimate(vertices, faces, uv, 6000)
-    assert coordinates is not None
     span = np.ptp(coordinates[kept][..., 0], axis=1)
     assert span.max() < 0.1  # no triangle runs across the whole texture
     around = np.arctan2(fewer[:, 1], fewer[:, 0]) / (2 * np.pi) % 1
@@ -110,7 +108,6 @@ def test_texture_coordinates_stay_on_their_side_of_a_seam():
 
 def test_the_part_is_measured_before_it_is_decimated(monkeypatch, caplog):
     mesh = servoholder().mesh
-    assert mesh is not None
     whole = make_part("a", mesh)
     assert whole.mesh is mesh
     monkeypatch.setattr(part, "MAX_FACES", 500)
@@ -121,7 +118,6 @@ def test_the_part_is_measured_before_it_is_decimated(monkeypatch, caplog):
     assert caplog.text.count("\n") == 1
     message = rf"part 'a': {len(mesh.faces)} triangles decimated to \d+ to render; no point moved"
     assert re.match(message + r" by more than [\d.]+ mm$", caplog.records[0].message)
-    assert fewer.mesh is not None
     assert len(fewer.mesh.faces) <= 500
     assert fewer.mesh.faces.dtype == np.int32
     assert fewer.mesh_hash == whole.mesh_hash

@@ -83,7 +83,6 @@ def test_face_areas_agree_with_trimesh():
 
 def test_samples_lie_on_the_surface():
     mesh = servoholder().mesh
-    assert mesh is not None
     points = sample_surface(mesh.vertices, mesh.faces, num_points=300)
     # In millimetres: trimesh's absolute tolerances find wrong closest points on metre-size slivers.
     reference = trimesh.Trimesh(1000 * mesh.vertices, mesh.faces, process=False)

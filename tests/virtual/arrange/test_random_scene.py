@@ -1,7 +1,5 @@
 """The same scenes from nearer and farther, against projections and rigid motions in closed form."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -49,7 +47,6 @@ def scenes(name: str, scale: float) -> list[Scene]:
 
 
 def centre(item: SceneObject) -> np.ndarray:
-    assert item.part is not None
     return np.asarray(item.T_cam_obj @ [*item.part.cuboid[CENTROID], 1])[:3]
 
 
@@ -58,7 +55,6 @@ def test_a_part_keeps_its_place_and_its_distance_is_divided(scale):
     for scene, near in zip(scenes("wide", 1), scenes("wide", scale), strict=True):
         (index,), (there,) = scene.targets, near.targets
         item = scene.objects[index]
-        assert item.part is not None
         turned = (item.part.cuboid - item.part.cuboid[CENTROID]) @ item.T_cam_obj[:3, :3].T
         pixels = (turned + centre(item) / scale) @ scene.K.T
         np.testing.assert_allclose(near.keypoints(there), pixels[:, :2] / pixels[:, 2:])
@@ -90,7 +86,6 @@ def test_only_the_camera_moves(name, scale):
         if scene.plane is None:
             np.testing.assert_array_equal(scene.background, near.background)
         else:
-            assert near.plane is not None
             assert near.plane.normal == scene.plane.normal
             offset = scene.plane.offset + scene.plane.normal @ shift
             assert near.plane.offset == pytest.approx(offset)
@@ -100,7 +95,6 @@ def test_only_the_camera_moves(name, scale):
 def test_the_picture_on_a_table_stays_where_it_lies(scale):
     rng, differences = np.random.default_rng(0), []
     for scene, near in zip(scenes("table", 1), scenes("table", scale), strict=True):
-        assert scene.plane is not None
         pixels = np.rint(rng.uniform(0, 1, (200, 2)) * (np.array(scene.size) - 1)).astype(int)
         rays = np.c_[pixels, np.ones(200)] @ np.linalg.inv(scene.K).T
         points = rays * (scene.plane.offset / (rays @ scene.plane.normal))[:, None]

@@ -1,7 +1,5 @@
 """Objects on tables and in heaps: contact, no piercing, views, and a background that fits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import manifold3d
@@ -12,19 +10,10 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
-from dopepp.parts.part import Part, make_part
-from dopepp.virtual import (
-    PRESETS,
-    Distractors,
-    Factory,
-    Preset,
-    Scene,
-    SceneObject,
-    Table,
-    customised_preset,
-    visible_fractions,
-)
+from dopepp.parts.part import make_part
+from dopepp.virtual import Distractors, Factory, Scene, SceneObject, Table, visible_fractions
 from dopepp.virtual.arrange.tabletop import HeightMap
+from dopepp.virtual.presets.preset import PRESETS, Preset, customised_preset
 
 NUM_SCENES = 25
 CONTACT = 1e-4
@@ -52,19 +41,18 @@ def small(name: str, **changes: object) -> Preset:
 
 def heights(scene: Scene, item: SceneObject) -> np.ndarray:
     """Heights of an object's vertices above the plane, metres."""
-    assert scene.plane is not None
     points = transform(item.T_cam_obj, item.surface.vertices)
     return np.asarray(points @ np.array(scene.plane.normal) - scene.plane.offset)
 
 
 @pytest.fixture(scope="module")
-def tables(parts: list[Part]) -> list[Scene]:
+def tables(parts):
     factory = Factory(parts, small("table"), 1, Constant())
     return [factory.scene(0, index) for index in range(NUM_SCENES)]
 
 
 @pytest.fixture(scope="module")
-def heaps(parts: list[Part]) -> list[Scene]:
+def heaps(parts):
     factory = Factory(parts, small("bin"), 1, Constant())
     return [factory.scene(0, index) for index in range(NUM_SCENES)]
 
@@ -132,7 +120,6 @@ def test_heaps_hide_but_not_too_much(parts):
 def test_the_cameras_place_keeps_to_its_ranges(tables):
     distances, elevations = [], []
     for scene in tables:
-        assert scene.plane is not None
         normal = np.array(scene.plane.normal)
         assert np.linalg.norm(normal) == pytest.approx(1.0)
         assert scene.plane.offset < 0
@@ -150,7 +137,6 @@ def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
     factory = Factory(parts, preset, 4, Ramp())
     for index in range(4):
         scene = factory.scene(0, index)
-        assert scene.plane is not None
         normal = np.array(scene.plane.normal)
         v, u = np.mgrid[10:250:7, 10:250:7].reshape(2, -1)
         rays = np.stack([u, v, np.ones(u.shape)], axis=1) @ np.linalg.inv(scene.K).T
@@ -219,7 +205,6 @@ def test_a_dropped_box_lands_on_what_is_there(surface_of):
     surface = surface_of(trimesh.creation.box((0.04, 0.02, 0.03)))
     table = HeightMap(0.001, 0.1)
     footprint = table.footprint(surface, np.eye(3), -0.015)
-    assert footprint is not None
     assert table.height(footprint, (0, 0)) == 0.0
     table.put(footprint, (0, 0), 0.0)
     assert table.height(footprint, (10, 5)) == pytest.approx(0.03, abs=1e-6)
@@ -230,7 +215,6 @@ def test_a_dropped_box_lands_on_what_is_there(surface_of):
     assert table.height(footprint, (95, 0)) is None  # off the map
     turned = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
     lying = table.footprint(surface, turned, -0.01)
-    assert lying is not None
     table.put(footprint, (10, 5), 0.03)
     assert table.height(lying, (0, 0)) == pytest.approx(0.06, abs=1e-6)
 
@@ -241,8 +225,6 @@ def test_a_slope_is_met_where_it_is_highest(surface_of):
     table = HeightMap(0.001, 0.1)
     slope = table.footprint(surface_of(wedge), np.eye(3), 0.0)
     block = table.footprint(surface_of(trimesh.creation.box([0.01] * 3)), np.eye(3), -0.005)
-    assert slope is not None
-    assert block is not None
     table.put(slope, (0, 0), 0.0)
     # Height z = (x + 5 cm)/2; the block's right edge is 5 mm beside its middle.
     for x in (-20, 0, 30):

@@ -48,7 +48,7 @@ def ray_cast(surface: Surface, origins: np.ndarray, normals: np.ndarray) -> np.n
 
 
 @pytest.fixture(scope="module")
-def bracket() -> Surface:
+def bracket():
     """A plate of two huge triangles a side, with a rib on it and a deep hole through it."""
     plate = Manifold.cube((0.10, 0.06, 0.006), center=True)
     rib = Manifold.cube((0.004, 0.06, 0.03), center=True).translate((0.01, 0, 0.015))

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +18,7 @@ def cylinder() -> Mesh:
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
 
 
-def test_parts_come_back_with_symmetries_in_metres(tmp_path: Path) -> None:
+def test_parts_come_back_with_symmetries_in_metres(tmp_path):
     flip = np.eye(4)
     flip[:3, :3] = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     flip[:3, 3] = 0.001, -0.002, 0.003
@@ -49,10 +46,10 @@ def test_parts_come_back_with_symmetries_in_metres(tmp_path: Path) -> None:
     assert [part.name for part in bop_parts(tmp_path, ["servoholder"])] == ["servoholder"]
 
 
-def test_ply_is_read_by_trimesh_in_millimetres(tmp_path: Path) -> None:
+def test_ply_is_read_by_trimesh_in_millimetres(tmp_path):
     write_models(tmp_path, [pivconnector()])
     path = tmp_path / "models" / "obj_000001.ply"
-    loaded: Any = trimesh.load(path, process=False)
+    loaded = trimesh.load(path, process=False)
     mesh = pivconnector().mesh
     np.testing.assert_allclose(loaded.vertices, 1000 * mesh.vertices, atol=1e-4)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
@@ -60,8 +57,8 @@ def test_ply_is_read_by_trimesh_in_millimetres(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_mesh(path, unit="mm").vertices, mesh.vertices, atol=1e-7)
 
 
-def test_vertex_normals_are_weighted_by_angle(tmp_path: Path) -> None:
-    box: Any = trimesh.creation.box((0.02, 0.02, 0.02))
+def test_vertex_normals_are_weighted_by_angle(tmp_path):
+    box = trimesh.creation.box((0.02, 0.02, 0.02))
     mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32))
     write_models(tmp_path, [make_part("box", mesh)])
     content = (tmp_path / "models" / "obj_000001.ply").read_bytes().partition(b"end_header\n")[2]
@@ -70,7 +67,7 @@ def test_vertex_normals_are_weighted_by_angle(tmp_path: Path) -> None:
     np.testing.assert_allclose(columns[:, 3:], box.vertices / (0.01 * np.sqrt(3)), atol=1e-6)
 
 
-def test_texture_round_trip(ycb_root: Path, tmp_path: Path) -> None:
+def test_texture_round_trip(ycb_root, tmp_path):
     part = ycb_part(ycb_root, "009_gelatin_box")
     write_models(tmp_path, [part])
     (read,) = bop_parts(tmp_path)
@@ -79,7 +76,7 @@ def test_texture_round_trip(ycb_root: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(read.mesh.vertices, part.mesh.vertices, atol=1e-7)
 
 
-def test_objects_without_a_name_are_called_after_their_file(tmp_path: Path) -> None:
+def test_objects_without_a_name_are_called_after_their_file(tmp_path):
     write_models(tmp_path, [servoholder(), pivconnector()])
     folder = tmp_path / "models"
     path = folder / "models_info.json"
@@ -121,14 +118,14 @@ def test_objects_without_a_name_are_called_after_their_file(tmp_path: Path) -> N
         ([], r"1: \[\]; .*diameter and symmetries"),
     ],
 )
-def test_damaged_models_info(record: object, message: str, tmp_path: Path) -> None:
+def test_damaged_models_info(record, message, tmp_path):
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "models_info.json").write_text(json.dumps({"1": record}))
     with pytest.raises(UserError, match=message):
         read_models(tmp_path)
 
 
-def test_numbers_and_names_must_be_unique(tmp_path: Path) -> None:
+def test_numbers_and_names_must_be_unique(tmp_path):
     (tmp_path / "models").mkdir()
     path = tmp_path / "models" / "models_info.json"
     for text, message in {
@@ -142,9 +139,7 @@ def test_numbers_and_names_must_be_unique(tmp_path: Path) -> None:
             read_models(tmp_path)
 
 
-def test_an_identity_is_no_symmetry_and_a_wrong_diameter_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_identity_is_no_symmetry_and_a_wrong_diameter_is_told(tmp_path, caplog):
     write_models(tmp_path, [servoholder()])
     path = tmp_path / "models" / "models_info.json"
     records = json.loads(path.read_text())

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import io
 import json
 import pickle
@@ -19,19 +17,10 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb, encode_png
 from dopepp.data.formats.bop.source import BopSource
-from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.parts.part import Part
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 R = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 """Row by row: x_cam = −y_obj, y_cam = x_obj."""
-
-
-def block(number: int) -> Part:
-    """Return a 40 × 20 × 10 mm block called as BOP's files are."""
-    half = np.array([0.02, 0.01, 0.005])
-    cuboid = cuboid_keypoints(-half, half)
-    return Part(f"obj_{number:06d}", cuboid, float(2 * np.linalg.norm(half)), cuboid[:8])
 
 
 def truth(number: int, t: tuple[float, float, float] = (5.0, -10.0, 250.0)) -> dict[str, Any]:
@@ -64,7 +53,7 @@ class Scene:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Scene:
+def scene(tmp_path):
     """Two images: one with two blocks, one without."""
     made = Scene(tmp_path)
     made.annotate({"3": [truth(9), truth(2)], "11": []}, {"3": [0.25, 0.75], "11": []})
@@ -79,7 +68,7 @@ def scene(tmp_path: Path) -> Scene:
     return made
 
 
-def test_conventions_in_literal_numbers(scene: Scene) -> None:
+def test_conventions_in_literal_numbers(scene, block):
     source = BopSource(scene.root, [block(2)], "test")
     assert len(source) == 2
     sample = source.sample(0)
@@ -117,7 +106,7 @@ def test_conventions_in_literal_numbers(scene: Scene) -> None:
     assert BopSource(scene.root, [block(2)], "test", read_depth=False).sample(0).depth is None
 
 
-def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path: Path) -> None:
+def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path, block):
     scene = Scene(tmp_path, "val", 7)
     scene.annotate({"0": [truth(1)], "1": [truth(1)]}, None)
     grey = np.tile(np.arange(64, dtype=np.uint8), (48, 1))
@@ -135,7 +124,7 @@ def test_gray_tiff_jpeg_and_16_bit_tiff_depth(tmp_path: Path) -> None:
         assert sample.instances[0].mask is None
 
 
-def test_fraction_is_estimated_where_it_is_not_stated(tmp_path: Path) -> None:
+def test_fraction_is_estimated_where_it_is_not_stated(tmp_path, block):
     scene = Scene(tmp_path)
     half_out = truth(1, (-78.75, 0.0, 250.0))  # its centre is on the left border, pixel −½ + ½
     scene.annotate({"0": [truth(1), half_out]}, None)
@@ -151,7 +140,7 @@ def test_fraction_is_estimated_where_it_is_not_stated(tmp_path: Path) -> None:
     assert "estimated" in str(source.describe()[0].identity["visible_fractions"])
 
 
-def test_scenes_images_targets_and_shares(tmp_path: Path) -> None:
+def test_scenes_images_targets_and_shares(tmp_path, block):
     for number in (2, 10):
         scene = Scene(tmp_path, "train_pbr", number)
         scene.annotate({str(i): [truth(1)] for i in (0, 2, 10, 1)}, None)
@@ -159,7 +148,7 @@ def test_scenes_images_targets_and_shares(tmp_path: Path) -> None:
             scene.image(f"rgb/{i:06d}.jpg", np.zeros((48, 64, 3), np.uint8))
     (tmp_path / "train_pbr" / "notes").mkdir()
 
-    def keys(**options: Any) -> list[str]:
+    def keys(**options):
         source = BopSource(tmp_path, [block(1)], "train_pbr", **options)
         return [source.sample(i).key for i in range(len(source))]
 
@@ -178,9 +167,9 @@ def test_scenes_images_targets_and_shares(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 200), st.lists(st.floats(0.01, 0.99), max_size=4, unique=True))
-def test_shares_are_disjoint_and_complete(num_items: int, inner: list[float]) -> None:
+def test_shares_are_disjoint_and_complete(num_items, inner):
     bounds = [0.0, *sorted(inner), 1.0]
-    taken: list[int] = []
+    taken = []
     for first, last in pairwise(bounds):
         try:
             taken += range(num_items)[share(num_items, (first, last), "x")]
@@ -191,9 +180,7 @@ def test_shares_are_disjoint_and_complete(num_items: int, inner: list[float]) ->
         share(num_items, (0.5, 0.5), "x")
 
 
-def test_absent_images_and_objects_behind_the_camera_are_counted(
-    scene: Scene, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, block):
     caplog.set_level("INFO")
     (scene.folder / "rgb" / "000011.png").unlink()
     scene.json("scene_gt", {"3": [truth(2, (0, 0, -50.0)), truth(2)], "99": [truth(2)]})
@@ -206,7 +193,7 @@ def test_absent_images_and_objects_behind_the_camera_are_counted(
     assert "0 objects that are none of the parts and 1 behind the camera" in caplog.text
 
 
-def test_matrices_may_be_nested_and_numbers_whole(tmp_path: Path) -> None:
+def test_matrices_may_be_nested_and_numbers_whole(tmp_path, block):
     scene = Scene(tmp_path)
     nested = truth(1) | {"cam_R_m2c": np.reshape(R, (3, 3)).tolist(), "cam_t_m2c": [[0], [0], [9]]}
     scene.annotate({"0": [nested]}, {"0": [1]})
@@ -216,8 +203,8 @@ def test_matrices_may_be_nested_and_numbers_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(instance.T_cam_obj[:3, :3], np.reshape(R, (3, 3)))
 
 
-def test_what_contradicts_an_image_is_named(scene: Scene) -> None:
-    def refused(match: str, **options: Any) -> None:
+def test_what_contradicts_an_image_is_named(scene, block):
+    def refused(match, **options):
         with pytest.raises(UserError, match=match):
             BopSource(scene.root, [block(2)], "test", **options).sample(0)
 
@@ -233,7 +220,7 @@ def test_what_contradicts_an_image_is_named(scene: Scene) -> None:
     refused(r"K with .*cx=500.*image 3", read_depth=False)
 
 
-def test_wrong_folders_are_named(scene: Scene, tmp_path: Path) -> None:
+def test_wrong_folders_are_named(scene, tmp_path, block):
     with pytest.raises(UserError, match=r"train_pbr, which is no folder; allowed: one of \['test"):
         BopSource(scene.root, [block(2)], "train_pbr")
     (tmp_path / "empty" / "test").mkdir(parents=True)
@@ -255,7 +242,7 @@ def _saved(image: Image.Image, name: str, **options: Any) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore")  # Pillow warns before it refuses
-def test_other_formats_channels_and_bombs_are_refused() -> None:
+def test_other_formats_channels_and_bombs_are_refused():
     grey = Image.fromarray(np.zeros((4, 5), np.uint8))
     for content, message in (
         (_saved(grey, "GIF"), "cannot identify"),

@@ -1,14 +1,11 @@
 """BOP challenge CSVs: as the BOP toolkit writes them, back again, and as nobody should."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
@@ -32,7 +29,7 @@ def write(folder: Path, content: str | bytes) -> Path:
     return path
 
 
-def test_a_file_in_the_toolkits_format(tmp_path: Path) -> None:
+def test_a_file_in_the_toolkits_format(tmp_path):
     first, second, third = read_results(write(tmp_path, BY_HAND), {2, 21})
     assert (first.scene_id, first.im_id, first.obj_id, first.score) == (1, 4, 2, 0.75)
     expected = np.array([[1, 0, 0, -0.0105], [0, 0, -1, 0.02], [0, 1, 0, 0.81225], [0, 0, 0, 1]])
@@ -51,24 +48,22 @@ def test_a_file_in_the_toolkits_format(tmp_path: Path) -> None:
         f"scene_id, im_id, obj_id, score, R, t, time\n{GOOD.replace(',', ' , ')}",
     ],
 )
-def test_header_blanks_and_line_ends_may_vary(content: str, tmp_path: Path) -> None:
+def test_header_blanks_and_line_ends_may_vary(content, tmp_path):
     (result,) = read_results(write(tmp_path, content), {2})
     assert (result.im_id, result.score, result.seconds) == (4, 0.75, 0.5)
 
 
-def test_a_header_alone_is_a_method_that_found_nothing(tmp_path: Path) -> None:
+def test_a_header_alone_is_a_method_that_found_nothing(tmp_path):
     assert read_results(write(tmp_path, HEADER + "\n"), {1}) == []
 
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 12))
-def test_what_is_written_is_read_back(
-    seed: int, count: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
     rng = np.random.default_rng(seed)
     results = []
     for number in range(count):
-        T: NDArray[np.float64] = np.eye(4)
+        T = np.eye(4)
         T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         T[:3, 3] = rng.normal([0, 0, 1], 0.2)
         results.append(PoseResult(number // 5, number % 5, 1 + number % 3, rng.normal(), T, 0.1))
@@ -112,7 +107,7 @@ def test_what_is_written_is_read_back(
         (HEADER, r"line 2: scene_id 'scene_id'"),
     ],
 )
-def test_a_wrong_line_is_named(line: str, message: str, tmp_path: Path) -> None:
+def test_a_wrong_line_is_named(line, message, tmp_path):
     path = write(tmp_path, f"{HEADER}\n{line}\n")
     with pytest.raises(UserError, match=message) as error:
         read_results(path, {2, 3})
@@ -121,12 +116,12 @@ def test_a_wrong_line_is_named(line: str, message: str, tmp_path: Path) -> None:
     assert len(str(error.value)) < 600 + len(str(path))
 
 
-def test_the_same_pose_twice_with_another_score_is_none(tmp_path: Path) -> None:
+def test_the_same_pose_twice_with_another_score_is_none(tmp_path):
     again = GOOD.replace("0.75", "0.7")
     assert len(read_results(write(tmp_path, f"{GOOD}\n{again}"), {2})) == 2
 
 
-def test_what_is_no_such_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_such_file(tmp_path, monkeypatch):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(UserError, match=r"no such file"):
             read_results(path, {1})
@@ -149,6 +144,6 @@ def test_what_is_no_such_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("_", "-", "/", "method_data-test.csv"),
     ],
 )  # fmt: skip
-def test_file_names_have_bops_three_parts(method: str, dataset: str, split: str, name: str) -> None:
+def test_file_names_have_bops_three_parts(method, dataset, split, name):
     assert results_name(method, dataset, split) == name
     assert name.count("_") == 1

@@ -1,13 +1,9 @@
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,12 +21,9 @@ from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.surface import make_surface
 
 NUM_IMAGES = 4
-Contents = Callable[[Path], dict[str, bytes]]
 
 
-def test_round_trip(
-    parts: list[Part], samples: list[Sample], tmp_path: Path, assert_read_back: Any, write_set: Any
-) -> None:
+def test_round_trip(parts, samples, tmp_path, assert_read_back, write_set):
     write_set(BopWriter, tmp_path, parts, samples)
     source = BopSource(tmp_path, bop_parts(tmp_path), "train_pbr")
     assert len(source) == NUM_IMAGES
@@ -44,9 +37,7 @@ def test_round_trip(
     assert info.identity["visible_fractions"] == "scene_gt_info.json"
 
 
-def test_bytes_do_not_depend_on_the_order_of_writing(
-    parts: list[Part], samples: list[Sample], tmp_path: Path, contents: Contents
-) -> None:
+def test_bytes_do_not_depend_on_the_order_of_writing(parts, samples, tmp_path, contents):
     one, other = BopWriter(tmp_path / "one", parts), BopWriter(tmp_path / "other", parts)
     for writer in (one, other):
         writer.prepare()
@@ -65,12 +56,10 @@ def test_bytes_do_not_depend_on_the_order_of_writing(
     assert other.written(2) == set()
 
 
-def test_goes_on_after_being_killed(
-    parts: list[Part], samples: list[Sample], tmp_path: Path, contents: Contents, write_set: Any
-) -> None:
+def test_goes_on_after_being_killed(parts, samples, tmp_path, contents, write_set):
     write_set(BopWriter, tmp_path / "whole", parts, samples)
 
-    def die(*_: object) -> None:
+    def die(*_):
         raise KeyboardInterrupt
 
     root = tmp_path / "killed"
@@ -106,9 +95,7 @@ def _write_and_seal(root: Path, parts: list[Part], samples: list[Sample], first:
 
 
 @pytest.mark.ddp
-def test_two_processes_seal_one_scene(
-    parts: list[Part], samples: list[Sample], tmp_path: Path
-) -> None:
+def test_two_processes_seal_one_scene(parts, samples, tmp_path):
     BopWriter(tmp_path, parts).prepare()
     context = multiprocessing.get_context("fork")
     processes = [
@@ -134,15 +121,13 @@ K = camera_matrix(100.0, 100.0, 15.5, 11.5)
 
 
 @pytest.fixture(scope="module")
-def plate() -> Part:
+def plate():
     """A plate of 40 × 20 mm."""
-    box: Any = trimesh.creation.box((0.040, 0.020, 0.002))
+    box = trimesh.creation.box((0.040, 0.020, 0.002))
     return make_part("plate", Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32)))
 
 
-def test_annotation_of_a_plate_in_literal_numbers(
-    plate: Part, tmp_path: Path, write_set: Any
-) -> None:
+def test_annotation_of_a_plate_in_literal_numbers(plate, tmp_path, write_set):
     # It faces the camera at 200 mm: 0.2 px/mm·200 → 20 px × 10 px.
     T = np.eye(4)
     T[:3, 3] = 0.0, 0.0, 0.201
@@ -182,7 +167,7 @@ def test_annotation_of_a_plate_in_literal_numbers(
     np.testing.assert_array_equal(png, labels.depth)
 
 
-def test_truncated_hidden_and_far_objects(plate: Part) -> None:
+def test_truncated_hidden_and_far_objects(plate):
     surfaces = {"plate": (plate, make_surface(plate.mesh))}
     T = np.eye(4)
     T[:3, 3] = -0.0305, 0.0, 0.201  # columns −9.75 … 10.25
@@ -212,7 +197,7 @@ def test_truncated_hidden_and_far_objects(plate: Part) -> None:
             make_labels(sample, numbers, surfaces)
 
 
-def test_refuses_a_folder_of_something_else(parts: list[Part], tmp_path: Path) -> None:
+def test_refuses_a_folder_of_something_else(parts, tmp_path):
     BopWriter(tmp_path / "a", parts).prepare()
     with pytest.raises(UserError, match=r"models_info\.json, written for other parts"):
         BopWriter(tmp_path / "a", parts[:1]).prepare()

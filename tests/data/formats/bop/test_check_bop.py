@@ -1,10 +1,6 @@
 """``dopepp check`` on BOP, scenewise and in shards: a good set is clean, each damage is found."""
 
-from __future__ import annotations
-
-import io
 import json
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,13 +90,13 @@ def write_models(root: Path) -> None:
 
 
 @pytest.fixture
-def bop(tmp_path: Path) -> Path:
+def bop(tmp_path):
     root = tmp_path / "bop"
     write_models(root)
     scene = root / "train_pbr" / "000000"
     for folder in ("rgb", "depth", "mask", "mask_visib"):
         (scene / folder).mkdir(parents=True)
-    merged: dict[str, dict[str, Any]] = {"camera": {}, "gt": {}, "gt_info": {}}
+    merged = {"camera": {}, "gt": {}, "gt_info": {}}
     for image in range(NUM_IMAGES):
         parts = records(image)
         (scene / "rgb" / f"{image:06d}.png").write_bytes(png(picture(image)))
@@ -118,7 +114,7 @@ def bop(tmp_path: Path) -> Path:
 SCENE = "train_pbr/000000"
 
 
-def test_a_good_set_is_clean_from_any_level(bop: Path) -> None:
+def test_a_good_set_is_clean_from_any_level(bop):
     for root in (bop, bop / "train_pbr", bop / SCENE):
         report = check_dataset(root)
         assert (report.layout, report.num_images, report.defects) == ("BOP", NUM_IMAGES, [])
@@ -155,7 +151,7 @@ def half(content: bytes) -> bytes:
 
 
 SMALL = np.zeros((SIZE // 2, SIZE), np.uint8)
-DAMAGES: dict[str, tuple[str, Any, str]] = {
+DAMAGES = {
     "rgb cut": ("rgb/000001.png", half, f"{SCENE}/rgb/000001.png: image: unreadable"),
     "rgb empty": ("rgb/000001.png", b"", "rgb/000001.png: image: unreadable"),
     "rgb missing": ("rgb/000001.png", None, "rgb/000001.png: file: missing"),
@@ -233,9 +229,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_every_damage_is_found_with_file_and_field(
-    bop: Path, name: str, spoilt: Any, assert_found: Any, assert_refused: Any
-) -> None:
+def test_every_damage_is_found_with_file_and_field(bop, name, spoilt, assert_found, assert_refused):
     *damage, expected = DAMAGES[name]
     spoil(bop, spoilt, *damage)
     assert_found(bop, expected)
@@ -255,16 +249,14 @@ INDEPENDENT = [
 
 # A number that is not finite makes the file no JSON, and its other records are checked still.
 @pytest.mark.parametrize("names", [INDEPENDENT, ["behind", "gt NaN"]])
-def test_one_defect_hides_no_other(
-    bop: Path, names: list[str], spoilt: Any, assert_found: Any
-) -> None:
+def test_one_defect_hides_no_other(bop, names, spoilt, assert_found):
     for name in names:
         *damage, _ = DAMAGES[name]
         spoil(bop, spoilt, *damage)
     assert_found(bop, *(DAMAGES[name][2] for name in names))
 
 
-def test_private_ground_truth_and_missing_models_are_notes(bop: Path) -> None:
+def test_private_ground_truth_and_missing_models_are_notes(bop):
     for name in ("scene_gt.json", "scene_gt_info.json"):
         (bop / SCENE / name).unlink()
     for folder in ("mask", "mask_visib"):
@@ -275,9 +267,6 @@ def test_private_ground_truth_and_missing_models_are_notes(bop: Path) -> None:
     assert report.ok
     assert any("has no scene_gt.json" in note for note in report.notes)
     assert any("models_info.json" in note for note in report.notes)
-
-
-# --- shards ----------------------------------------------------------------------------------
 
 
 def runs(mask: np.ndarray) -> dict[str, Any]:
@@ -302,22 +291,14 @@ def shard_members(image: int) -> dict[str, bytes]:
     return {f"000000_{image:06d}.{name}": data for name, data in content.items()}
 
 
-def write_shard(path: Path, members: list[tuple[str, bytes]]) -> None:
-    with tarfile.open(path, "w") as archive:
-        for name, data in members:
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
-
-
 @pytest.fixture
-def shards(tmp_path: Path) -> Path:
+def shards(tmp_path, write_shard):
     root = tmp_path / "wds"
     write_models(root)
     (root / "train_pbr").mkdir()
     keys = {f"000000_{image:06d}": 0 for image in range(NUM_IMAGES)}
     (root / "train_pbr" / "key_to_shard.json").write_text(json.dumps(keys))
-    write_shard(root / SHARD, list(good_members().items()))
+    write_shard(root / SHARD, good_members().items())
     return root
 
 
@@ -327,7 +308,7 @@ def good_members() -> dict[str, bytes]:
 
 SHARD = "train_pbr/shard-000000.tar"
 FIRST = "000000_000000"
-SHARD_DAMAGES: dict[str, tuple[str, Any, str]] = {
+SHARD_DAMAGES = {
     "image cut": ("rgb.png", half, f"shard-000000.tar/{FIRST}.rgb.png: image: unreadable"),
     "no image": ("rgb.png", None, f"{FIRST}.rgb.png: member: missing"),
     "no camera": ("camera.json", None, f"{FIRST}.camera.json: member: missing"),
@@ -341,7 +322,7 @@ SHARD_DAMAGES: dict[str, tuple[str, Any, str]] = {
     "moved": ("gt.json:1.cam_t_m2c", [90.0, 0.0, 340.0], "[1].box: "),
 }
 
-LISTS: dict[str, Callable[[list[tuple[str, bytes]]], list[tuple[str, bytes]]]] = {
+LISTS = {
     "archive: member '../evil.rgb.png'": lambda m: [("../evil.rgb.png", b"x"), *m],
     f"{FIRST}.gt.json' twice": lambda m: [*m, (f"{FIRST}.gt.json", b"[]")],
     f"{FIRST}: key: its members are not together": lambda m: [*m[1:], m[0]],
@@ -351,7 +332,7 @@ LISTS: dict[str, Callable[[list[tuple[str, bytes]]], list[tuple[str, bytes]]]] =
 }  # fmt: skip
 
 
-def test_good_shards_are_clean(shards: Path) -> None:
+def test_good_shards_are_clean(shards):
     for root in (shards, shards / "train_pbr"):
         report = check_dataset(root)
         assert (report.layout, report.num_images) == ("BOP-WebDataset", NUM_IMAGES)
@@ -368,30 +349,26 @@ def in_first(spoilt: Any, place: str, value: Any) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", SHARD_DAMAGES)
-def test_every_damage_in_a_shard_is_found(
-    shards: Path, name: str, spoilt: Any, assert_found: Any
-) -> None:
+def test_every_damage_in_a_shard_is_found(shards, name, spoilt, assert_found, write_shard):
     *damage, expected = SHARD_DAMAGES[name]
-    write_shard(shards / SHARD, list(in_first(spoilt, *damage).items()))
+    write_shard(shards / SHARD, in_first(spoilt, *damage).items())
     assert_found(shards, expected)
 
 
 @pytest.mark.parametrize("expected", LISTS)
-def test_members_out_of_order_are_found(shards: Path, expected: str, assert_found: Any) -> None:
+def test_members_out_of_order_are_found(shards, expected, assert_found, write_shard):
     write_shard(shards / SHARD, LISTS[expected](list(good_members().items())))
     assert_found(shards, expected)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.97])
-def test_shard_cut_short(shards: Path, share: float, assert_found: Any) -> None:
+def test_shard_cut_short(shards, share, assert_found):
     content = (shards / SHARD).read_bytes()
     (shards / SHARD).write_bytes(content[: int(len(content) * share)])
     assert_found(shards, "shard-000000.tar: archive: ")
 
 
-def test_a_bad_archive_does_not_hide_what_it_holds(
-    shards: Path, spoilt: Any, assert_found: Any
-) -> None:
+def test_a_bad_archive_does_not_hide_what_it_holds(shards, spoilt, assert_found, write_shard):
     *damage, _ = SHARD_DAMAGES["behind"]
     listed = list(in_first(spoilt, *damage).items())
     listed[2:2] = [("../evil.txt", b"x"), listed[0]]
@@ -399,7 +376,7 @@ def test_a_bad_archive_does_not_hide_what_it_holds(
     assert_found(shards, "archive", "behind the camera", "twice")
 
 
-def test_shard_that_is_no_archive(shards: Path, assert_found: Any) -> None:
+def test_shard_that_is_no_archive(shards, assert_found):
     (shards / "train_pbr" / "shard-000001.tar").write_bytes(b"\x1f\x8b" + bytes(600))
     assert_found(shards, "shard-000001.tar: archive")
     assert check_dataset(shards).num_images == NUM_IMAGES

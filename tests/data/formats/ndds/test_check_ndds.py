@@ -1,7 +1,5 @@
 """``dopepp check`` on NDDS: good folders are clean, each damage is found, habits are noted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -53,12 +51,12 @@ def make_sample(seed: int) -> Sample:
 
 
 @pytest.fixture
-def ndds(tmp_path: Path, write_set: Any) -> Path:
+def ndds(tmp_path, write_set):
     samples = [make_sample(index) for index in range(NUM_IMAGES)]
     return write_set(NddsWriter, tmp_path / "ndds", PARTS, samples)
 
 
-def test_a_good_folder_is_clean(ndds: Path) -> None:
+def test_a_good_folder_is_clean(ndds):
     report = check_dataset(ndds)
     assert (report.layout, report.num_images, report.defects) == ("NDDS", NUM_IMAGES, [])
     assert report.notes == []
@@ -97,7 +95,7 @@ def other_masks(objects: list[dict[str, Any]]) -> list[dict[str, Any]]:
 SMALL = np.zeros((SIZE // 2, SIZE), np.uint8)
 OBJECT, CAMERA = "000000.json:objects.0", "000000.json:camera_data"
 SETTINGS = "_object_settings.json"
-DAMAGES: dict[str, tuple[str, Any, str]] = {
+DAMAGES = {
     "image cut": ("000001.png", cut, "000001.png: image: unreadable"),
     "image missing": ("000001.png", None, "000001.json: image: missing"),
     "depth cut": ("000001.depth.png", b"\x89PNG", "000001.depth.png: image: of 4 bytes"),
@@ -200,8 +198,8 @@ def spoil(root: Path, spoilt: Any, place: str, value: Any) -> None:
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_every_damage_is_found_with_file_and_field(
-    ndds: Path, name: str, spoilt: Any, assert_found: Any, assert_refused: Any
-) -> None:
+    ndds, name, spoilt, assert_found, assert_refused
+):
     *damage, expected = DAMAGES[name]
     spoil(ndds, spoilt, *damage)
     assert_found(ndds, expected)
@@ -209,7 +207,7 @@ def test_every_damage_is_found_with_file_and_field(
         assert_refused(lambda: NddsSource(ndds, PARTS), expected)
 
 
-def test_one_defect_hides_no_other(ndds: Path, spoilt: Any, assert_found: Any) -> None:
+def test_one_defect_hides_no_other(ndds, spoilt, assert_found):
     # Without a location, the projection has nothing to be held against.
     names = (
         "image cut", "depth missing", "seg size", "NaN", "unknown class", "no rotation",
@@ -225,9 +223,7 @@ def test_one_defect_hides_no_other(ndds: Path, spoilt: Any, assert_found: Any) -
     ("field", "change", "note"),
     [("quaternion_xyzw", roll, "w, x, y, z"), ("bounding_box", flip_box, "column, row")],
 )
-def test_habits_of_a_whole_set_are_notes(
-    ndds: Path, field: str, change: Callable[[Any], Any], note: str, spoilt: Any
-) -> None:
+def test_habits_of_a_whole_set_are_notes(ndds, field, change, note, spoilt):
     for path in ndds.glob("0*.json"):
         for number in (0, 1):
             spoil(ndds, spoilt, f"{path.name}:objects.{number}.{field}", change)
@@ -236,7 +232,7 @@ def test_habits_of_a_whole_set_are_notes(
     assert report.notes == [f"{field}: {note} (6 objects)"]
 
 
-def test_opengl_files_without_cuboids_are_clean(ndds: Path) -> None:
+def test_opengl_files_without_cuboids_are_clean(ndds):
     """As old nvisii writes them: y up, z backwards, projections and nothing in 3-D."""
     (ndds / "_object_settings.json").unlink()
     for path in ndds.glob("0*.json"):
@@ -257,7 +253,7 @@ def test_opengl_files_without_cuboids_are_clean(ndds: Path) -> None:
     assert report.notes == ["camera axes: OpenGL (6 objects)"]
 
 
-def test_what_nobody_sees_may_be_behind_the_camera(ndds: Path, spoilt: Any) -> None:
+def test_what_nobody_sees_may_be_behind_the_camera(ndds, spoilt):
     spoil(ndds, spoilt, f"{OBJECT}.visibility", 0)
     spoil(ndds, spoilt, f"{OBJECT}.location.2", lambda z: -z)
     for field in ("cuboid", "cuboid_centroid", "pose_transform", "projected_cuboid"):

@@ -1,7 +1,5 @@
 """NDDS: written and read back, and read as others write it (synthesised with SciPy and OpenCV)."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable
@@ -64,16 +62,13 @@ def make_sample(seed: int, parts: tuple[Part, ...] = (BOX, CUBE)) -> Sample:
     return Sample(image, K, instances, depth)
 
 
-# --- our own files ---------------------------------------------------------------------------
-
-
 @pytest.fixture
-def written(tmp_path: Path, write_set: Any) -> tuple[Path, list[Sample]]:
+def written(tmp_path, write_set):
     samples = [make_sample(seed) for seed in range(4)]
     return write_set(NddsWriter, tmp_path / "set", [BOX, CUBE], samples), samples
 
 
-def test_round_trip(written: tuple[Path, list[Sample]], assert_read_back: Any) -> None:
+def test_round_trip(written, assert_read_back):
     root, samples = written
     source = NddsSource(root, [BOX, CUBE])
     assert len(source) == 4
@@ -86,7 +81,7 @@ def test_round_trip(written: tuple[Path, list[Sample]], assert_read_back: Any) -
     assert parts[0].describe()[0].identity["items"] != parts[1].describe()[0].identity["items"]
 
 
-def test_fields_agree_with_their_documentation(written: tuple[Path, list[Sample]]) -> None:
+def test_fields_agree_with_their_documentation(written):
     root, samples = written
     record = json.loads((root / "000001.json").read_text())
     P = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])
@@ -117,7 +112,7 @@ def test_fields_agree_with_their_documentation(written: tuple[Path, list[Sample]
     np.testing.assert_allclose(exported[0]["cuboid_dimensions"], [8, 5, 3])
 
 
-def test_interrupted_writing_goes_on(tmp_path: Path) -> None:
+def test_interrupted_writing_goes_on(tmp_path):
     writer = NddsWriter(tmp_path, [BOX, CUBE])
     writer.prepare()
     writer.write(3, make_sample(3))
@@ -135,7 +130,7 @@ def test_interrupted_writing_goes_on(tmp_path: Path) -> None:
     assert again.written(1234) == {1_234_567}
 
 
-def test_settings_are_written_for_one_camera_only(tmp_path: Path, write_set: Any) -> None:
+def test_settings_are_written_for_one_camera_only(tmp_path, write_set):
     other = make_sample(1)
     other.K = camera_matrix(200.0, 200.0, 79.0, 60.0)
     write_set(NddsWriter, tmp_path, [BOX, CUBE], [make_sample(0), other])
@@ -144,7 +139,7 @@ def test_settings_are_written_for_one_camera_only(tmp_path: Path, write_set: Any
     assert (tmp_path / "_camera_settings.json").exists()
 
 
-def test_writer_refuses_foreign_folders(tmp_path: Path) -> None:
+def test_writer_refuses_foreign_folders(tmp_path):
     NddsWriter(tmp_path / "a", [BOX]).prepare()
     NddsWriter(tmp_path / "a", [BOX]).prepare()
     with pytest.raises(UserError, match=r"_object_settings\.json of other parts"):
@@ -155,7 +150,7 @@ def test_writer_refuses_foreign_folders(tmp_path: Path) -> None:
         NddsWriter(tmp_path / "b", [BOX]).prepare()
 
 
-def test_samples_without_masks_depth_or_instances(tmp_path: Path, write_set: Any) -> None:
+def test_samples_without_masks_depth_or_instances(tmp_path, write_set):
     bare, empty = make_sample(0, (BOX,)), make_sample(1, ())
     bare.depth, bare.instances[0].mask = None, None
     write_set(NddsWriter, tmp_path, [BOX], [bare, empty])
@@ -165,7 +160,7 @@ def test_samples_without_masks_depth_or_instances(tmp_path: Path, write_set: Any
     assert source.sample(1).instances == []
 
 
-def test_corner_behind_the_camera_survives(tmp_path: Path, write_set: Any) -> None:
+def test_corner_behind_the_camera_survives(tmp_path, write_set):
     sample = make_sample(0, (BOX, BOX))
     T = sample.instances[0].T_cam_obj
     T[:3, 3] = [0, 0, 0.02]
@@ -176,9 +171,6 @@ def test_corner_behind_the_camera_survives(tmp_path: Path, write_set: Any) -> No
     back = NddsSource(tmp_path, [BOX]).sample(0).instances[0]
     np.testing.assert_allclose(back.T_cam_obj, T, atol=1e-12)
     np.testing.assert_allclose(back.keypoints, sample.instances[0].keypoints, atol=1e-6)
-
-
-# --- files in the wild -----------------------------------------------------------------------
 
 
 class Wild:
@@ -303,14 +295,7 @@ SLANTED[:3, 3] = [0.013, -0.04, 0.02]
     ],
     ids=["plain", "opengl", "nvisii", "old-nvisii", "fixed", "fixed-slanted"],
 )
-def test_every_habit_is_found(
-    tmp_path: Path,
-    order: str,
-    unit: str,
-    habits: dict[str, Any],
-    frame: str,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_every_habit_is_found(tmp_path, order, unit, habits, frame, caplog):
     wild = Wild(tmp_path, order=order, unit=unit, **habits)
     wild.items(3, BOX, CUBE)
     if "fixed" in habits:
@@ -328,16 +313,14 @@ def test_every_habit_is_found(
 
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))
 @settings(max_examples=25, deadline=None)
-def test_a_single_instance_is_enough(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, order: str
-) -> None:
+def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
     wild = Wild(tmp_path_factory.mktemp("one"), order=order)
     wild.rng = np.random.default_rng(seed)
     wild.item(0, CUBE)
     assert_read(wild, NddsSource(wild.root, [CUBE]))
 
 
-def test_falling_things(tmp_path: Path) -> None:
+def test_falling_things(tmp_path):
     """Its folders, names, two cameras, classes with _16k, segmentation and depth."""
     wild = Wild(
         tmp_path / "mixed" / "kitchen_0",
@@ -363,7 +346,7 @@ def test_falling_things(tmp_path: Path) -> None:
     assert NddsSource(tmp_path, [BOX], read_depth=False).sample(0).depth is None
 
 
-def test_models_moved_to_their_centre(tmp_path: Path) -> None:
+def test_models_moved_to_their_centre(tmp_path):
     """The pose is of the mesh moved by its box's centre, which no file states."""
     centre = np.eye(4)
     centre[:3, 3] = -BOX.cuboid[8]
@@ -374,7 +357,7 @@ def test_models_moved_to_their_centre(tmp_path: Path) -> None:
     assert_read(wild, source)
 
 
-def test_noise_in_the_projections(tmp_path: Path) -> None:
+def test_noise_in_the_projections(tmp_path):
     wild = Wild(tmp_path, order="wxyz", noise=1.5)
     wild.items(20, BOX, CUBE)
     source = NddsSource(tmp_path, [BOX, CUBE])
@@ -383,7 +366,7 @@ def test_noise_in_the_projections(tmp_path: Path) -> None:
     assert_read(wild, source)
 
 
-def test_orders_that_cannot_be_told_apart_are_said(tmp_path: Path) -> None:
+def test_orders_that_cannot_be_told_apart_are_said(tmp_path):
     wild, T = Wild(tmp_path), np.eye(4)
     T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
     T[:3, 3] = [0.01, 0.0, 0.4]
@@ -399,7 +382,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_text(json.dumps(record))
 
 
-def test_an_item_that_contradicts_the_others(tmp_path: Path) -> None:
+def test_an_item_that_contradicts_the_others(tmp_path):
     paths = Wild(tmp_path).items(12, BOX)
     edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
     source = NddsSource(tmp_path, [BOX])
@@ -408,21 +391,21 @@ def test_an_item_that_contradicts_the_others(tmp_path: Path) -> None:
         source.sample(7)
 
 
-def test_no_convention_fits(tmp_path: Path) -> None:
+def test_no_convention_fits(tmp_path):
     Wild(tmp_path).items(4, BOX)
     inch = make_box("box", (0.2, 0.127, 0.076), (0.025, -0.05, 0.0127))
     with pytest.raises(UserError, match=r"no known convention fits.* px: quaternion .*, lengths"):
         NddsSource(tmp_path, [inch])
 
 
-def test_half_the_files_in_each_order(tmp_path: Path) -> None:
+def test_half_the_files_in_each_order(tmp_path):
     for path in Wild(tmp_path).items(8, BOX)[:4]:
         edit(path, lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
     with pytest.raises(UserError, match="convention"):
         NddsSource(tmp_path, [BOX])
 
 
-def test_visible_fraction_of_a_truncated_object(tmp_path: Path) -> None:
+def test_visible_fraction_of_a_truncated_object(tmp_path):
     for visibility in (1, 0.5, -1, None):
         wild, T = Wild(tmp_path / str(visibility), visibility=visibility), np.eye(4)
         # The centre of the face towards the camera is on the left border.
@@ -433,10 +416,10 @@ def test_visible_fraction_of_a_truncated_object(tmp_path: Path) -> None:
         assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
 
 
-def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path):
     Wild(tmp_path).items(3, BOX, CUBE)
 
-    def behind(item: dict[str, Any]) -> None:
+    def behind(item):
         item["location"][2] *= -1
         item["visibility"] = 0
 
@@ -458,9 +441,7 @@ def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path: Pat
         NddsSource(tmp_path, [dice])
 
 
-def test_missing_camera_images_and_folders(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_camera_images_and_folders(tmp_path, caplog):
     wild = Wild(tmp_path / "set", own_camera=False)
     wild.item(0, BOX)
     with pytest.raises(UserError, match=r"camera_data\.intrinsics: 0 cameras.*_camera_settings"):
@@ -481,14 +462,14 @@ def test_missing_camera_images_and_folders(
             NddsSource(folder, [BOX])
 
 
-def test_image_of_another_size_than_its_camera(tmp_path: Path) -> None:
+def test_image_of_another_size_than_its_camera(tmp_path):
     Wild(tmp_path).item(0, BOX)
     cv2.imwrite(str(tmp_path / "000000.png"), np.zeros((40, 50, 3), np.uint8))
     with pytest.raises(UserError, match=r"for the 50×40 image of .*000000\.json"):
         NddsSource(tmp_path, [BOX]).sample(0)
 
 
-def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path: Path) -> None:
+def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path):
     wild = Wild(tmp_path)
     wild.item(0, BOX, BOX)
     wild.settings("box")

@@ -1,16 +1,10 @@
-from __future__ import annotations
-
 import gzip
-import io
 import json
 import pickle
 import tarfile
 import threading
-from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,23 +19,19 @@ from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.webdataset.source import WebdatasetSource
 from dopepp.data.formats.webdataset.tar import FIELDS, index_shard, members
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
-from dopepp.data.sample import Sample
-from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.parts.part import Part
 
 NUM_IMAGES = 4
-Contents = Callable[[Path], dict[str, bytes]]
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
 
 
 @pytest.fixture
-def written(parts: list[Part], samples: list[Sample], tmp_path: Path, write_set: Any) -> Path:
+def written(parts, samples, tmp_path, write_set):
     """Write four images in two shards."""
     return write_set(WebdatasetWriter, tmp_path / "rendered", parts, samples, 998)
 
 
-def test_round_trip(written: Path, samples: list[Sample], assert_read_back: Any) -> None:
+def test_round_trip(written, samples, assert_read_back):
     source = WebdatasetSource(written, bop_parts(written), "train_pbr")
     assert len(source) == NUM_IMAGES
     source = pickle.loads(pickle.dumps(source))
@@ -60,7 +50,7 @@ def test_round_trip(written: Path, samples: list[Sample], assert_read_back: Any)
     assert {instance.label for instance in sample.instances} <= {"pivconnector"}
 
 
-def test_the_library_and_tarfile_read_the_shards(written: Path, samples: list[Sample]) -> None:
+def test_the_library_and_tarfile_read_the_shards(written, samples):
     import webdataset
 
     url = str(written / "train_pbr" / "shard-{000000..000001}.tar")
@@ -87,10 +77,8 @@ def test_the_library_and_tarfile_read_the_shards(written: Path, samples: list[Sa
             assert (info.mtime, info.uid, info.uname) == (0, 0, "dopepp")
 
 
-def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
-    written: Path, parts: list[Part], samples: list[Sample], contents: Contents
-) -> None:
-    def die(*_: object) -> None:
+def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(written, parts, samples, contents):
+    def die(*_):
         raise KeyboardInterrupt
 
     root = written.parent / "other"
@@ -116,13 +104,13 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(
 
 @settings(max_examples=60, deadline=None)
 @given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
-def test_runs_round_trip(mask: np.ndarray) -> None:
+def test_runs_round_trip(mask):
     record = encode_runs(mask)
     assert sum(record["counts"]) == mask.size
     np.testing.assert_array_equal(decode_runs(record, mask.shape, "x"), mask)
 
 
-def test_runs_go_down_the_columns_and_begin_with_zeros() -> None:
+def test_runs_go_down_the_columns_and_begin_with_zeros():
     mask = np.array([[1, 0, 0], [1, 1, 0]], bool)
     assert encode_runs(mask) == {"counts": [0, 2, 1, 1, 2], "size": [2, 3]}
     assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), "x").sum() == 0
@@ -140,25 +128,9 @@ def test_runs_go_down_the_columns_and_begin_with_zeros() -> None:
         (None, "missing"),
     ],
 )
-def test_damaged_runs(record: object, message: str) -> None:
+def test_damaged_runs(record, message):
     with pytest.raises(UserError, match=message):
         decode_runs(record, (2, 3), "x")
-
-
-def write_shard(path: Path, files: list[tuple[Any, bytes]], **options: Any) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tarfile.open(path, "w", **options) as archive:
-        for name, content in files:
-            info = name if isinstance(name, tarfile.TarInfo) else tarfile.TarInfo(name)
-            info.size = len(content) if info.isreg() else 0
-            archive.addfile(info, io.BytesIO(content))
-    return path
-
-
-def block() -> Part:
-    half = np.array([0.02, 0.01, 0.005])
-    cuboid = cuboid_keypoints(-half, half)
-    return Part("obj_000002", cuboid, float(2 * np.linalg.norm(half)), cuboid[:8])
 
 
 def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
@@ -174,7 +146,7 @@ def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
     return [*texts, (f"{key}.rgb.jpg", picture)]
 
 
-def test_a_shard_of_another_writer(tmp_path: Path) -> None:
+def test_a_shard_of_another_writer(tmp_path, block, write_shard):
     files = [("./" + name, data) for name, data in image_files("000001_000005")]
     files += image_files("000000_000007", gt_json=None, gt_info_json=None)
     folder = tarfile.TarInfo("some")
@@ -183,7 +155,7 @@ def test_a_shard_of_another_writer(tmp_path: Path) -> None:
     files = [(folder, b""), *files, ("__meta__", b"x"), *long]
     for kind in (tarfile.PAX_FORMAT, tarfile.GNU_FORMAT):
         write_shard(tmp_path / "shard-000000.tar", files, format=kind)
-        source = WebdatasetSource(tmp_path, [block()])
+        source = WebdatasetSource(tmp_path, [block(2)])
         samples = [source.sample(index) for index in range(len(source))]
         keys = [sample.key[:20] for sample in samples]
         assert keys == ["000001_000005", "000000_000007", "some/" + "x" * 15]
@@ -194,10 +166,10 @@ def test_a_shard_of_another_writer(tmp_path: Path) -> None:
         assert (instance.visible_fraction, instance.mask, samples[0].depth) == (0.5, None, None)
 
 
-def test_hostile_members_are_refused(tmp_path: Path) -> None:
+def test_hostile_members_are_refused(tmp_path, write_shard):
     good = image_files("000000_000000")
 
-    def refused(message: str, files: list[tuple[Any, bytes]]) -> None:
+    def refused(message, files):
         path = write_shard(tmp_path / "s" / "shard-000000.tar", files)
         with pytest.raises(UserError, match=message) as caught:
             index_shard(path)
@@ -216,7 +188,7 @@ def test_hostile_members_are_refused(tmp_path: Path) -> None:
     refused("no KEY.EXTENSION", [*good, ("README", b"x")])
 
 
-def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) -> None:
+def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path, write_shard):
     files = image_files("000000_000000") + image_files("000000_000001")
     path = write_shard(tmp_path / "shard-000000.tar", files)
     whole = path.read_bytes()
@@ -264,24 +236,22 @@ def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path: Path) ->
         ({"mask_visib_json": {"1": {"size": [48, 64], "counts": [1]}}}, r"counts \[1\]"),
     ],
 )
-def test_damaged_annotation_is_named(
-    changes: dict[str, object], message: str, tmp_path: Path
-) -> None:
+def test_damaged_annotation_is_named(changes, message, tmp_path, block, write_shard):
     write_shard(tmp_path / "shard-000000.tar", image_files("000003_000004", **changes))
-    source = WebdatasetSource(tmp_path, [block()])
+    source = WebdatasetSource(tmp_path, [block(2)])
     with pytest.raises(UserError, match=message) as caught:
         source.sample(0)
     assert "000003_000004" in str(caught.value)
 
 
-def test_a_key_in_two_shards_and_wrong_paths(tmp_path: Path) -> None:
+def test_a_key_in_two_shards_and_wrong_paths(tmp_path, block, write_shard):
     for name in ("shard-000000.tar", "shard-000001.tar"):
         write_shard(tmp_path / "a" / name, image_files("000000_000000"))
     with pytest.raises(UserError, match=r"shard-000001\.tar with 1 keys of .*shard-000000\.tar"):
-        WebdatasetSource(tmp_path, [block()], "a")
-    source = WebdatasetSource(tmp_path, [block()], "a/shard-000001.tar")
+        WebdatasetSource(tmp_path, [block(2)], "a")
+    source = WebdatasetSource(tmp_path, [block(2)], "a/shard-000001.tar")
     assert len(source) == 1
-    braces = WebdatasetSource(tmp_path, [block()], "a/shard-00000{1..1}.tar")
+    braces = WebdatasetSource(tmp_path, [block(2)], "a/shard-00000{1..1}.tar")
     assert braces.describe()[0].identity == source.describe()[0].identity
     for shards, message in {
         "b": "no such file or folder",
@@ -295,16 +265,16 @@ def test_a_key_in_two_shards_and_wrong_paths(tmp_path: Path) -> None:
         "PIPE:touch hacked": "a command to run",
     }.items():
         with pytest.raises(UserError, match=message):
-            WebdatasetSource(tmp_path, [block()], shards)
+            WebdatasetSource(tmp_path, [block(2)], shards)
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"a folder without \*\.tar"):
-        WebdatasetSource(tmp_path, [block()], "empty")
+        WebdatasetSource(tmp_path, [block(2)], "empty")
     with pytest.raises(UserError, match=r"shard-000000\.tar twice"):
-        WebdatasetSource(tmp_path, [block()], ["a/shard-000000.tar", "a/shard-000000.tar"])
+        WebdatasetSource(tmp_path, [block(2)], ["a/shard-000000.tar", "a/shard-000000.tar"])
 
 
 @pytest.fixture
-def address(tmp_path: Path) -> Iterator[str]:
+def address(tmp_path):
     handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path / "served"))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
@@ -313,36 +283,36 @@ def address(tmp_path: Path) -> Iterator[str]:
 
 
 def test_shards_are_downloaded_once_and_within_bounds(
-    address: str, tmp_path: Path, contents: Contents, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    address, tmp_path, contents, monkeypatch, block, write_shard
+):
     for n in (0, 1):
         write_shard(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
     folder = tmp_path / "downloads"
     url = address + "/shard-{000000..000001}.tar"
-    source = WebdatasetSource(tmp_path, [block()], url, download_dir=folder)
+    source = WebdatasetSource(tmp_path, [block(2)], url, download_dir=folder)
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
     assert contents(folder) == contents(tmp_path / "served")
     monkeypatch.setattr("dopepp.data.formats.webdataset.shards.MAX_SHARD_BYTES", 1000)
-    again = WebdatasetSource(tmp_path, [block()], url, download_dir=folder)
+    again = WebdatasetSource(tmp_path, [block(2)], url, download_dir=folder)
     assert again.describe() == [source.describe()[0]]
     with pytest.raises(UserError, match="of over 0 GB"):
-        WebdatasetSource(tmp_path, [block()], url, download_dir=tmp_path / "small")
+        WebdatasetSource(tmp_path, [block(2)], url, download_dir=tmp_path / "small")
     missing = address + "/shard-000009.tar"
     with pytest.raises(UserError, match="which cannot be fetched"):
-        WebdatasetSource(tmp_path, [block()], missing, download_dir=folder)
+        WebdatasetSource(tmp_path, [block(2)], missing, download_dir=folder)
     with pytest.raises(UserError, match=r"URLs of .*https"):
-        WebdatasetSource(tmp_path, [block()], "nope://x/y.tar", download_dir=folder)
+        WebdatasetSource(tmp_path, [block(2)], "nope://x/y.tar", download_dir=folder)
     assert list((tmp_path / "small").iterdir()) == []
 
 
-def test_commands_run_only_when_allowed(tmp_path: Path) -> None:
+def test_commands_run_only_when_allowed(tmp_path, block, write_shard):
     path = write_shard(tmp_path / "elsewhere" / "shard-000000.tar", image_files("000000_000000"))
     command = f"pipe:cat {path}"
     with pytest.raises(UserError, match="a command to run"):
-        WebdatasetSource(tmp_path, [block()], command, download_dir=tmp_path / "d")
+        WebdatasetSource(tmp_path, [block(2)], command, download_dir=tmp_path / "d")
     assert not (tmp_path / "d").exists()
     source = WebdatasetSource(
-        tmp_path, [block()], command, download_dir=tmp_path / "d", allow_commands=True
+        tmp_path, [block(2)], command, download_dir=tmp_path / "d", allow_commands=True
     )
     assert source.sample(0).key == "000000_000000"
     assert FIELDS[0] == "image"

@@ -1,12 +1,9 @@
 """``dopepp check`` on YCB-Video, real and made up, and on folders of no or several layouts."""
 
-from __future__ import annotations
-
 import logging
 import re
 import shutil
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,14 +15,13 @@ from dopepp.data.check import check_dataset
 from dopepp.data.formats.problems import MAX_KEPT, CheckReport
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.geometry.camera import camera_matrix
-from dopepp.parts.part import Part
 
 FRAME = "0000/000001"
 HALF = np.array([0.04, 0.03, 0.02])
 
 
 @pytest.fixture
-def ycb(ycb_tree: Any) -> Any:
+def ycb(ycb_tree):
     rng = np.random.default_rng(0)
     for name in ("002_can", "003_box", "004_mug"):
         folder = ycb_tree.root / "models" / name
@@ -39,14 +35,14 @@ def ycb(ycb_tree: Any) -> Any:
     return ycb_tree
 
 
-def test_a_good_folder_is_clean(ycb: Any) -> None:
+def test_a_good_folder_is_clean(ycb):
     report = check_dataset(ycb.root)
     assert (report.layout, report.num_images, report.defects, report.notes) == (
         "YCB-Video", 3, [], [],
     )  # fmt: skip
 
 
-def test_the_real_frames_are_clean(ycb_root: Path) -> None:
+def test_the_real_frames_are_clean(ycb_root):
     report = check_dataset(ycb_root)
     assert (report.layout, report.num_images, report.defects) == ("YCB-Video", 9, [])
     (note,) = report.notes
@@ -85,7 +81,7 @@ def spoil(what: str, value: Any) -> Callable[[Any], Any]:
     return damage
 
 
-DAMAGES: dict[str, tuple[Callable[[Any], Any], str]] = {
+DAMAGES = {
     "colour cut": (spoil("color.png", -300), "color.png: image: unreadable"),
     "colour missing": (spoil("color.png", None), "color.png: file: missing"),
     "depth missing": (spoil("depth.png", None), "depth.png: file: missing"),
@@ -147,9 +143,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_every_damage_is_found_with_file_and_field(
-    ycb: Any, box: Part, name: str, assert_found: Any, assert_refused: Any
-) -> None:
+def test_every_damage_is_found_with_file_and_field(ycb, box, name, assert_found, assert_refused):
     damage, expected = DAMAGES[name]
     damage(ycb)
     assert_found(ycb.root, expected)
@@ -159,7 +153,7 @@ def test_every_damage_is_found_with_file_and_field(
         assert_refused(lambda: YcbVideoSource(ycb.root, [box], "train"), expected)
 
 
-def test_one_defect_hides_no_other(ycb: Any, assert_found: Any) -> None:
+def test_one_defect_hides_no_other(ycb, assert_found):
     poses(R00=1.1, tz=-0.3)(ycb)
     for name in ("colour cut", "depth size", "box of nobody"):
         DAMAGES[name][0](ycb)
@@ -168,7 +162,7 @@ def test_one_defect_hides_no_other(ycb: Any, assert_found: Any) -> None:
     )
 
 
-def test_unlabelled_objects_and_absent_models_are_no_defects(ycb: Any) -> None:
+def test_unlabelled_objects_and_absent_models_are_no_defects(ycb):
     ycb.write(FRAME, labelled=False)
     shutil.rmtree(ycb.root / "models" / "004_mug")
     ycb.write("0000/000003", (3,))
@@ -180,10 +174,7 @@ def test_unlabelled_objects_and_absent_models_are_no_defects(ycb: Any) -> None:
     assert missing.startswith("models/004_mug/points.xyz is missing")
 
 
-# --- the report and the layouts --------------------------------------------------------------
-
-
-def test_unknown_layouts(tmp_path: Path) -> None:
+def test_unknown_layouts(tmp_path):
     (tmp_path / "readme.txt").touch()
     (tmp_path / "notes.json").write_text("{}")
     for folder in (tmp_path, tmp_path / "nowhere"):
@@ -191,7 +182,7 @@ def test_unknown_layouts(tmp_path: Path) -> None:
             check_dataset(folder)
 
 
-def test_report_lines_are_capped_and_counted(tmp_path: Path) -> None:
+def test_report_lines_are_capped_and_counted(tmp_path):
     report = CheckReport(tmp_path, "BOP")
     for number in range(MAX_KEPT + 5):
         report.report(tmp_path / "a" / f"{number}.json", "0.cam_K", "two\nlines")
@@ -207,7 +198,7 @@ def test_report_lines_are_capped_and_counted(tmp_path: Path) -> None:
     assert not report.ok
 
 
-def test_progress_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_progress_is_told(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         report = CheckReport(tmp_path, "NDDS")
         for _ in range(1000):

@@ -13,27 +13,15 @@ from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Part
-from dopepp.virtual import (
-    PRESETS,
-    Ambient,
-    Factory,
-    Grooves,
-    Light,
-    Material,
-    Plane,
-    Rendered,
-    Scene,
-    SceneObject,
-    make_surface,
-    render,
-)
-from dopepp.virtual.renderers import Renderer, find_renderer
+from dopepp.virtual import PRESETS, Factory, Rendered, make_surface, render
+from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject
 
 pytestmark = pytest.mark.render
 
 
 @pytest.fixture(scope="module")
-def photoreal() -> Renderer:
+def photoreal():
     pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
     pytest.importorskip("pyoidn", reason="the extra photoreal is not installed")
     return find_renderer("photoreal")
@@ -43,7 +31,6 @@ def lying(part: Part, height: float, **options: Material) -> SceneObject:
     """Place a part's frame above the plane that :func:`on_table` adds, half a metre away."""
     T = np.eye(4)
     T[:3, 3] = 0.0, 0.0, 0.5 - height
-    assert part.mesh is not None
     return SceneObject(make_surface(part.mesh), T, part=part, **options)
 
 
@@ -152,7 +139,7 @@ def test_a_red_neighbour_is_seen_in_a_mirror(photoreal, box_part, scene_of):
     both, alone = photoreal(scene), photoreal(replace(scene, objects=(plate,)))
     seen = (both.instances == 0) & (alone.instances == 0)
 
-    def redness(picture: Rendered) -> float:
+    def redness(picture):
         values = picture.image[seen].astype(float)
         return float((values[:, 0] - values[:, 1]).max())
 

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,12 +29,12 @@ os._exit(0)
 
 
 @pytest.fixture(autouse=True)
-def mitsuba_is_installed() -> None:
+def mitsuba_is_installed():
     pytest.importorskip("mitsuba", reason="the extra photoreal is not installed")
 
 
 @pytest.fixture
-def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def library(tmp_path, monkeypatch):
     """A file that stands for a libLLVM, with the user's cache in a folder of its own."""
     path = tmp_path / "libLLVM-15.so.1"
     path.write_bytes(b"\0" * 2_000_000)
@@ -87,7 +86,7 @@ def test_a_damaged_memory_is_written_anew(library, monkeypatch, tmp_path):
 
 
 def test_a_trial_without_an_end_is_made_again_later(library, monkeypatch):
-    def hang(command: list[str], timeout: float, **_: Any) -> None:
+    def hang(command, timeout, **_):
         raise subprocess.TimeoutExpired(command, timeout)
 
     with monkeypatch.context() as patch:

@@ -1,6 +1,5 @@
 """Colour: textures, normals, light and shadow, metal and grooves, against closed forms."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -10,21 +9,9 @@ import trimesh
 
 from dopepp.geometry.camera import make_transform, resize_camera
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.parts.part import Mesh
-from dopepp.virtual import (
-    Ambient,
-    Grooves,
-    Light,
-    Material,
-    SceneObject,
-    Surface,
-    make_surface,
-    render,
-)
+from dopepp.virtual import Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
-
-MakeSheet = Callable[..., Mesh]
-Tilted = Callable[..., SceneObject]
+from dopepp.virtual.scene import Ambient, Grooves, Light, Material, SceneObject
 
 
 def even(light: float) -> Ambient:
@@ -93,19 +80,11 @@ def test_a_shadow_falls_where_the_light_is_blocked(scene_of, sheet, surface_of):
     assert abs(shadowed.image[60, 120, 0] - lit[60, 120, 0]) <= 1
 
 
-def test_flat_faces_have_no_shadow_acne(scene_of, sheet):
-    floor = facing(make_surface(sheet(0.6)), (0, 0, 0.5), Material(specular=0.0))
-    for light in (Light((2.0, 1.0, 0.0)), Light((-0.5, 0.5, 0.2)), Light((3, 0, 0.1), reach=3)):
-        rendered = render(scene_of(floor, lights=(light,)))
-        inner = rendered.image[5:-5, 5:-5, 0].astype(int)
-        assert np.abs(np.diff(inner, axis=1)).max() <= 4
-
-
 @pytest.fixture(scope="module")
-def tilted(sheet: MakeSheet) -> Tilted:
+def tilted(sheet):
     """Make a sheet of 20 cm that faces the camera, or leans over by an angle."""
 
-    def make(material: Material, tilt: float = 0.0, depth: float = 0.4) -> SceneObject:
+    def make(material, tilt=0.0, depth=0.4):
         turned = rotation_vector_to_matrix(np.array([tilt, 0, 0])) @ FACING
         plain = replace(sheet(0.2), uv=None)
         return SceneObject(
@@ -119,7 +98,7 @@ def test_metal_has_no_diffuse_light_and_a_coloured_mirror(scene_of, tilted):
     gold = Material((0.9, 0.6, 0.2), roughness=0.3, metallic=1.0)
     beside = Light((1.0, 0.0, 0.0), (0.8, 0.8, 0.8), 1.0)
 
-    def middle(material: Material, ambient: float, *lights: Light) -> np.ndarray:
+    def middle(material, ambient, *lights):
         scene = scene_of(tilted(material), lights=lights, ambient=even(ambient))
         return render(scene).image[60, 79]
 
