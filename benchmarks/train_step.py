@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import torch
 
-from dopepp.experiment.build.hardware import choose_precision, keep_freed_memory
+from dopepp.experiment.build.system import choose_precision, keep_freed_memory
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.spec import build_network
 

@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
-from dopepp.experiment.launch import remote, slurm
+from dopepp.experiment.launch import remote
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.resume import read_overrides, remember_overrides
@@ -41,7 +41,6 @@ Job = Callable[[dict[str, Any], Path], object]
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
 
-_START_AGAIN: Final = "start the command again"
 _REFUSALS: Final = (*NO_SPACE, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST)
 """What a disk may answer to any program; another ``OSError`` is one of this program."""
 
@@ -57,7 +56,10 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
         try:
-            _remember(run_dir)
+            # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
+            if not any(text.startswith("resume=") for text in hydra.overrides.task):
+                remember_overrides(run_dir)
+                remote.remember_run(sys.argv[1:], run_dir)
             job(_plain(config), run_dir)
         except UserError as error:  # here, because Hydra would print a stack before handing it on
             _exit(error, USERS_MISTAKE)
@@ -106,19 +108,10 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     return None
 
 
-def _remember(run_dir: Path) -> None:
-    """Write down how this run was started: Hydra's own file may be cut in the middle."""
-    overrides = [str(text) for text in HydraConfig.get().overrides.task]
-    if not any(text.startswith("resume=") for text in overrides):  # else once it is accepted
-        remember_overrides(run_dir)
-        slurm.remember_run(sys.argv[1:], run_dir)
-
-
 def _plain(config: DictConfig) -> dict[str, Any]:
     """Resolve every interpolation; below this line there are only plain values."""
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return dict(plain)
 
 
 def entry(
@@ -137,18 +130,18 @@ def entry(
     remote.configure_logging()
     try:
         arguments = [_spelled_out(text, short_names or {}, open_nodes) for text in sys.argv[1:]]
-        begun = slurm.begun_run(arguments)
+        begun = remote.begun_run(arguments)
         if begun is not None:
             arguments.append(f"resume={begun}")
         _refuse_used_folder(arguments)
         sys.argv = [sys.argv[0], *_resumed(arguments)]
-        with interruptible(_START_AGAIN):
+        with interruptible("start the command again"):
             main()
     except Interruption as interruption:
         line = str(interruption)
         first = not getattr(rank_zero_only, "rank", 0)
-        if interruption.number == signal.SIGTERM and slurm.job_id() is not None and first:
-            line = f"{line}; {slurm.requeue()}"
+        if interruption.number == signal.SIGTERM and remote.job_id() is not None and first:
+            line = f"{line}; {remote.requeue()}"
         _exit(line, interruption.exit_code)
     except (HydraException, OmegaConfBaseException) as error:  # one of Hydra's is an OSError, too
         config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"

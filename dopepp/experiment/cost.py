@@ -30,10 +30,10 @@ from dopepp.data.sample import Sample
 from dopepp.data.transforms.resize import pad_sample, resize_sample
 from dopepp.drawing.curves import figure_image
 from dopepp.drawing.panels import PlotLine, lines_figure
-from dopepp.experiment.build.sources import build_parts, build_test_source
+from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.reports.tables import Row, csv_text
+from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.geometry.camera import Letterbox
@@ -67,24 +67,18 @@ _BATCHES: Final = 3
 
 @dataclass(frozen=True)
 class NetworkCost:
-    """What a network costs on this machine.
+    """What a network costs on this machine; sizes are (width, height), pixels.
 
     Attributes:
-        name: The model's name.
         backbone_weights: Weights of the backbone's convolutions, as the paper counts: no biases.
-        parameters: All trained numbers.
         gmacs: Multiply-accumulates of one image of the input size, 10⁹.
-        input_size: The network's input (width, height), pixels.
-        picture_size: The timed pictures' (width, height), pixels; they are scaled into the input
-            and padded no further than the network needs.
-        device: What it ran on.
+        picture_size: The timed pictures'; they are scaled into the input and padded no further than
+            the network needs.
         threads: CPU threads.
-        ms_per_frame: Median time from one picture to its poses, milliseconds.
-        network_ms: Median time of the network in them, milliseconds.
-        recovery_ms: Median time from maps to poses in them, milliseconds.
-        batch_size: Images in a batch.
+        ms_per_frame: Median time from one picture to its poses, milliseconds; in it
+            ``network_ms`` and, from maps to poses, ``recovery_ms``.
         frames_per_s: Images of the input size that the network alone turns into maps in a second
-            in such batches, the fastest of a few.
+            in batches of ``batch_size``, the fastest of a few.
     """
 
     name: str
@@ -159,7 +153,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
-    source = build_test_source(config.data, parts)
+    source = held_out_source(config.data, parts, "test")
     # Read or rendered now, so that no frame's time has that in it.
     samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
     estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
@@ -184,7 +178,14 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     record.write_config(run_dir, config.plain)
     record.write_json(run_dir / COST_FILE, asdict(cost))
     record.write_json(run_dir / record.VERSIONS_FILE, record.environment(config.seed, ""))
-    write_whole(run_dir / FRAMES_FILE, csv_text(_frame_rows(frames)).encode())
+    rows = [
+        {
+            "frame": number,
+            **{name: f"{values[number]:.6f}" for name, values in vars(frames).items()},
+        }
+        for number in range(len(frames.seconds))
+    ]
+    write_whole(run_dir / FRAMES_FILE, csv_text(rows).encode())
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
     write_job_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
@@ -261,14 +262,6 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
         lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
-
-
-def _frame_rows(frames: FrameTimes) -> list[Row]:
-    columns = vars(frames).items()
-    return [
-        {"frame": str(number), **{name: f"{values[number]:.6f}" for name, values in columns}}
-        for number in range(len(frames.seconds))
-    ]
 
 
 @torch.inference_mode()

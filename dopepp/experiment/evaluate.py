@@ -14,13 +14,12 @@ from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
+from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, held_out_source
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports import conditions, evaluators
-from dopepp.experiment.reports.breakdown import record_breakdown
 from dopepp.experiment.reports.compare import compare_reports
-from dopepp.experiment.reports.protocols import Protocols
+from dopepp.experiment.reports.protocols import Protocols, record_breakdown
 from dopepp.experiment.reports.report import Report, measure
 from dopepp.experiment.reports.tables import reported_rates
 from dopepp.experiment.runs import display, record
@@ -54,7 +53,7 @@ def measure_and_record(
     Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
     """
     protocols = protocols or Protocols()
-    source = build_test_source(data, parts)
+    source = held_out_source(data, parts, "test")
     numbers = evaluators.object_numbers(data, parts)
     files = {
         name: evaluators.FileMethod(path, parts, numbers) for name, path in (results or {}).items()
@@ -191,7 +190,10 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         _tune_only(asked, loaded, parts, data, run_dir)
         return []
     file = None if asked.results is None else Path(asked.results)
-    names = _names(loaded, [] if file is None else [_method_name(asked.method, file)])
+    others = []
+    if file is not None:  # BOP's file names begin with the method's
+        others = [file.stem.partition("_")[0] if asked.method is None else str(asked.method)]
+    names = _names(loaded, others)
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         parts,
@@ -224,11 +226,6 @@ def _tune_only(
         raise UserError("tune=true", allowed, "tune one checkpoint at a time")
     tune_and_record(loaded[0], Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
     display.show_files(run_dir)
-
-
-def _method_name(given: object, results: Path) -> str:
-    """Return what made the results: as given, else what BOP's file names begin with."""
-    return str(given) if given is not None else results.stem.partition("_")[0]
 
 
 def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:

@@ -25,7 +25,7 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run import LearningRateConfig, RunConfig
 from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
@@ -68,7 +68,6 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     The chosen optimiser with its other settings; no schedule, no validation, no checkpoint. A
     :class:`UserError`: a choice is wrong; a ``RunError``: the loss is not finite from the start.
     """
-    first, last = config.lr_finder.min_lr, config.lr_finder.max_lr
     if config.resume is not None:
         raise UserError(
             f"resume={config.resume} with job=lr_finder", "init_from=…, or neither", "leave it"
@@ -82,11 +81,11 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     trainer = build_trainer(short, run_dir)
     record.write_config(run_dir, config.plain)
     record.write_environment(run_dir, config.seed, "")
-    rates, losses = _sweep(trainer, system, datamodule, first, last, config.lr_finder.num_steps)
+    rates, losses = _sweep(trainer, system, datamodule, config.lr_finder)
     if len(rates) < _MIN_STEPS:
         raise RunError(
-            f"the loss diverged after {len(rates)} steps at a learning rate of {first:g}; "
-            "set a smaller lr_finder.min_lr"
+            f"the loss diverged after {len(rates)} steps at a learning rate of "
+            f"{config.lr_finder.min_lr:g}; set a smaller lr_finder.min_lr"
         )
     found = _report(rates, losses, run_dir)
     write_job_readme(run_dir, f"Learning rate of {config.model.name}")
@@ -113,12 +112,7 @@ def _short_training(config: RunConfig) -> RunConfig:
 
 
 def _sweep(
-    trainer: Trainer,
-    system: PoseSystem,
-    datamodule: PoseDataModule,
-    first: float,
-    last: float,
-    num_steps: int,
+    trainer: Trainer, system: PoseSystem, datamodule: PoseDataModule, options: LearningRateConfig
 ) -> tuple[Steps, Steps]:
     """Return rate and loss of every step up to where the loss diverges or is not finite."""
     passes: list[float] = []
@@ -133,9 +127,9 @@ def _sweep(
         found = Tuner(trainer).lr_find(
             system,
             datamodule=datamodule,
-            min_lr=first,
-            max_lr=last,
-            num_training=num_steps,
+            min_lr=options.min_lr,
+            max_lr=options.max_lr,
+            num_training=options.num_steps,
             update_attr=False,
         )
     assert found is not None, "Lightning skips the sweep in its fast_dev_run alone"

@@ -22,9 +22,13 @@ from lightning.pytorch.utilities import rank_zero_only
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.experiment.build.hardware import estimate_training_s, keep_freed_memory
 from dopepp.experiment.build.sources import build_datamodule, build_parts
-from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.build.system import (
+    build_system,
+    build_trainer,
+    estimate_training_s,
+    keep_freed_memory,
+)
 from dopepp.experiment.config.run import RunConfig, TrainerConfig
 from dopepp.experiment.cost import measure_cost
 from dopepp.experiment.evaluate import measure_and_record, tune_and_record

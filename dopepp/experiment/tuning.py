@@ -106,8 +106,8 @@ def tune(
     A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
     """
     old = estimator.recovery
-    validation = sources.build_validation_source(data, parts)
-    test = sources.build_test_source(data, parts)
+    validation = sources.held_out_source(data, parts, "val")
+    test = sources.held_out_source(data, parts, "test")
     empty = sources.build_source_without_objects(data, parts, "val", target.num_empty)
     empty_test = sources.build_source_without_objects(data, parts, "test", target.num_empty)
 

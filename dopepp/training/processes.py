@@ -54,7 +54,9 @@ class Watch(threading.Thread):
             death = self.death()
             if death is not None:
                 time.sleep(_GRACE_S)
-                _end_now(death)
+                sys.stderr.write(f"{death}: the run ends\n")
+                sys.stderr.flush()
+                os._exit(1)  # the main thread hangs in a collective, where no exception reaches it
 
     def stop(self) -> None:
         """Stop looking: from now on a process may end."""
@@ -74,12 +76,6 @@ class Watch(threading.Thread):
             if time.monotonic() >= deadline:
                 return None
             time.sleep(0.1)
-
-
-def _end_now(reason: str) -> None:
-    sys.stderr.write(f"{reason}: the run ends\n")
-    sys.stderr.flush()
-    os._exit(1)  # the main thread hangs in a collective, where no exception reaches it
 
 
 class WatchedLauncher(_SubprocessScriptLauncher):

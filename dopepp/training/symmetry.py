@@ -45,9 +45,6 @@ class SymmetryOptions:
     border_deg: float = 30.0
 
     def __post_init__(self) -> None:
-        """Check what a user may have written."""
-        if not isinstance(self.canonical, bool):
-            raise UserError(f"symmetry.canonical={self.canonical}", "true, false", "choose one")
         check_number("symmetry.border_deg", self.border_deg, 0.0, 360.0)
         if self.border_deg > 0 and not self.canonical:
             raise UserError(
@@ -73,25 +70,17 @@ class SymmetryHandling:
 
     def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
         self.options, self.num_objects = options, len(parts)
-        self.active = options.canonical and any(_is_symmetric(part) for part in parts)
-        groups = [_Group.of(part) for part in parts]
-        longest = max(len(group.transforms) for group in groups)
-        padding = [longest - len(group.transforms) for group in groups]
-        identity = np.eye(4)[None]
-        tables = {
-            "transforms": [
-                np.concatenate([group.transforms, *[identity] * missing])
-                for group, missing in zip(groups, padding, strict=True)
-            ],
-            "there": [np.arange(longest) < len(group.transforms) for group in groups],
-            "axes": [group.axis for group in groups],
-            "offsets": [group.offset for group in groups],
-            "references": [group.reference for group in groups],
-            "fixed": [group.fixed for group in groups],
-            "cuboids": [part.cuboid for part in parts],
-            "symmetric": [np.array(_is_symmetric(part)) for part in parts],
+        rows = [_row(part) for part in parts]
+        longest = max(len(row["transforms"]) for row in rows)
+        for row in rows:
+            count = len(row["transforms"])
+            padding = [np.eye(4)[None]] * (longest - count)
+            row["there"] = np.arange(longest) < count
+            row["transforms"] = np.concatenate([row["transforms"], *padding])
+        self.active = options.canonical and any(row["symmetric"] for row in rows)
+        self._tables = {
+            name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]
         }
-        self._tables = {name: torch.from_numpy(np.stack(rows)) for name, rows in tables.items()}
 
     def equivalents(self, batch: Batch) -> Equivalents:
         """Return the poses of a batch's instances that look alike.
@@ -145,37 +134,30 @@ class SymmetryHandling:
         return self._tables
 
 
-@dataclass(frozen=True)
-class _Group:
-    """A part's symmetries with the reference that its poses are compared with."""
-
-    transforms: Float[np.ndarray, "discrete 4 4"]
-    axis: Float[np.ndarray, "3"]
-    offset: Float[np.ndarray, "3"]
-    reference: Float[np.ndarray, "3 3"]
-    fixed: Float[np.ndarray, "3"]
-
-    @classmethod
-    def of(cls, part: Part) -> _Group:
-        discrete = part.symmetries_discrete
-        transforms = np.eye(4)[None]
-        if discrete is not None and len(discrete):
-            transforms = np.concatenate([transforms, discrete])
-        axis, offset, reference = np.zeros(3), np.zeros(3), FACING
-        orbit = transforms[:, :3, :3] @ part.cuboid[CENTROID] + transforms[:, :3, 3]
-        fixed = orbit.mean(axis=0)  # every symmetry only reorders the orbit
-        if part.symmetries_continuous:
-            # A ball has more axes than this one; its maps are round whatever is chosen.
-            axis, offset = map(np.array, part.symmetries_continuous[0])
-            axis = axis / np.linalg.norm(axis)
-            reference = _between(FACING @ axis, UP) @ FACING
-            fixed = offset + axis * (axis @ (fixed - offset))
-        return cls(transforms, axis, offset, reference, fixed)
-
-
-def _is_symmetric(part: Part) -> bool:
+def _row(part: Part) -> dict[str, np.ndarray]:
+    """Return a part's symmetries with the reference that its poses are compared with."""
     discrete = part.symmetries_discrete
-    return bool(part.symmetries_continuous) or (discrete is not None and len(discrete) > 0)
+    transforms = np.eye(4)[None]
+    if discrete is not None and len(discrete):
+        transforms = np.concatenate([transforms, discrete])
+    axis, offset, reference = np.zeros(3), np.zeros(3), FACING
+    orbit = transforms[:, :3, :3] @ part.cuboid[CENTROID] + transforms[:, :3, 3]
+    fixed = orbit.mean(axis=0)  # every symmetry only reorders the orbit
+    if part.symmetries_continuous:
+        # A ball has more axes than this one; its maps are round whatever is chosen.
+        axis, offset = map(np.array, part.symmetries_continuous[0])
+        axis = axis / np.linalg.norm(axis)
+        reference = _between(FACING @ axis, UP) @ FACING
+        fixed = offset + axis * (axis @ (fixed - offset))
+    return {
+        "transforms": transforms,
+        "axes": axis,
+        "offsets": offset,
+        "references": reference,
+        "fixed": fixed,
+        "cuboids": part.cuboid,
+        "symmetric": np.array(bool(part.symmetries_continuous) or len(transforms) > 1),
+    }
 
 
 def _between(

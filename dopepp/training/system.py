@@ -57,17 +57,13 @@ class PoseSystem(LightningModule):
     """Trains a network on maps and recovers poses from them.
 
     Args:
-        network: Images to maps.
-        loss: Compares every stage with the targets.
         parts: The objects, in the order of the network's channels.
         geometry: Of the target maps.
         recovery: Thresholds of the way from maps to poses.
-        make_optimizer: Parameters to optimiser.
         make_scheduler: Optimiser and number of steps to a schedule stepped once a batch; None for
             a constant learning rate.
         payload: The self-description stored in every checkpoint under ``dopepp``.
         compile_network: Whether to run the network through ``torch.compile``.
-        symmetry: How symmetric parts are learnt.
     """
 
     def __init__(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any
 
 from hydra.core.utils import JobReturn
@@ -13,13 +12,10 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class _RemoteLauncher(Launcher):
-    """Hands jobs to :func:`dopepp.experiment.launch.jobs.launch`.
+    """Hands jobs to :mod:`dopepp.experiment.launch.jobs`, whose ``function`` gives the runner."""
 
-    The function of the module, one of ``dopepp.experiment.launch``, returns the runner.
-    """
-
-    def __init__(self, module: str, function: str, *options: object) -> None:
-        self.module, self.function, self.options = module, function, options
+    def __init__(self, function: str, *options: object) -> None:
+        self.function, self.options = function, options
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -31,26 +27,25 @@ class _RemoteLauncher(Launcher):
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         """Run the jobs, numbered from ``initial_job_idx``, and wait for all."""
-        from dopepp.experiment.launch.jobs import Jobs, launch
+        from dopepp.experiment.launch import jobs
 
-        jobs = Jobs.of(self.hydra_context, self.config, self.task_function)
-        module = import_module(f"dopepp.experiment.launch.{self.module}")
-        runner = getattr(module, self.function)(*self.options)
-        return launch(jobs, job_overrides, initial_job_idx, runner)
+        common = jobs.Jobs.of(self.hydra_context, self.config, self.task_function)
+        runner = getattr(jobs, self.function)(*self.options)
+        return jobs.launch(common, job_overrides, initial_job_idx, runner)
 
 
 class JoblibLauncher(_RemoteLauncher):
     """Jobs in several processes of this machine."""
 
     def __init__(self, n_jobs: int) -> None:
-        super().__init__("jobs", "on_joblib", n_jobs)
+        super().__init__("on_joblib", n_jobs)
 
 
 class RayLauncher(_RemoteLauncher):
     """Jobs as tasks of a Ray cluster."""
 
     def __init__(self, address: str | None, num_cpus: float, num_gpus: float) -> None:
-        super().__init__("jobs", "on_ray", address, num_cpus, num_gpus)
+        super().__init__("on_ray", address, num_cpus, num_gpus)
 
 
 class SlurmLauncher(_RemoteLauncher):
@@ -59,4 +54,4 @@ class SlurmLauncher(_RemoteLauncher):
     def __init__(self, folder: str, cluster: str, max_num_timeout: int, **sbatch: Any) -> None:
         is_config, plain = OmegaConf.is_config, OmegaConf.to_container
         given = {key: plain(one) if is_config(one) else one for key, one in sbatch.items()}
-        super().__init__("slurm", "on_slurm", folder, cluster, max_num_timeout, given)
+        super().__init__("on_slurm", folder, cluster, max_num_timeout, given)

@@ -11,17 +11,16 @@ from omegaconf import DictConfig
 
 
 class OptunaSweeper(Sweeper):
-    """Hands a search to :func:`dopepp.experiment.search.loop.search`.
+    """Hands a search to :func:`dopepp.experiment.search.search`.
 
-    Args:
-        params: What an experiment wants to sweep over; a search takes nothing but ``search.space``.
+    ``params`` are what an experiment wants to sweep over; a search takes its ``space`` alone.
     """
+
+    config: DictConfig
+    launcher: Launcher
 
     def __init__(self, params: DictConfig | None = None) -> None:
         self.params = params
-        self.config: DictConfig | None = None
-        self.launcher: Launcher | None = None
-        self.hydra_context: HydraContext | None = None
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -29,7 +28,7 @@ class OptunaSweeper(Sweeper):
         """Take what Hydra hands to every sweeper, and prepare the chosen launcher."""
         from hydra.core.plugins import Plugins
 
-        self.hydra_context, self.config = hydra_context, config
+        self.loader, self.config = hydra_context.config_loader, config
         self.launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config
         )
@@ -39,10 +38,6 @@ class OptunaSweeper(Sweeper):
         from dopepp.core.errors import require
 
         require("optuna", "search=optuna", "search")
-        from dopepp.experiment.search.loop import search
+        from dopepp.experiment.search import search
 
-        assert self.config is not None
-        assert self.launcher is not None
-        assert self.hydra_context is not None
-        loader = self.hydra_context.config_loader
-        return search(self.config, loader, self.launcher, arguments, list(self.params or ()))
+        return search(self.config, self.loader, self.launcher, arguments, list(self.params or ()))

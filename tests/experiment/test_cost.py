@@ -9,7 +9,7 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.build.sources import build_parts, build_test_source
+from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.cost import (
@@ -70,7 +70,11 @@ def estimator_of(config: RunConfig) -> tuple[RehearsedEstimator, MapGeometry, De
     parts = build_parts(config.data)
     network, description = build_untrained(config, parts)
     geometry = map_geometry(config.maps, network.stride)
-    return RehearsedEstimator(network, description), geometry, build_test_source(config.data, parts)
+    return (
+        RehearsedEstimator(network, description),
+        geometry,
+        held_out_source(config.data, parts, "test"),
+    )
 
 
 def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):

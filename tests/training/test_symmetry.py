@@ -191,7 +191,6 @@ def test_instances_on_one_image_choose_each_for_itself(plate_system):
     ("options", "message"),
     [
         ({"border_deg": -1.0}, "symmetry.border_deg"),
-        ({"canonical": "yes"}, "symmetry.canonical=yes"),
         ({"canonical": False}, "border_deg=30.0 with symmetry.canonical=false"),
     ],
 )

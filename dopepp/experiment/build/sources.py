@@ -1,31 +1,46 @@
-"""From the ``data`` config to the objects to learn, and to the DataModule: what a split shows."""
+"""From the ``data`` config to the objects to learn, and to the DataModule: what a split shows.
+
+A split's images are labelled ones in a format of the field, or renders. To add a format, write a
+source and an entry in :data:`FORMATS`.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import cache_folder
 from dopepp.core.futures import available_cores
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.ycb_video.frame import read_classes, read_image_set
+from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
+from dopepp.data.sources.cache import CachedSource
 from dopepp.data.sources.hybrid import HybridSource
-from dopepp.data.sources.rendered import Split
-from dopepp.experiment.build import splits
+from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data import Cache, DataConfig
+from dopepp.geometry.camera import Letterbox
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Part, Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
+from dopepp.virtual.factory import Factory, code_hash
+from dopepp.virtual.presets.preset import Preset, customised_preset
 
 _log = logging.getLogger(__name__)
+
+_TRAINING_SHARE: Final = 0.8
+"""Of the images of a folder that training shares with validation or test."""
 
 PAPER_OBJECTS: Final = (
     "003_cracker_box",
@@ -81,8 +96,8 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
     backgrounds = find_backgrounds(data.virtual.backgrounds)
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
-        val=build_validation_source(data, parts),
-        test=build_test_source(data, parts),
+        val=held_out_source(data, parts, "val"),
+        test=held_out_source(data, parts, "test"),
         object_names=[part.name for part in parts],
         input_size=data.input_size,
         batch_size=data.batch_size,
@@ -94,14 +109,14 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
     )
 
 
-def build_test_source(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Build the test images alone, at their native resolution."""
-    return _held_out_source(data, parts, "test")
+def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
+    """Build the validation or the test images alone, at their native resolution.
 
-
-def build_validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
-    """Build the validation images alone, at their native resolution."""
-    return _held_out_source(data, parts, "val")
+    They are labelled ones where there is a root, else a range of renders that no other uses.
+    """
+    if data.is_rendered(split):
+        return held_out_renders(data, parts, split)
+    return labelled_images(data, parts, data.eval_seed, split)
 
 
 def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
@@ -112,20 +127,17 @@ def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> De
             "renders, whose camera can be moved",
             "leave out scale, or test on renders of these objects with data.test.renderer=raster",
         )
-    return splits.held_out_renders(data, parts, "test", scale)
+    return held_out_renders(data, parts, "test", scale)
 
 
 def build_source_without_objects(
     data: DataConfig, parts: Parts, split: Split, num_images: int
 ) -> DescribedSource:
-    """Render what the network must be silent on: backgrounds, distractors and look-alike parts.
-
-    They are the scenes of the validation or the test range, without the objects.
-    """
+    """Render a held-out range without the objects: what the network must be silent on."""
     scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
     virtual = replace(data.virtual, scene=scene)
     empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
-    return splits.held_out_renders(empty, parts, split)
+    return held_out_renders(empty, parts, split)
 
 
 def _train_source(
@@ -134,9 +146,7 @@ def _train_source(
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
-        real = splits.kept(
-            splits.labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size
-        )
+        real = kept(labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size)
     elif data.real_fraction > 0:
         if data.real_fraction == 1:
             raise UserError(
@@ -150,8 +160,8 @@ def _train_source(
             ", ".join(part.name for part in parts),
         )
     if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
-        synthetic = splits.synthetic_companions(data, parts, seed, backgrounds)
-    virtual = None if data.real_fraction == 1 else splits.training_renders(data, parts, seed)
+        synthetic = synthetic_companions(data, parts, seed, backgrounds)
+    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed)
     return HybridSource(
         real,
         virtual,
@@ -164,8 +174,117 @@ def _train_source(
     )
 
 
-def _held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
-    """Open labelled images where there is a root, else a range of renders that no other uses."""
-    if data.is_rendered(split):
-        return splits.held_out_renders(data, parts, split)
-    return splits.labelled_images(data, parts, data.eval_seed, split)
+def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
+    """Open a split's labelled images; a :class:`UserError` if ``data.root`` does not hold them."""
+    assert data.root is not None
+    if data.format not in FORMATS:
+        formats = ", ".join(FORMATS)
+        raise UserError(f"data.format={data.format}", formats, "choose the images' format")
+    return FORMATS[data.format](data, data.root, parts, seed, split)
+
+
+def synthetic_companions(
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
+) -> DescribedSource | None:
+    """Open YCB-Video's own synthetic frames where its training list names any."""
+    if data.root is None or data.format != "ycb_video":
+        return None
+    image_set = data.image_sets["train"]
+    if not read_image_set(data.root, image_set, "synthetic"):
+        return None
+    return YcbVideoSource(
+        data.root, parts, image_set, "synthetic",
+        backgrounds=backgrounds, seed=seed, read_depth=False,
+    )  # fmt: skip
+
+
+def share_of(image_sets: Mapping[str, str], split: Split) -> tuple[float, float]:
+    """Return the range of its folder's images that a split takes, as fractions.
+
+    A folder that several splits name is divided in order (training, validation, test): 80 % to
+    training if it is among them, the rest equally.
+    """
+    sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
+    first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
+    borders = [0.0, first]
+    for number in range(1, len(sharing)):
+        borders.append(first + (1 - first) * number / (len(sharing) - 1))
+    place = sharing.index(split)
+    return borders[place], borders[place + 1]
+
+
+Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
+"""From data, root, parts, seed and split to the split's images."""
+
+FORMATS: Final[dict[str, Opener]] = {
+    # An image set of real frames, or the listed frames, the same for every split.
+    "ycb_video": lambda data, root, parts, seed, split: YcbVideoSource(
+        root, parts, data.image_sets[split] if data.frames is None else None,
+        frames=data.frames, seed=seed, read_depth=split == "test",
+    ),
+    "bop": lambda data, root, parts, seed, split: BopSource(
+        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        targets=data.targets if split == "test" else None, read_depth=split == "test",
+    ),
+    "ndds": lambda data, root, parts, seed, split: NddsSource(
+        root / data.image_sets[split], parts, part_of=share_of(data.image_sets, split),
+        classes=data.classes, read_depth=split == "test",
+    ),
+    "webdataset": lambda data, root, parts, seed, split: WebdatasetSource(
+        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        download_dir=data.download_dir, read_depth=split == "test",
+    ),
+}  # fmt: skip
+"""How the images of each format are opened."""
+
+
+def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
+    """Render at the size the network sees, which costs a fraction of the native one."""
+    preset = choose_preset(data)
+    box = Letterbox.fit((preset.width, preset.height), data.input_size)
+    small = preset.resized(box.width, box.height)
+    factory = _factory(data, parts, small, seed, data.virtual.renderer)
+    source = RenderedSource(factory, data.samples_per_epoch)
+    return kept(source, data, data.cache, data.input_size)
+
+
+def held_out_renders(
+    data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
+) -> DescribedSource:
+    """Render a range that no other split uses, at its native size, with parts of any scale."""
+    renderer, count = data.virtual.renderer, data.num_val
+    cache: Cache = "none"
+    if split == "test":
+        renderer, count, cache = data.test.renderer or renderer, data.num_test, data.test.cache
+    factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
+    name = "virtual" if renderer == "raster" else renderer
+    return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
+
+
+def kept(
+    source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
+) -> DescribedSource:
+    """Put the chosen cache around a source; a :class:`UserError` where there is no room."""
+    if cache == "none":
+        return source
+    folder = None
+    if cache == "disk":
+        folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
+    return CachedSource(source, input_size, folder, identity=code_hash())
+
+
+def choose_preset(data: DataConfig) -> Preset:
+    """Return the preset with the config's changes."""
+    name = data.virtual.preset or ("paper" if data.root is None else "ycb")
+    return customised_preset(name, data.virtual.scene or {})
+
+
+def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:
+    return Factory(
+        parts,
+        preset,
+        seed,
+        find_backgrounds(data.virtual.backgrounds),
+        renderer=renderer,
+        negatives=[load_part(name, data.unit) for name in data.virtual.negatives],
+    )

@@ -67,7 +67,7 @@ class DataConfig:
 
     Attributes:
         name: Of the choice, for folders and tables.
-        format: Of the labelled images: a key of :data:`~dopepp.experiment.build.splits.FORMATS`.
+        format: Of the labelled images: a key of :data:`~dopepp.experiment.build.sources.FORMATS`.
         root: Folder of labelled images; None renders all images.
         objects: Objects of the root to learn; None takes the paper's five of YCB-Video, else all.
         parts: Built-in names or mesh files, without a root and for NDDS.

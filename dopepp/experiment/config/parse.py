@@ -9,21 +9,12 @@ field is refused.
 from __future__ import annotations
 
 import math
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
-from typing import (
-    Annotated,
-    Any,
-    Final,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Final, Literal, TypeVar, Union
 
 from dopepp.core.checks import check_flag, check_integer, check_number
 from dopepp.core.errors import UserError
@@ -70,14 +61,14 @@ def parse(kind: type[T], given: object, name: str = "", **known: Any) -> T:
     for key, one in own.items():
         if key not in given and one.default is MISSING and one.default_factory is MISSING:
             raise UserError(f"no {prefix}{key}", f"{prefix}{key}=…", "add it")
-    hints = get_type_hints(kind, include_extras=True)
+    hints = typing.get_type_hints(kind, include_extras=True)
     values = {key: _value(hints[key], value, f"{prefix}{key}") for key, value in given.items()}
     return kind(**values, **known)
 
 
 def _value(hint: Any, value: Any, name: str) -> Any:
     """Return a field's value as its type says."""
-    origin, arguments = get_origin(hint), get_args(hint)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         bounds = arguments[1]
         check = check_integer if arguments[0] is int else check_number

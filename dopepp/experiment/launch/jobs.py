@@ -1,4 +1,4 @@
-"""What all launchers share: a job in another process, and what is left of one that was lost.
+"""Jobs in other processes: of this machine, of a Ray cluster, or of SLURM as one job array.
 
 To add a launcher, write a :data:`Runner`, a class in ``hydra_plugins.dopepp_plugins.launchers`` and
 a file in ``conf/hydra/launcher``.
@@ -19,13 +19,17 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
 from dopepp.core.checks import check_integer
-from dopepp.core.errors import require
+from dopepp.core.errors import UserError, require
 from dopepp.core.futures import THREAD_LIMITS, available_cores, completed, connect, spread
 from dopepp.experiment.runs import display, record
 
 _MOST: Final = 1024
 _IDLE_S: Final = 300
 """How long a process waits for its next job."""
+
+_ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
+                    "mem_gb", "name")  # fmt: skip
+"""What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
 
 
 @dataclass(frozen=True)
@@ -164,3 +168,56 @@ def _result(future: Future[JobReturn], lost: type[Exception]) -> JobReturn | Exc
         return future.result()
     except lost as error:
         return error
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A job that submitit can queue again."""
+
+    jobs: Jobs
+
+    def __call__(self, number: int, overrides: list[str]) -> JobReturn:
+        return self.jobs.run(number, overrides)
+
+    def checkpoint(self, number: int, overrides: list[str]) -> Any:
+        """Near the time limit: the same job once more, which goes on in its folder."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, number, overrides)
+
+
+def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
+    """Return a runner that submits an array and waits for it.
+
+    SLURM's own logs go to the folder. The cluster is ``slurm``, or submitit's ``local``: processes
+    of this machine. A job that reaches its time limit is queued again ``max_num_timeout`` times.
+    Of ``sbatch``, options by submitit's names, None leaves one to the cluster. A
+    :class:`UserError`: submitit is not installed.
+    """
+    require("submitit", "hydra/launcher=submitit_slurm", "slurm")
+    given = {key: value for key, value in sbatch.items() if value is not None}
+    named = {key if key in _ANYWHERE else f"slurm_{key}": value for key, value in given.items()}
+
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        import submitit
+
+        try:
+            slurm = {"cluster": cluster, "slurm_max_num_timeout": max_num_timeout}
+            executor = submitit.AutoExecutor(folder, **slurm)
+            executor.update_parameters(**named)
+            handles = executor.map_array(_Task(jobs), *zip(*overrides.items(), strict=True))
+        except (RuntimeError, ValueError, NameError, TypeError, OSError) as error:
+            raise UserError(
+                f"hydra/launcher=submitit_slurm, which this machine or SLURM refuses: {error}",
+                "a machine with srun and sbatch, and options of sbatch that the cluster takes",
+                "correct hydra.launcher.…, or try it here with hydra.launcher.cluster=local",
+            ) from error
+        numbers = dict(zip((handle.job_id for handle in handles), overrides, strict=True))
+        for handle in submitit.helpers.as_completed(handles):
+            try:
+                yield numbers[handle.job_id], handle.result()
+            except (submitit.core.utils.UncompletedJobError,
+                    submitit.core.utils.FailedJobError) as error:  # fmt: skip
+                yield numbers[handle.job_id], error
+
+    return run

@@ -1,11 +1,14 @@
 """Comparing methods: ``compare.csv``, ``compare.md`` and ``compare_auc.{png,csv}``.
 
-Of run folders, ``compare.png`` has curves of training and test pictures as well.
+Of run folders, ``compare.png`` also has what they logged while they trained (paper Fig. 12), and
+the same test images through every model (paper Fig. 14).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -14,17 +17,21 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
+from dopepp.data.sample import Sample
 from dopepp.drawing.curves import accuracy_figure, figure_image, save_accuracy_curves
-from dopepp.drawing.panels import grid, lines_figure
+from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
+from dopepp.drawing.panels import PlotLine, grid, lines_figure, message_picture
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import contact_sheet
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.experiment.build.sources import build_parts, held_out_source
+from dopepp.experiment.config.data import chosen_data, trained_on
 from dopepp.experiment.reports.differences import figures, full, headline, notes
 from dopepp.experiment.reports.entries import BASELINE, Entry, Run, find_runs, group, ordered
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
-from dopepp.experiment.reports.pictures import NUM_PICTURES, picture_tiles, training_lines
 from dopepp.experiment.reports.report import Report
-from dopepp.experiment.reports.tables import Row, csv_text, markdown_text
+from dopepp.experiment.reports.tables import Row, csv_text, markdown_text, read_csv
 from dopepp.experiment.runs import display
+from dopepp.inference.estimator import PoseEstimator
 
 TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"
@@ -32,6 +39,10 @@ CURVES_FILE: Final = "compare_auc.png"
 PANELS_FILE: Final = "compare.png"
 LOSS_FILE: Final = "compare_loss.png"
 PICTURES_FILE: Final = "compare_pictures.png"
+LOG_FILE: Final = "metrics.csv"
+
+NUM_PICTURES: Final = 3
+"""Test images, the first ones: nobody has chosen them."""
 
 _MIN_COLUMNS: Final = 3
 """Tiles of fewer methods than this would be larger than anybody needs."""
@@ -177,3 +188,131 @@ def _panels(entries: Sequence[Entry], folder: Path) -> list[Picture]:
         figure = accuracy_figure(curves, title="ADD on test images", colours=colours)
         panels.append(figure_image(figure))
     return panels
+
+
+def training_lines(
+    entries: Sequence[Entry], column: str, colours: Mapping[str, str], scale: float = 1.0
+) -> list[PlotLine]:
+    """Return a line per method for a column of ``metrics.csv``, such as ``train/loss``.
+
+    Runs that did not finish have one, too; several seeds are drawn at the steps that all of them
+    have logged. Colours go by method; ``scale`` is a factor of the values.
+    """
+    lines = []
+    for entry in entries:
+        series = [one for run in entry.runs if (one := logged(run.folder / LOG_FILE, column))]
+        steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
+        if steps:
+            values = scale * np.array([[one[step] for step in steps] for one in series])
+            lines.append(PlotLine(entry.name, np.array(steps, float), values, colours[entry.name]))
+    return lines
+
+
+def logged(path: Path, column: str) -> dict[int, float]:
+    """Return what a log holds in a column, by step; empty where there is no such file or column."""
+    cells = ((_number(row.get("step")), _number(row.get(column))) for row in read_csv(path))
+    return {int(step): value for step, value in cells if step is not None and value is not None}
+
+
+def _number(text: object) -> float | None:
+    """Return a finite number, None for anything else that a log may hold."""
+    try:
+        number = float(str(text))
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+@dataclass
+class _Model:
+    """A method's network, of its first run; or why there is none."""
+
+    name: str
+    run: Run | None = None
+    estimator: PoseEstimator | None = None
+    reason: str = ""
+
+
+def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
+    """Predict on the first test images of the first method whose images can be opened.
+
+    Of several seeds the first run is shown, of several networks, one a part, one after the other.
+    Returns row by row the tiles of an image, one per method; and why some are missing.
+    """
+    measured = [run for entry in entries for run in entry.runs if run.report]
+    kinds = list(dict.fromkeys(map(_parts, measured)))
+    tiles, notes = [], []
+    for number, parts in enumerate(kinds or [()]):
+        share = num // max(1, len(kinds)) + (number < num % max(1, len(kinds)))
+        rows, note = _rows([_load(entry, parts) for entry in entries], share)
+        tiles += rows
+        notes += [note] if note else []
+    return tiles, " ".join(notes)
+
+
+def _parts(run: Run) -> tuple[str, ...]:
+    """Return the names of the parts that a run was measured on."""
+    return tuple(sorted(run.report.errors)) if run.report is not None else ()
+
+
+def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
+    """Return the tiles of some images, one per method; and why there are none."""
+    samples, reasons = [], []
+    for model in models:
+        if model.run is None or model.estimator is None:
+            continue
+        try:
+            samples = _test_images(model.run, model.estimator, num)
+            break
+        except UserError as error:
+            reasons.append(f"{model.name}: {error}")
+    if not samples:
+        why = "; ".join(reasons or [f"{one.name}: {one.reason}" for one in models])
+        return [], f"No pictures of the same test images. {why}" if num else ""
+    first = next(model for model in models if model.estimator is not None)
+    return [_tile(model, sample, BLUE if model is first and len(models) > 1 else YELLOW)
+            for sample in samples for model in models], ""  # fmt: skip
+
+
+def _load(entry: Entry, parts: tuple[str, ...]) -> _Model:
+    """Load a method's checkpoint of some parts, or say why that cannot be."""
+    if not entry.runs:
+        return _Model(entry.name, reason="there is no checkpoint of it")
+    run = next((one for one in entry.runs if _parts(one) == parts), entry.runs[0])
+    if run.checkpoint is None or not run.checkpoint.is_file():
+        return _Model(entry.name, run, reason=entry.failure or f"no file {run.checkpoint}")
+    try:
+        estimator = PoseEstimator.load(run.checkpoint, refine=run.config.get("refine"))
+    except UserError as error:
+        return _Model(entry.name, run, reason=str(error))
+    return _Model(entry.name, run, estimator)
+
+
+def _test_images(run: Run, estimator: PoseEstimator, num: int) -> list[Sample]:
+    """Open the images that a run was measured on."""
+    stored = trained_on(estimator.checkpoint.data)
+    # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
+    given = run.config if "ckpt_path" in run.config else {}
+    data = chosen_data(given.get("data"), given.get("virtual"), stored, str(run.checkpoint))
+    if data.root is not None:
+        data = replace(data, objects=tuple(part.name for part in estimator.parts))
+    source = held_out_source(data, build_parts(data), "test")
+    return [source.sample(index, 0) for index in range(min(num, len(source)))]
+
+
+def _tile(model: _Model, sample: Sample, colour: tuple[int, int, int]) -> Tile:
+    """Draw one method's answer to one image."""
+    width, height = sample.size
+    factor = max(1, -(-MIN_WIDTH_PX // width))
+    if model.estimator is None:
+        return Tile(message_picture(width * factor, height * factor, model.reason), model.name)
+    try:
+        found = model.estimator.predict(sample.image, sample.K, depth=sample.depth)
+    except UserError as error:
+        return Tile(message_picture(width * factor, height * factor, str(error)), model.name)
+    known = {part.name for part in model.estimator.parts}
+    truths = [one for one in sample.instances if one.label in known]
+    wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in truths]
+    wireframes += [Wireframe(one.keypoints, colour, "predicted") for one in found]
+    missed = "" if found else ": finds nothing"
+    return Tile(overlay(sample.image, wireframes), f"{model.name}{missed} ({sample.key})")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
@@ -41,9 +41,6 @@ MAX_EXAMPLES: Final = 4
 _FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
 """Measures that stand beside the pass rates."""
 
-_SYMMETRIC: Final = ("median_rotation_s_deg",)
-"""Further ones, where a part has symmetries."""
-
 _MARGIN: Final = 0.3
 """Around shaded objects on the sheet, as a share of their extent."""
 
@@ -59,8 +56,7 @@ class Condition:
         name: The option's name; the files are called after it.
         axis: What is changed, with the unit in which levels are shown.
         level: Name of the CSV file's column of levels.
-        form: How a level is written in that unit, e.g. ``{:g} %``.
-        introduction: What stands above the tables, Markdown.
+        form: How a level is written in that unit.
         images: What the images of its levels are, of which a file has no poses.
         per_unit: By what a level is multiplied to have that unit.
         ratio: Whether levels are ratios, which a logarithmic axis spaces evenly.
@@ -148,7 +144,7 @@ def record_condition(
     Levels ascend; tiles are the examples, image by image, each at all levels.
     """
     rows = [row for rows in levels[0].rows.values() for row in rows.values()]
-    extra = _SYMMETRIC if any(row.num_symmetries > 1 for row in rows) else ()
+    extra = ["median_rotation_s_deg"] if any(row.num_symmetries > 1 for row in rows) else []
     fields = [*(rate.field for rate in rates), *_FIELDS, *extra]
     table = list(_figures(levels, fields, rates))
 
@@ -300,14 +296,12 @@ def _around_masks(sample: Sample) -> tuple[slice, slice]:
     """Return the image's rows and columns around all masks, with a margin."""
     masks = [one.mask for one in sample.instances if one.mask is not None]
     shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
-    rows, columns = (_widened(hit) for hit in np.nonzero(shown if shown.any() else ~shown))
-    return rows, columns
-
-
-def _widened(places: Int[np.ndarray, "n"]) -> slice:
-    first, end = int(places.min()), int(places.max()) + 1
-    margin = round(_MARGIN * (end - first))
-    return slice(max(0, first - margin), end + margin)
+    ranges = []
+    for places in np.nonzero(shown if shown.any() else ~shown):
+        first, end = int(places.min()), int(places.max()) + 1
+        margin = round(_MARGIN * (end - first))
+        ranges.append(slice(max(0, first - margin), end + margin))
+    return ranges[0], ranges[1]
 
 
 def measure_scales(

@@ -34,9 +34,6 @@ _TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
 """Options that say where something is, not what is measured."""
 
-_UNKNOWN_MODEL: Final = "run"
-"""What a run is called that left nothing but its folder."""
-
 _LONGEST_NAME: Final = 60
 """Characters of a name that tables and legends have room for."""
 
@@ -46,17 +43,13 @@ class Run:
     """A run folder.
 
     Attributes:
-        folder: The folder.
-        model: The model's name.
         overrides: What it was overridden with, without options that only name places.
         report: Its result, None where there is none.
         failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
-        seed: Of the training; None where unknown.
         config: The resolved config, empty where there is none.
-        checkpoint: Its best checkpoint, None where unknown.
         recipe: Everything but seed and parts that decides about the result, as one text; empty
             where unknown.
-        cost: What its network costs; None where unknown.
+        cost: What its network costs.
         pruned: Whether it has no result because a search stopped it.
     """
 
@@ -91,8 +84,7 @@ class Entry:
     """A method in a comparison.
 
     Attributes:
-        name: Its name.
-        reports: Its results on one test set, one per seed; empty where there is none.
+        reports: Its results on one test set, one per seed.
         seeds: The trainings' seeds, as many; None where unknown.
         failure: Why there is no result, in one line; empty where only the cost was asked for.
         pruned: Whether the reason is that a search stopped it, which is no failure.
@@ -126,10 +118,7 @@ class Entry:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Run]:
-    """Read run folders, evaluation folders and all jobs of multirun folders, each once.
-
-    A :class:`UserError`: a path is none of them.
-    """
+    """Read folders of runs, evaluations and multiruns, each once; a :class:`UserError` if none."""
     folders = {folder.resolve(): folder for path in paths for folder in _folders(path)}
     return [read_run(folder) for folder in folders.values()]
 
@@ -185,7 +174,7 @@ def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report |
     chosen = [text.partition("=")[2] for text in overrides if text.startswith("model=")]
     if chosen:
         return chosen[-1]
-    return _UNKNOWN_MODEL if report is None else report.name
+    return "run" if report is None else report.name
 
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:

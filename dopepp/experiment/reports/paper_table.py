@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
+from dopepp.experiment.config.parse import parse
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
 from dopepp.experiment.reports import tables
 from dopepp.experiment.reports.conditions import SHADING
@@ -45,7 +46,6 @@ _STRICT: Final = "add_01d"
 _NETWORK: Final = "network"
 """What stands for the object, where there is none."""
 _PAPER: Final = "the paper"
-_CONFIDENCE: Final = 0.95
 
 _PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (tables.ADD_5CM, tables.ADD_10CM)}
 _MEASURED: Final = ("poses", "shading")
@@ -58,7 +58,7 @@ class PaperTable:
     """How a sweep's table is laid out.
 
     Attributes:
-        title: Its title, with the paper's number.
+        title: With the paper's number.
         kind: A key of :data:`KINDS`.
         threshold: Of the paper's pass rate: 0.05 m for parts, 0.1 m for YCB-Video.
         labels: Override to what the paper calls it; a run that has several gets all of them.
@@ -74,18 +74,12 @@ class PaperTable:
     labels: Mapping[str, str] = field(default_factory=dict)
     paper: Printed = field(default_factory=dict)
     recomputed: Printed = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> PaperTable:
         """Read the config's ``table``; a :class:`UserError` if a field or a value is unknown."""
-        known = [entry.name for entry in fields(cls)]
-        unknown = sorted(set(config) - set(known))
-        if unknown:
-            raise UserError(f"table.{unknown[0]}", ", ".join(known), "correct the table's field")
-        if "title" not in config:
-            raise UserError("a table without a title", "table.title", "name the table")
-        table = cls(**config)
+        table = parse(cls, config, "table")
         if table.kind not in KINDS:
             raise UserError(f"table.kind={table.kind!r}", ", ".join(KINDS), "choose one of them")
         if table.threshold not in _PASS_FIELDS:
@@ -129,10 +123,7 @@ class PaperTable:
 
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
-    """Print and write ``table.md`` and ``table.csv``, and the figure of a kind that has one.
-
-    A method without a result is a row that says why.
-    """
+    """Print and write ``table.md`` and ``table.csv``, and the figure of a kind that has one."""
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
     methods = table.methods(entries)
     rows, doubts = KINDS[table.kind](table, methods, folder)
@@ -338,7 +329,7 @@ def _change(rates: Sequence[tables.Figure], baseline: Sequence[tables.Figure]) -
     text = f"{points.mean():+.1f}"
     if count < 2:
         return text
-    half = t.ppf((1 + _CONFIDENCE) / 2, count - 1) * points.std(ddof=1) / math.sqrt(count)
+    half = t.ppf(0.975, count - 1) * points.std(ddof=1) / math.sqrt(count)
     return f"{text} [{points.mean() - half:+.1f}, {points.mean() + half:+.1f}]"
 
 
@@ -381,8 +372,8 @@ def time_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
         if label not in methods
     ]
     if costs:
-        folders = {label: methods[label].runs[0].folder for label in costs}
-        frames = {label: read_frames(one / FRAMES_FILE) for label, one in folders.items()}
+        jobs = {label: methods[label].runs[0].folder / FRAMES_FILE for label in costs}
+        frames = {label: read_frames(path) for label, path in jobs.items()}
         save_frame_rates(folder / "frame_rate.png", frames)
     return rows + missing + others, []
 

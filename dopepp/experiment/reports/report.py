@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,19 +29,11 @@ FULL_SIZE_COST: Final = "full_size_cost"
 
 @dataclass
 class Report:
-    """One method's result on one test set.
+    """One method's result on one test set, whose fingerprint is empty where that is not known.
 
-    Attributes:
-        name: The method's name.
-        rows: A row per object, then the mean.
-        references: The reference rows, by reference and object.
-        errors: ADD of every instance, metres, infinite where missed, by object.
-        cost: The network's cost.
-        num_images: Size of the test set.
-        details: Further plain facts, e.g. the range of poses.
-        rotation_deg: Rotation error of every instance, degrees, infinite where missed, by object.
-        diameters: The objects' diameters, metres.
-        test_set: Fingerprint of the images it was measured on; empty where that is not known.
+    ``rows`` are of every object, then their mean, ``references`` the same by reference. By object,
+    ``errors`` are the ADD, metres, and ``rotation_deg`` the rotation error of every instance,
+    infinite where missed; ``diameters`` are metres. ``details`` are further plain facts.
     """
 
     name: str
@@ -90,7 +81,7 @@ class Report:
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Report:
         """Read ``metrics.json`` back; files of earlier versions lack the optional fields."""
-        return cls(
+        report = cls(
             name=record["name"],
             rows={name: PoseRow(**row) for name, row in record["objects"].items()},
             references={
@@ -100,18 +91,17 @@ class Report:
             errors=_unlisted(record["add"]),
             cost=Cost(**record["cost"]),
             num_images=record["num_images"],
-            details={key: value for key, value in record.items() if key not in _FIELDS},
             rotation_deg=_unlisted(record.get("rotation_deg", {})),
             diameters=dict(record.get("diameters", {})),
             test_set=record.get("test_set", ""),
         )
+        known = report.to_record()
+        report.details = {key: value for key, value in record.items() if key not in known}
+        return report
 
     @classmethod
     def joined(cls, reports: Sequence[Report]) -> Report:
-        """Return the results of several networks, one a part, as those of one method.
-
-        They differ in nothing but their parts; no part occurs twice.
-        """
+        """Return the results of networks that differ in nothing but their parts as one method's."""
         reports = sorted(reports, key=lambda report: list(report.rows))
         first = reports[0]
         known = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
@@ -135,13 +125,6 @@ def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
     """Put the rows of several tables into one and average them anew."""
     rows = {name: row for group in groups for name, row in group.items() if name != MEAN}
     return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
-
-
-_FIELDS: Final = (
-    "name", "num_images", "objects", "references", "add", "rotation_deg", "diameters", "test_set",
-    "cost",
-)  # fmt: skip
-"""Keys of ``metrics.json`` that are no details."""
 
 
 def _listed(errors: Mapping[str, Float[np.ndarray, "instances"]]) -> dict[str, list[float | None]]:
@@ -225,15 +208,17 @@ def measure(
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
     """Return what scores each method's poses on its parts."""
     # One process measures alone: after a distributed training the others have ended.
-    of = functools.partial(PoseMetrics, sync_on_compute=False)
-    return {name: of(method.parts, name) for name, method in methods.items()}
+    return {
+        name: PoseMetrics(method.parts, name, sync_on_compute=False)
+        for name, method in methods.items()
+    }
 
 
-def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats: int = 3) -> Cost:
+def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
     """Measure the untrained network of a spec at width 1: what narrowing has saved.
 
-    The input is (width, height), pixels (the paper's is 416×416). Of ``repeats`` timed forward
-    passes after one that is not, the median counts.
+    The input is (width, height), pixels (the paper's is 416×416). Of three timed forward passes
+    after one that is not, the median counts.
     """
     widened = {
         key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
@@ -243,7 +228,7 @@ def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int], repeats
     images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
     times = []
     with torch.inference_mode():
-        for _ in range(1 + repeats):
+        for _ in range(4):
             start = time.perf_counter()
             network.maps(images)
             times.append(1000 * (time.perf_counter() - start))

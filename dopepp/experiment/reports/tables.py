@@ -46,7 +46,6 @@ class Figure:
     """One line of the results table.
 
     Attributes:
-        method: What was measured.
         object: The part's name, ``mean``, or why there is no result.
         measure: A field of ``PoseRow``, with :data:`DELTA` before it for a difference to the
             baseline, or the heading of something else.
@@ -55,7 +54,6 @@ class Figure:
         seeds: Of the trainings that it is the mean of; None where unknown.
         num_instances: Instances that it is the rate of.
         deviation: Standard deviation over the seeds (of a sample); None of fewer than two.
-        difference: The difference that it is the value of, with its interval.
     """
 
     method: str

@@ -89,8 +89,8 @@ def show_tuning(tuning: Tuning, path: Path) -> None:
     shown, empty = tuning.num_images
     title = f"tuned; measured on {shown} test images and {empty} without objects"
     table = Table("", "before", "after", title=title)
-    for name in ("calibration_error", "false_positive_rate", "recall"):
-        before, after = getattr(tuning.before, name), getattr(tuning.after, name)
+    for name, before in vars(tuning.before).items():
+        after = getattr(tuning.after, name)
         table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
     console.print(table)
     for name, value in tuning.options.items():

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
-from dopepp.experiment.build.sources import build_test_source
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig, trained_on
 from dopepp.experiment.config.parse import flat
 from dopepp.geometry.camera import Letterbox
@@ -87,15 +87,19 @@ def describe_images(source: DescribedSource) -> dict[str, Any]:
 
 def differing_images(stored: Mapping[str, Any], present: Mapping[str, Any]) -> list[str]:
     """Say in which points two descriptions of images differ; nothing where they do not."""
-    old, new = (dict(flat(one["sources"])) for one in (stored, present))
+    old, new = dict(flat(stored["sources"])), dict(flat(present["sources"]))
     lines = [
         f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}"
         for key in {**old, **new}
         if old.get(key) != new.get(key)
     ]
-    if not _same_labels(stored["first_image"], present["first_image"]):
+    one, other = stored["first_image"], present["first_image"]
+    if one["labels"] != other["labels"] or not all(
+        np.allclose(one[name], other[name], rtol=_MAX_LABEL, atol=_MAX_LABEL)
+        for name in ("K", "T_cam_obj")
+    ):
         lines.append("labels of the first image")
-    if _picture_difference(stored["first_image"], present["first_image"]) > _MAX_LEVELS:
+    if _picture_difference(one, other) > _MAX_LEVELS:
         lines.append("pixels of the first image")
     return lines
 
@@ -110,13 +114,6 @@ def _look(sample: Sample) -> dict[str, Any]:
         "size": [box.width, box.height],
         "pixels": np.asarray(small, np.uint8).tobytes().hex(),
     }
-
-
-def _same_labels(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    if one["labels"] != other["labels"]:
-        return False
-    pairs = [(one[name], other[name]) for name in ("K", "T_cam_obj")]
-    return all(np.allclose(*pair, rtol=_MAX_LABEL, atol=_MAX_LABEL) for pair in pairs)
 
 
 def _picture_difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
@@ -156,7 +153,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
         return  # nor does one whose data nobody can read
     if _test_set(own) != _test_set(data):
         return
-    found = differing_images(stored["test"], describe_images(build_test_source(data, parts)))
+    found = differing_images(stored["test"], describe_images(held_out_source(data, parts, "test")))
     if found:
         _log.warning(
             "the test images are not those of the checkpoint's own figures, "

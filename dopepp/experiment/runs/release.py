@@ -48,7 +48,8 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
 
 def _card(name: str, trained: Checkpoint, report: Report) -> str:
     rows = [
-        {"object": row.object, "method": row.method, **_measures(row)}
+        {"object": row.object, "method": row.method}
+        | {one.heading: one.text(row) for one in COLUMNS if one.field in _CARD_FIELDS}
         for rows in [report.rows, *report.references.values()]
         for row in shown_rows(rows).values()
     ]
@@ -76,10 +77,6 @@ Measured on {report.num_images} rendered images that it was not trained on, with
 of the same images:
 
 {markdown_text(rows)}"""
-
-
-def _measures(row: Any) -> dict[str, str]:
-    return {column.heading: column.text(row) for column in COLUMNS if column.field in _CARD_FIELDS}
 
 
 def _training(data: Mapping[str, Any]) -> str:

@@ -74,7 +74,10 @@ def check_resume(
     optimiser differs, or what is learnt from does and ``resume_anyway`` is not set.
     """
     path = run / record.CONFIG_FILE
-    found = config_differences(_read_config(path), config.plain) if path.is_file() else []
+    before = read_yaml(path) if path.is_file() else config.plain
+    if not isinstance(before, Mapping):
+        raise UserError(f"{path} with a {type(before).__name__}", "a config", "check the run")
+    found = config_differences(before, config.plain)
     state = [one for one in found if one.key == _OPTIMIZER]
     if saved.spec != payload["spec"] or state:
         network = [one for one in found if below(one.key, _NETWORK)] + state
@@ -179,13 +182,6 @@ def _task(hydra: object) -> object:
     for key in ("hydra", "overrides", "task"):
         hydra = hydra.get(key) if isinstance(hydra, dict) else None
     return hydra
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    config = read_yaml(path)
-    if not isinstance(config, dict):
-        raise UserError(f"{path} with a {type(config).__name__}", "a config", "check the run")
-    return config
 
 
 def _text(entries: Mapping[str, object], key: str) -> str:

@@ -52,8 +52,8 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
 
 def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
     """Return a node of a config in plain values, None where there is none."""
-    node = OmegaConf.to_container(config[key], resolve=True) if config.get(key) else None
-    return {str(name): value for name, value in node.items()} if isinstance(node, dict) else None
+    node: Any = OmegaConf.to_container(config[key], resolve=True) if config.get(key) else None
+    return node if isinstance(node, dict) else None
 
 
 def _command() -> list[str]:

@@ -31,8 +31,6 @@ _MIN_CELLS: Final = 3.0
 _FALL: Final = 0.95
 """A validation loss above this share of its first value has not fallen."""
 
-_LIKELY: Final = " (likely here)"
-
 
 class EmptyMaps(Callback):
     """Warns once when nothing can be found because no belief is high enough, and says why.
@@ -66,13 +64,7 @@ class EmptyMaps(Callback):
         self._inside, self._sizes = [], []
 
     def on_validation_batch_end(  # type: ignore[override]
-        self,
-        trainer: Trainer,
-        pl_module: PoseSystem,
-        outputs: ValidationOutput,
-        batch: Batch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
         """Keep the highest beliefs, and where the labels are."""
         belief = outputs.belief.reshape(len(batch), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
@@ -84,7 +76,7 @@ class EmptyMaps(Callback):
         limit = keypoints.new_tensor([width, height])
         self._inside.append(((keypoints >= 0) & (keypoints < limit)).all(dim=-1).float().flatten())
         extent = keypoints.amax(dim=1) - keypoints.amin(dim=1)
-        self._sizes.append(extent.amax(dim=-1) / pl_module.geometry.stride)
+        self._sizes.append(extent.amax(dim=-1) / system.geometry.stride)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count, and say so when there have been enough."""
@@ -122,7 +114,7 @@ class EmptyMaps(Callback):
             f"(recovery.peak_threshold={options.peak_threshold:g}), of a centroid {centroid:.2g} "
             f"(recovery.centroid_threshold={options.centroid_threshold:g}). The usual causes:",
             *(
-                f"  {number}. {what}{_LIKELY if likely else ''}: {text}"
+                f"  {number}. {what}{' (likely here)' if likely else ''}: {text}"
                 for number, (likely, what, text) in enumerate(causes, start=1)
             ),
         ]
@@ -131,25 +123,21 @@ class EmptyMaps(Callback):
     def _causes(self, trainer: Trainer, system: PoseSystem) -> list[tuple[bool, str, str]]:
         """Return of each cause whether it is likely, its name, and what to look at and try."""
         rate, labels = self._rate(trainer), self._labels()
+        early = (
+            f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
+            "train longer (trainer.max_epochs)"
+        )
+        if isinstance(system.loss, MapMSE):
+            early += (
+                "; to the squared error of model/loss=mse, whose peaks are a few cells of a map, "
+                "empty maps are a good answer for long: model/loss=spatial_ce learns from the "
+                "first step on"
+            )
         return [
-            (not rate[0] and not labels[0], *self._too_early(trainer, system)),
+            (not rate[0] and not labels[0], "too little training so far", early),
             (rate[0], "a learning rate that is too high or too low", rate[1]),
             (labels[0], "labels or units that do not fit the images", labels[1]),
         ]
-
-    def _too_early(self, trainer: Trainer, system: PoseSystem) -> tuple[str, str]:
-        """Say how long it has trained, and which loss needs long."""
-        squared = (
-            "; to the squared error of model/loss=mse, whose peaks are a few cells of a map, empty "
-            "maps are a good answer for long: model/loss=spatial_ce learns from the first step on"
-            if isinstance(system.loss, MapMSE)
-            else ""
-        )
-        return (
-            "too little training so far",
-            f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
-            f"train longer (trainer.max_epochs){squared}",
-        )
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
         """Judge the learning rate by the validation loss."""

@@ -128,14 +128,7 @@ class FiniteSteps(Callback):
         self.in_a_row += 1
         self._report(trainer, pl_module, passes, what)
 
-    def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Batch,
-        batch_idx: int,
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Log the count."""
         pl_module.log("train/skipped_steps", float(self.skipped), rank_zero_only=False)
 

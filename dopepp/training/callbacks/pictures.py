@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -73,20 +73,14 @@ class ValidationSheet(Callback):
         self._tiles, self._num_drawn = [], 0
 
     def on_validation_batch_end(  # type: ignore[override]
-        self,
-        trainer: Trainer,
-        pl_module: PoseSystem,
-        outputs: ValidationOutput,
-        batch: Batch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
         """Draw the batch's first images until the sheet is full."""
         num = min(self.num_images - self._num_drawn, len(batch))
         if num <= 0 or not trainer.is_global_zero or trainer.sanity_checking:
             return
         first = ValidationOutput(outputs.loss, outputs.belief[:num], outputs.field[:num])
-        self._tiles += self.tiles(pl_module, first, batch.rows(torch.arange(num)))
+        self._tiles += self.tiles(system, first, batch.rows(torch.arange(num)))
         self._num_drawn += num
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -49,17 +49,11 @@ class PoseMetricsCallback(Callback):
         self.metrics.to(pl_module.device).reset()
 
     def on_validation_batch_end(  # type: ignore[override]
-        self,
-        trainer: Trainer,
-        pl_module: PoseSystem,
-        outputs: ValidationOutput,
-        batch: Batch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
         """Recover the batch's poses and compare them with its instances."""
-        detections = pl_module.recover(outputs, batch)
-        truths = batch_instances(batch, pl_module.parts)
+        detections = system.recover(outputs, batch)
+        truths = batch_instances(batch, system.parts)
         width = batch.images.shape[-1]
         cameras = batch.K.double().cpu().numpy()
         for found, instances, K in zip(detections, truths, cameras, strict=True):

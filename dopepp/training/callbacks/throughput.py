@@ -27,10 +27,7 @@ FOLDER: Final = "profile"
 
 _STARVED: Final = 0.2
 """A larger share of waiting is worth a hint."""
-_REFRESH_EVERY: Final = 5
-"""Batches; drawing the bar costs more than a small network's step."""
 _FILE: Final = "report"
-_US: Final = 1e-6
 _SHOWN: Final = 12
 
 Total = tuple[str, int, float]
@@ -69,19 +66,12 @@ class Throughput(Callback):
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = time.perf_counter()
 
-    def on_train_batch_start(
-        self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Count the time since the last step ended as waiting."""
         self._waited += time.perf_counter() - self._step_ended
 
     def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Batch,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, *_: Any
     ) -> None:
         """Count the batch's images, over all processes."""
         self._images += len(batch) * trainer.world_size
@@ -94,12 +84,10 @@ class Throughput(Callback):
         pl_module.log("throughput/images_per_s", speed, rank_zero_only=False)
         pl_module.log("throughput/loader_wait", waiting, rank_zero_only=False)
         if trainer.is_global_zero:
-            hint = (
-                "; data.cache=memory or disk renders each image once" if waiting > _STARVED else ""
-            )
             _log.info(
                 "epoch %d: %.0f images/s, %.0f %% of the time waiting for the loader%s",
-                trainer.current_epoch, speed, 100 * waiting, hint,
+                trainer.current_epoch, speed, 100 * waiting,
+                "; data.cache=memory or disk renders each image once" if waiting > _STARVED else "",
             )  # fmt: skip
 
 
@@ -110,7 +98,7 @@ class RunProgress(TQDMProgressBar):
     """
 
     def __init__(self) -> None:
-        super().__init__(refresh_rate=_REFRESH_EVERY)
+        super().__init__(refresh_rate=5)  # drawing it costs more than a small network's step
         self._start, self._first_step = 0.0, 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -153,7 +141,7 @@ class Operators(PyTorchProfiler):
             if one.is_user_annotation or one.key.startswith("[pl]"):
                 continue  # Lightning's hooks
             calls, seconds = self._totals.get(one.key, (0, 0.0))
-            spent = _US * (one.self_cpu_time_total + one.self_device_time_total)
+            spent = 1e-6 * (one.self_cpu_time_total + one.self_device_time_total)
             self._totals[one.key] = (calls + one.count, seconds + spent)
 
     def totals(self) -> list[Total]:

@@ -42,6 +42,8 @@ class TrialReport(Callback):
         pruned: Why training was stopped; empty where it was not.
     """
 
+    _study: Study
+
     def __init__(
         self,
         storage: str,
@@ -56,8 +58,6 @@ class TrialReport(Callback):
         self._place, self._name = storage, study
         self._after_trials = check_integer("search.prune_after_trials", after_trials, 1, MOST)
         self._after_epochs = check_integer("search.prune_after_epochs", after_epochs, 0, MOST)
-        self._study: Study | None = None
-        self._trial_id = -1
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Find the trial in its study."""
@@ -79,17 +79,13 @@ class TrialReport(Callback):
         epoch = trainer.current_epoch
         self._storage.set_trial_intermediate_value(self._trial_id, epoch, float(value))
         last = trainer.max_epochs is not None and epoch + 1 >= trainer.max_epochs
-        if self.prune and not last and self._is_bad():
+        trial = self._storage.get_trial(self._trial_id)
+        if self.prune and not last and self._study.pruner.prune(self._study, trial):
             self.pruned = (
                 f"after epoch {epoch}, whose {self.monitor} of {float(value):.4g} is worse "
                 "than the other trials' median"
             )
             trainer.should_stop = True
-
-    def _is_bad(self) -> bool:
-        assert self._study is not None
-        trial = self._storage.get_trial(self._trial_id)
-        return bool(self._study.pruner.prune(self._study, trial))
 
 
 def raise_if_pruned(trainer: Trainer) -> None:

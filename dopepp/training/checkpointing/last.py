@@ -3,12 +3,19 @@
 A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
 metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
 ``docs/reliability.md``. Ctrl-C and SIGTERM are remembered and answered between two steps.
+
+Lightning counts a batch as begun when it hands it out, an epoch as open until its metrics are
+logged, and derives from such differences at which hook a checkpoint was taken. Taken inside a
+batch or a validation, and at the end of an epoch, those counters lead to replayed or skipped
+batches. So the counters of a checkpoint are set to a moment between two batches, at the beginning
+of a validation or between two epochs; only these are resumed from.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import random
 import signal
 import threading
 import time
@@ -17,21 +24,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+import numpy as np
+import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from dopepp.core.interrupts import Interruption
 from dopepp.data.batch import Batch
 from dopepp.data.loader import PoseLoader
-from dopepp.training.checkpointing import resume_point
-from dopepp.training.checkpointing.files import (
-    FOLDER,
-    LAST,
-    PREVIOUS,
-    AtomicCheckpointIO,
-    saved_step,
-    sweep,
-)
+from dopepp.training.checkpointing import files
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class LastCheckpoint(Checkpoint):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the random generators' states; in a validation, those at its beginning."""
-        return {"random": self._random or resume_point.capture()}
+        return {"random": self._random or capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Keep the states until training starts."""
@@ -82,16 +83,16 @@ class LastCheckpoint(Checkpoint):
         if self._cut is not None:
             self._cut(fit_loop)
         elif epochs["processed"] == epochs["ready"]:  # the best one, at the end of an epoch
-            resume_point.between_epochs(fit_loop)
+            between_epochs(fit_loop)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take up the random states and the signals; tidy up after the run that was cut off."""
         if self._random is not None:
-            resume_point.restore(self._random)
+            restore(self._random)
             self._random = None
         _find_place(trainer)
         if trainer.is_global_zero:
-            sweep(Path(trainer.default_root_dir))
+            files.sweep(Path(trainer.default_root_dir))
             _set_aside_damaged(trainer)
         _forget_later_best(trainer)
         self._saved, self._saved_at = _state(trainer), time.monotonic()
@@ -104,22 +105,17 @@ class LastCheckpoint(Checkpoint):
         """Save what the batches before this one have made of the weights, if it is time."""
         # Gradients that are being accumulated are in no checkpoint.
         if batch_idx % trainer.accumulate_grad_batches == 0:
-            self._save_if_due(trainer, resume_point.before_batch)
+            self._save_if_due(trainer, before_batch)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remember the random states that a repeated validation has to begin with."""
-        self._random = resume_point.capture()
+        self._random = capture()
 
     def on_validation_batch_start(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        batch: Batch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
         """Save if it is time; the validation is repeated as a whole."""
-        self._save_if_due(trainer, resume_point.before_validation)
+        self._save_if_due(trainer, before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Go back to the present states."""
@@ -128,11 +124,11 @@ class LastCheckpoint(Checkpoint):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the result; a ``SavingFailedError`` if it cannot be written."""
         self._stop.end()
-        self._save(trainer, resume_point.between_epochs)
+        self._save(trainer, between_epochs)
         if trainer.is_global_zero:
-            files = trainer.strategy.checkpoint_io
-            assert isinstance(files, AtomicCheckpointIO)
-            files.finish()
+            writer = trainer.strategy.checkpoint_io
+            assert isinstance(writer, files.AtomicCheckpointIO)
+            writer.finish()
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -157,11 +153,13 @@ class LastCheckpoint(Checkpoint):
             raise Interruption(stop or signal.SIGTERM)
 
     def _save(self, trainer: Trainer, cut: Cut) -> None:
-        folder = Path(trainer.default_root_dir) / FOLDER
+        folder = Path(trainer.default_root_dir) / files.FOLDER
         self._cut = cut
         start = time.monotonic()
         try:
-            trainer.save_checkpoint(folder / LAST, storage_options={"previous": folder / PREVIOUS})
+            trainer.save_checkpoint(
+                folder / files.LAST, storage_options={"previous": folder / files.PREVIOUS}
+            )
         finally:
             self._cut = None
         self._saved_at = time.monotonic()
@@ -211,9 +209,13 @@ class StopRequest:
 
 def _set_aside_damaged(trainer: Trainer) -> None:
     """Keep a damaged file from taking the place of the whole one that is resumed from."""
-    last = Path(trainer.default_root_dir) / FOLDER / LAST
-    if trainer.ckpt_path is not None and Path(trainer.ckpt_path).name != LAST and last.exists():
-        last.replace(last.with_name(f"{LAST}.damaged"))
+    last = Path(trainer.default_root_dir) / files.FOLDER / files.LAST
+    if (
+        trainer.ckpt_path is not None
+        and Path(trainer.ckpt_path).name != files.LAST
+        and last.exists()
+    ):
+        last.replace(last.with_name(f"{files.LAST}.damaged"))
 
 
 def _find_place(trainer: Trainer) -> None:
@@ -251,7 +253,7 @@ def _forget_later_best(trainer: Trainer) -> None:
     best = _best(trainer)
     if best is None or not best.best_model_path:
         return
-    step = saved_step(Path(best.best_model_path))
+    step = files.saved_step(Path(best.best_model_path))
     if step is not None and step <= trainer.global_step:
         return
     _log.info("%s is newer than step %d: chosen anew", best.best_model_path, trainer.global_step)
@@ -259,3 +261,52 @@ def _forget_later_best(trainer: Trainer) -> None:
     best.best_k_models, best.kth_value = {}, fresh.kth_value
     best.best_model_path = best.kth_best_model_path = ""
     best.best_model_score = None
+
+
+def before_batch(fit_loop: dict[str, Any]) -> None:
+    """Take back the batch that was handed out and has not been trained on."""
+    batches = fit_loop["epoch_loop.batch_progress"]
+    for counter in (batches["total"], batches["current"]):
+        counter["ready"] -= 1
+    batches["is_last_batch"] = False
+
+
+def before_validation(fit_loop: dict[str, Any]) -> None:
+    """Forget what has been validated: all of the epoch's batches are trained on, none is judged."""
+    validation = fit_loop["epoch_loop.val_loop.batch_progress"]
+    # One batch begun and none done is how Lightning tells that a validation was cut off.
+    validation["total"].update(ready=1, started=1, processed=0, completed=0)
+    validation["current"].update(ready=0, started=0, processed=0, completed=0)
+    validation["is_last_batch"] = False
+
+
+def between_epochs(fit_loop: dict[str, Any]) -> None:
+    """Close the epoch: the next one starts with its first batch."""
+    epochs = fit_loop["epoch_progress"]
+    for counter in (epochs["total"], epochs["current"]):
+        counter["completed"] = counter["processed"]
+
+
+def capture() -> dict[str, Any]:
+    """Return the states of Python's, NumPy's and torch's generators, as tensors and numbers."""
+    version, numbers, gauss = random.getstate()
+    _, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002
+    return {
+        "python": [version, list(numbers), gauss],
+        "numpy": [torch.tensor(np.asarray(keys, np.int64)), int(position), int(has_gauss)],
+        "numpy_gauss": float(cached),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def restore(state: dict[str, Any]) -> None:
+    """Set the generators to captured states; those of GPUs only where there are as many."""
+    version, numbers, gauss = state["python"]
+    random.setstate((version, tuple(numbers), gauss))
+    keys, position, has_gauss = state["numpy"]
+    generator = ("MT19937", keys.numpy().astype(np.uint32), position, has_gauss)
+    np.random.set_state((*generator, state["numpy_gauss"]))  # noqa: NPY002
+    torch.set_rng_state(state["torch"].cpu())
+    if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all([one.cpu() for one in state["cuda"]])

@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build import hardware
-from dopepp.experiment.build.hardware import choose_precision, estimate_training_s
+from dopepp.experiment.build import system as hardware
 from dopepp.experiment.build.sources import build_datamodule, build_parts
-from dopepp.experiment.build.system import build_system
+from dopepp.experiment.build.system import build_system, choose_precision, estimate_training_s
 from dopepp.experiment.config.run import TrainerConfig
 
 

@@ -10,7 +10,7 @@ from dopepp.experiment.build.sources import (
     PAPER_OBJECTS,
     build_datamodule,
     build_parts,
-    build_test_source,
+    held_out_source,
 )
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
@@ -121,7 +121,7 @@ def test_a_users_mesh_with_its_unit(tiny, tmp_path):
     (part,) = build_parts(data)
     assert part.name == "bracket"
     assert part.diameter == pytest.approx(np.sqrt(0.08**2 + 0.05**2 + 0.03**2))
-    sample = build_test_source(data, [part]).sample(0, 0)
+    sample = held_out_source(data, [part], "test").sample(0, 0)
     assert sample.instances[0].label == "bracket"
     assert sample.instances[0].mask.any()
 
@@ -160,7 +160,7 @@ def test_a_unit_matters_to_files_only(tiny):
 def test_preset_changes_reach_the_renders(tiny):
     plain, changed = tiny(), tiny("++virtual.scene.horizontal_fov_deg=20")
     fx = [
-        build_test_source(config.data, build_parts(config.data)).sample(0, 0).K[0, 0]
+        held_out_source(config.data, build_parts(config.data), "test").sample(0, 0).K[0, 0]
         for config in (plain, changed)
     ]
     assert fx[1] == pytest.approx(64 / np.tan(np.radians(10)), rel=1e-6)

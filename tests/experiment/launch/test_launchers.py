@@ -11,8 +11,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.launch import remote
-from dopepp.experiment.launch.jobs import on_joblib
-from dopepp.experiment.launch.slurm import on_slurm
+from dopepp.experiment.launch.jobs import on_joblib, on_slurm
 from dopepp.experiment.runs import record
 
 ROOT = Path(__file__).parents[3]

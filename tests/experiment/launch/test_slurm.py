@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from dopepp.experiment.launch import slurm
+from dopepp.experiment.launch import remote
 
 
 @pytest.fixture(autouse=True)
@@ -12,15 +12,15 @@ def job(tmp_path, monkeypatch):
 
 
 def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(tmp_path, monkeypatch):
-    slurm.remember_run(["seed=1"], tmp_path / "a")
-    slurm.remember_run(["seed=2"], tmp_path / "b")
-    assert slurm.begun_run(["seed=1"]) is None  # the first time: no restart
+    remote.remember_run(["seed=1"], tmp_path / "a")
+    remote.remember_run(["seed=2"], tmp_path / "b")
+    assert remote.begun_run(["seed=1"]) is None  # the first time: no restart
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert slurm.begun_run(["seed=1"]) == tmp_path / "a"
-    assert slurm.begun_run(["seed=2"]) == tmp_path / "b"
-    assert slurm.begun_run(["seed=3"]) is None
+    assert remote.begun_run(["seed=1"]) == tmp_path / "a"
+    assert remote.begun_run(["seed=2"]) == tmp_path / "b"
+    assert remote.begun_run(["seed=3"]) is None
     monkeypatch.setenv("SLURM_JOB_ID", "13")
-    assert slurm.begun_run(["seed=1"]) is None
+    assert remote.begun_run(["seed=1"]) is None
 
 
 @pytest.mark.parametrize(
@@ -36,14 +36,14 @@ def test_only_a_requeued_job_goes_on_and_only_with_its_own_command(tmp_path, mon
 def test_a_job_is_named(variables, named, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert slurm.job_id() == named
+    assert remote.job_id() == named
 
 
 def test_a_refused_or_missing_scontrol_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm.requeue().startswith("SLURM did not requeue job 12: ")
+    assert remote.requeue().startswith("SLURM did not requeue job 12: ")
     script = tmp_path / "scontrol"
     script.write_text("#!/bin/sh\necho Access denied >&2\nexit 1\n")
     script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.defpath}")
-    assert slurm.requeue() == "SLURM did not requeue job 12: Access denied"
+    assert remote.requeue() == "SLURM did not requeue job 12: Access denied"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from dopepp.data.sample import Instance
-from dopepp.experiment.reports.breakdown import (
+from dopepp.experiment.reports.protocols import (
     QUANTITIES,
     bin_numbers,
     break_down,

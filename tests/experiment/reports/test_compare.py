@@ -17,12 +17,12 @@ from dopepp.experiment.reports.compare import (
     compare_paths,
     compare_reports,
     compare_runs,
+    logged,
     write_comparison,
 )
 from dopepp.experiment.reports.differences import differences, figures, full, headline
 from dopepp.experiment.reports.entries import Entry, find_runs, group, ordered, read_run
 from dopepp.experiment.reports.evaluators import Cost
-from dopepp.experiment.reports.pictures import logged
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import DELTA, read_csv
 from dopepp.experiment.runs import record

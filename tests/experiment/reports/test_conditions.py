@@ -10,7 +10,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, build_test_source
+from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, held_out_source
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.evaluate import measure_and_record
 from dopepp.experiment.reports.conditions import (
@@ -157,7 +157,7 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(tiny):
 def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     data = tiny().data
     (part,) = build_parts(data)
-    source = build_test_source(data, [part])
+    source = held_out_source(data, [part], "test")
     scaled = {scale: build_scaled_test_source(data, [part], scale) for scale in (0.5, 20.0)}
     usual = [source.sample(index).instances[0] for index in range(3)]
     far = [scaled[0.5].sample(index).instances[0] for index in range(3)]

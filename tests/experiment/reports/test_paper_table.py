@@ -251,10 +251,10 @@ def test_recipes_are_ours_unless_the_papers_are_asked_for(composed):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"title": "T", "colour": 1}, r"table\.colour; allowed: title, kind"),
+        ({"title": "T", "colour": 1}, r"table\.colour=1; allowed: title, kind"),
         ({"title": "T", "kind": "pie"}, r"table\.kind='pie'; allowed: poses, shading"),
         ({"title": "T", "threshold": 0.2}, r"table\.threshold=0\.2; allowed: 0\.05, 0\.1"),
-        ({}, "table without a title"),
+        ({}, "no table.title"),
     ],
 )
 def test_impossible_tables(table, message):

@@ -8,7 +8,7 @@ from hydra._internal.utils import create_config_search_path
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.search.study import chosen, examples, overrides, read_space
+from dopepp.experiment.search import chosen, examples, overrides, read_space
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,12 @@
-"""What a search varies, as Optuna's distributions, and the study behind it.
+"""Searching: trials are asked from a study, run by Hydra's launcher, and told to it.
 
-An option is varied by a sweep of Hydra's, ``key=interval(0, 1)``. A study is opened by one command
-at a time, and trials of different configurations are never mixed in it.
+A trial's number is its job's. Whatever ends a command in the middle, its trials stay ``RUNNING`` in
+the study: the next command runs those first, each under its number and in its folder, where a
+training goes on from its last checkpoint. A study is opened by one command at a time, and trials of
+different configurations are never mixed in it.
 
-To vary another option, write it into ``search.space`` or on the command line.
+An option is varied by a sweep of Hydra's, ``key=interval(0, 1)``. To vary another one, write it
+into ``search.space`` or on the command line.
 """
 
 from __future__ import annotations
@@ -11,9 +14,11 @@ from __future__ import annotations
 import fcntl
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,26 +26,23 @@ import optuna
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.core.utils import JobReturn
 from hydra.errors import HydraException
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-)
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, OmegaConf
+from optuna import distributions
 from optuna.study import StudyDirection
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 
+from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.parse import FORMER_TARGETS, below, flat
-from dopepp.experiment.runs import record
-from dopepp.training.callbacks.trial import open_storage
+from dopepp.experiment.runs import display, record
+from dopepp.training.callbacks.trial import MOST, open_storage
 
-_FORMS: Final = "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)"
-_LOG: Final = "log"
-_LOCK_FILE: Final = ".search.lock"
 _FACTS: Final = "configuration"
 _NUM_SHOWN: Final = 3
+_MAX_PARALLEL: Final = 10_000
 _DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
 _NO_PART: Final = (
     "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
@@ -58,9 +60,118 @@ class Space:
     ``fixed`` are the overrides that every trial has.
     """
 
-    varied: dict[str, BaseDistribution]
+    varied: dict[str, distributions.BaseDistribution]
     texts: dict[str, str]
     fixed: list[str]
+
+
+def search(
+    config: DictConfig,
+    loader: ConfigLoader,
+    launcher: Launcher,
+    arguments: Sequence[str],
+    swept: Sequence[str],
+) -> list[JobReturn]:
+    """Run trials until the study has as many finished ones as ``search.num_trials``.
+
+    ``swept`` are the options that the experiment sweeps over by itself; there must be none. A
+    :class:`UserError`: an option of the search is wrong, or the study does not belong to this
+    command.
+    """
+    if swept:
+        raise UserError(
+            f"search=optuna with an experiment that sweeps over {', '.join(swept)} itself",
+            "an experiment of one training, such as experiment=quickstart",
+            "leave one of the two out",
+        )
+    options: Any = OmegaConf.to_container(config.search, resolve=True)
+    wanted = check_integer("search.num_trials", options["num_trials"], 1, MOST)
+    at_a_time = check_integer("search.num_parallel", options["num_parallel"], 1, _MAX_PARALLEL)
+    space = read_space(loader, options["space"], arguments)
+    for example in examples(space):
+        loader.load_sweep_config(config, example)
+    folder = Path(str(config.hydra.sweep.dir))
+    facts = facts_of(OmegaConf.to_container(config, resolve=False), space.texts)
+    with alone(folder, str(options["study"])):
+        study = open_study(options, facts, int(config.seed))
+        trials = _Trials(study, space, launcher, folder)
+        OmegaConf.save(config, folder / "multirun.yaml")
+        returns = trials.run(wanted, at_a_time)
+        _report(study, options)
+    return returns
+
+
+class _Trials:
+    """The trials of a study, each a job in a folder of its number."""
+
+    def __init__(self, study: optuna.Study, space: Space, launcher: Launcher, folder: Path) -> None:
+        self._study, self._space, self._launcher, self._folder = study, space, launcher, folder
+        known = {trial.number for trial in study.get_trials(deepcopy=False)}
+        names = [path.name for path in folder.iterdir() if path.name.isdigit()]
+        foreign = [name for name in names if int(name) not in known]
+        if foreign:  # a trial must not go on in the folder of another study's
+            raise UserError(
+                f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
+                f"a folder of the study {study.study_name} alone",
+                "choose another search.study=NAME, or move the folder away",
+            )
+
+    def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
+        """Finish what an earlier command has left, then run new ones until so many are finished."""
+        returns: list[JobReturn] = []
+        self._tell(self._running())
+        left = self._running()
+        if left:
+            numbers = ", ".join(str(trial.number) for trial in left)
+            display.console.print(f"study {self._study.study_name} goes on with trials {numbers}")
+        for trials in _consecutive(left, at_a_time):
+            returns += self._launch(trials)
+        ended = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
+        while (missing := wanted - len(self._study.get_trials(False, ended))) > 0:
+            asked = range(min(missing, at_a_time))
+            numbers_asked = {self._study.ask(self._space.varied).number for _ in asked}
+            returns += self._launch([one for one in self._running() if one.number in numbers_asked])
+        return returns
+
+    def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
+        """Run trials of consecutive numbers and tell the study how they ended."""
+        jobs = [overrides(self._space, trial.params) for trial in trials]
+        returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
+        self._tell(trials)
+        numbers = {trial.number for trial in trials}
+        for trial in self._running():
+            if trial.number in numbers:  # its process died without a word
+                self._study.tell(trial.number, state=TrialState.FAIL)
+        return returns
+
+    def _tell(self, trials: Sequence[FrozenTrial]) -> None:
+        """Tell the study about those trials whose jobs have ended."""
+        for trial in trials:
+            state, value = outcome(self._folder / str(trial.number))
+            if state != TrialState.RUNNING:
+                self._study.tell(trial.number, value, state=state)
+
+    def _running(self) -> list[FrozenTrial]:
+        return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+
+
+def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequence[FrozenTrial]]:
+    """Yield runs of consecutive numbers: a launcher counts up from the first one's."""
+    for _, run in groupby(enumerate(trials), lambda pair: pair[1].number - pair[0]):
+        left = [trial for _, trial in run]
+        for first in range(0, len(left), at_most):
+            yield left[first : first + at_most]
+
+
+def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
+    """Print how the trials ended, and the best one as overrides."""
+    states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
+    counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+    display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
+    if states[TrialState.COMPLETE.name.lower()]:
+        best = study.best_trial
+        options_of = " ".join(chosen(best.params))
+        display.console.print(f"best trial {best.number}, objective {best.value:.4f}: {options_of}")
 
 
 def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
@@ -93,27 +204,35 @@ def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[s
     return Space({key: _distribution(sweep) for key, sweep in sweeps.items()}, texts, fixed)
 
 
-def _distribution(sweep: Override) -> BaseDistribution:
+def _distribution(sweep: Override) -> distributions.BaseDistribution:
     """Return what Optuna draws an option from."""
     value = sweep.value()
     try:
         if isinstance(value, IntervalSweep):
             low: Any = value.start  # ints where the interval was cast to int
             high: Any = value.end
-            kind = IntDistribution if isinstance(low, int) else FloatDistribution
-            return kind(low, high, log=_LOG in value.tags)
+            kind = (
+                distributions.IntDistribution
+                if isinstance(low, int)
+                else distributions.FloatDistribution
+            )
+            return kind(low, high, log="log" in value.tags)
         if isinstance(value, RangeSweep) and isinstance(value.step, int):
             numbers = range(int(value.start or 0), int(value.stop or 0), value.step)
-            return IntDistribution(min(numbers), max(numbers), step=abs(value.step))
+            return distributions.IntDistribution(min(numbers), max(numbers), step=abs(value.step))
         if sweep.is_discrete_sweep():
-            return CategoricalDistribution(list(sweep.sweep_string_iterator()))
+            return distributions.CategoricalDistribution(list(sweep.sweep_string_iterator()))
     except ValueError as error:
         raise _bad_entry(f"{sweep.input_line!r}: {error}") from error
     raise _bad_entry(f"{sweep.input_line!r}")
 
 
 def _bad_entry(got: str) -> UserError:
-    return UserError(f"search.space with {got}", _FORMS, "correct search.space or the command line")
+    return UserError(
+        f"search.space with {got}",
+        "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",
+        "correct search.space or the command line",
+    )
 
 
 def examples(space: Space) -> list[list[str]]:
@@ -125,11 +244,13 @@ def examples(space: Space) -> list[list[str]]:
     return [overrides(space, params) for params in tried]
 
 
-def _ends(distribution: BaseDistribution) -> list[object]:
+def _ends(distribution: distributions.BaseDistribution) -> list[object]:
     """Return every choice, or one number of a range: another one composes as well."""
-    if isinstance(distribution, CategoricalDistribution):
+    if isinstance(distribution, distributions.CategoricalDistribution):
         return list(distribution.choices)
-    assert isinstance(distribution, (FloatDistribution, IntDistribution))
+    assert isinstance(
+        distribution, (distributions.FloatDistribution, distributions.IntDistribution)
+    )
     return [distribution.low]
 
 
@@ -156,7 +277,7 @@ def alone(folder: Path, study: str) -> Iterator[None]:
     If there is another one, it is a :class:`UserError`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK_FILE).open("w") as stream:
+    with (folder / ".search.lock").open("w") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -211,7 +332,7 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
     )
 
 
-def facts_of(config: Mapping[str, Any], texts: Mapping[str, str]) -> dict[str, str]:
+def facts_of(config: object, texts: Mapping[str, str]) -> dict[str, str]:
     """Return a config, and what it is varied by, flat and without what names only places."""
     facts = {key: str(value) for key, value in flat(config) if not below(key, _NO_PART)}
     return {**facts, **{f"search.space {key}": text for key, text in texts.items()}}

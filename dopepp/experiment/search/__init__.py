@@ -1,1 +1,0 @@
-"""``search=optuna``: jobs of a multirun whose options a study chooses."""
