@@ -47,13 +47,6 @@ def check_range(
         raise _refused(name, value, allowed, of)
 
 
-def check_counts(name: str, value: object, low: int, high: int, of: object = None) -> None:
-    """Refuse what is no pair of whole numbers (smallest, largest) within bounds."""
-    check_range(name, value, low, high, "a count", of)
-    if not all(isinstance(entry, int) for entry in value):  # type: ignore[attr-defined]
-        raise _refused(name, value, "two whole numbers", of)
-
-
 def _is_number(value: object) -> bool:
     # A comparison, because an endless integer cannot even be asked whether it is finite.
     if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -28,7 +28,9 @@ MAX_THRESHOLD: Final = 0.1
 _NUM_STEPS: Final = 200
 """Steps of a curve: 0.5 mm each up to 0.1 m."""
 
-_PANEL_INCHES: Final = (5.2, 4.0)
+_SMOOTHING: Final = 50
+"""A line of more points than this is drawn as a moving average over 1/50 of them, above its own
+pale self."""
 
 
 def accuracy_curve(
@@ -143,19 +145,12 @@ def rates_figure(
 ) -> Figure:
     """Draw panels row by row, each with a line and a band of confidence for every method.
 
-    Args:
-        panels: By title, then by method; at least one.
-        x_label: The quantity with its unit.
-        columns: Panels in a row.
-        edges: Where bins end, marked on the axis; None for none.
-        ratio: Whether the quantity is a ratio: its axis is logarithmic, marked where it was
-            measured.
+    ``panels`` are by title, then by method; ``columns`` are in a row. ``x_label`` is the quantity
+    with its unit; of a ratio the axis is logarithmic, marked where it was measured. ``edges`` are
+    where bins end, marked on the axis.
     """
-    if not panels or columns < 1:
-        raise ValueError(f"rates need panels and columns, got {len(panels)} and {columns}")
     rows = -(-len(panels) // columns)
-    width, height = _PANEL_INCHES
-    figure = Figure(figsize=(columns * width, rows * height), dpi=120, layout="constrained")
+    figure = Figure(figsize=(columns * 5.2, rows * 4.0), dpi=120, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         _draw_panel(axes, title, curves, x_label, edges)
@@ -192,3 +187,54 @@ def _draw_panel(
     axes.grid(visible=True, axis="y", alpha=0.3)
     if curves:
         axes.legend(loc="best")
+
+
+@dataclass(frozen=True)
+class PlotLine:
+    """One method's values over training, of one or several runs.
+
+    Attributes:
+        values: Of each run; NaN where there is none.
+    """
+
+    name: str
+    x: Float[np.ndarray, "points"]
+    values: Float[np.ndarray, "runs points"]
+    colour: str
+    dashed: bool = False
+
+
+def lines_figure(
+    lines: Sequence[PlotLine], x_label: str, y_label: str, log_y: bool = False
+) -> Figure:
+    """Draw lines; of several runs their mean, in a band from the lowest to the highest.
+
+    ``y_label`` has its unit; ``log_y`` makes values logarithmic, where all are positive.
+    """
+    figure, axes = figure_with_axes(x_label, y_label)
+    for line in lines:
+        mean = line.values.mean(axis=0)
+        if len(line.values) > 1:
+            low, high = line.values.min(axis=0), line.values.max(axis=0)
+            axes.fill_between(line.x, low, high, color=line.colour, alpha=0.2, linewidth=0)
+        marker = "o" if len(mean) <= _SMOOTHING else ""
+        if len(mean) > _SMOOTHING and len(line.values) == 1:
+            axes.plot(line.x, mean, color=line.colour, alpha=0.2)
+        axes.plot(line.x, smoothed(mean), "--" if line.dashed else "-", color=line.colour,
+                  label=line.name, marker=marker, markersize=3)  # fmt: skip
+    positive = [(line.values[np.isfinite(line.values)] > 0).all() for line in lines]
+    if log_y and lines and all(positive):
+        axes.set_yscale("log")
+    if lines:
+        axes.legend(fontsize="small")
+    return figure
+
+
+def smoothed(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the moving average of a long line, of what there is near its ends."""
+    width = max(1, len(values) // _SMOOTHING)
+    if width == 1:
+        return values
+    window = np.ones(width)
+    counted = np.convolve(np.ones(len(values)), window, mode="same")
+    return np.asarray(np.convolve(values, window, mode="same") / counted)

@@ -22,9 +22,6 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import resize_points
 from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, EDGES
 
-_POINTS_PER_PX = 72 / 100
-"""At 100 dots per inch a pixel is 0.72 typographic points."""
-
 Colour = tuple[int, int, int]
 """RGB, 0..255."""
 
@@ -42,9 +39,6 @@ MIN_WIDTH_PX: Final = 640
 
 _FRACTION_BITS: Final = 4
 """cv2 takes sub-pixel coordinates as integers, here in 1/16 pixel."""
-
-_BACK_SHADE: Final = 0.8
-"""Brightness of the edges off the +z face."""
 
 _FRONT: Final = frozenset(np.flatnonzero(CORNER_SIGNS[:, 2] > 0).tolist())
 _FRONT_BOTTOM: Final = tuple(np.flatnonzero((CORNER_SIGNS[:, 1:] == [-1, 1]).all(axis=1)).tolist())
@@ -97,7 +91,7 @@ def draw_wireframe(
     """
     canvas = np.ascontiguousarray(image).copy()
     points = np.asarray(keypoints, np.float64)
-    shade = tuple(round(_BACK_SHADE * value) for value in colour)
+    shade = tuple(round(0.8 * value) for value in colour)  # of edges off the +z face
     front = [edge for edge in EDGES if _FRONT.issuperset(edge)]
     for a, b in EDGES:
         if (a, b) not in front:
@@ -112,13 +106,7 @@ def draw_wireframe(
 
 
 def enlarge(image: Picture, factor: int) -> UInt8[np.ndarray, "out_height out_width 3"]:
-    """Enlarge a copy of the image by a whole factor; ``resize_points`` moves keypoints along.
-
-    Raises:
-        ValueError: The factor is below 1.
-    """
-    if factor < 1:
-        raise ValueError(f"factor must be a whole number >= 1, got {factor}")
+    """Enlarge a copy of the image by a whole factor; ``resize_points`` moves keypoints along."""
     if factor == 1:
         return np.ascontiguousarray(image).copy()
     resized = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
@@ -190,14 +178,11 @@ def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]
     width = size_px * (len(text) + 1)
     figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    # 0.72 of the line is the em, so that ascenders and descenders stay inside.
+    # 0.72 of the line is the em, so that ascenders and descenders stay inside, and at 100 dots per
+    # inch a pixel is 0.72 typographic points.
+    points = 0.72 * size_px * 0.72
     label = figure.text(
-        size_px / 4 / width,
-        0.28,
-        text,
-        fontsize=0.72 * size_px * _POINTS_PER_PX,
-        va="baseline",
-        parse_math=False,
+        size_px / 4 / width, 0.28, text, fontsize=points, va="baseline", parse_math=False
     )
     canvas.draw()  # type: ignore[no-untyped-call]
     used = int(np.ceil(label.get_window_extent().x1 + size_px / 4))

@@ -57,15 +57,11 @@ _JPEG_END: Final = b"\xff\xd9"
 
 
 def read_picture(path: Path, longest_px: int | None = None) -> Picture:
-    """Return a picture as RGB, first row on top.
+    """Return a picture in one of :data:`FORMATS`, whatever its suffix, as RGB.
 
-    Args:
-        path: A file in one of :data:`FORMATS`, whatever its suffix.
-        longest_px: Reduce a picture whose longer side is longer than this; a JPEG file is then
-            decoded at a fraction of its size, which takes a fraction of the time.
-
-    Raises:
-        ValueError: It is missing, no picture, damaged, or over 8,192 pixels wide or high.
+    One whose longer side is longer than ``longest_px`` is reduced; a JPEG file is then decoded at a
+    fraction of its size, which takes a fraction of the time. A ValueError: it is missing, no
+    picture, damaged, or over 8,192 pixels wide or high.
     """
     try:
         with _opened(_content(path), FORMATS) as image:
@@ -84,8 +80,7 @@ def read_picture(path: Path, longest_px: int | None = None) -> Picture:
 def whole_picture(content: bytes, formats: tuple[str, ...] = FORMATS) -> Image.Image:
     """Decode a file that is in memory, with its own depth and channels.
 
-    Raises:
-        ValueError: It is none of the formats, damaged, or larger than :data:`MAX_PIXELS`.
+    A ValueError: it is none of the formats, damaged, or larger than :data:`MAX_PIXELS`.
     """
     try:
         image = _opened(content, formats)
@@ -114,9 +109,8 @@ def read_content(path: Path) -> bytes:
 def read_image(path: Path) -> NDArray[Any]:
     """Read a frame with its own depth and channels, colours as R, G, B(, A).
 
-    Raises:
-        UserError: The file is missing, is neither PNG nor JPEG, is incomplete or damaged, or has
-            colours of 16 bits.
+    A UserError: the file is missing, is neither PNG nor JPEG, is incomplete or damaged, or has
+    colours of 16 bits.
     """
     content = read_content(path)
     try:
@@ -142,8 +136,7 @@ def read_image(path: Path) -> NDArray[Any]:
 def read_rgb(path: Path) -> Picture:
     """Read an 8-bit frame as RGB; an alpha channel is dropped, grey becomes three channels.
 
-    Raises:
-        UserError: As :func:`read_image`, or the image does not have 8 bits.
+    A UserError, as from :func:`read_image`, also where the image does not have 8 bits.
     """
     image = read_image(path)
     if image.dtype != np.uint8:

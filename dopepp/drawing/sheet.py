@@ -1,22 +1,34 @@
-"""Contact sheets: many captioned pictures as one image."""
+"""Contact sheets of captioned pictures, and panels for them: masks, depth, axes, a message."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
-from dopepp.drawing.overlay import text_coverage
-from dopepp.drawing.panels import grid
-from dopepp.drawing.pictures import Picture
+from dopepp.drawing.overlay import Colour, draw_line, draw_text, text_coverage
+from dopepp.drawing.pictures import DepthMap, Mask, Picture
 
-_GAP_PX: Final = 6
 _CAPTION_PX: Final = 18
 _MIN_CAPTION_PX: Final = 9
 """Smallest readable line; what is still too long at this size is cut."""
+
+COLOURS: Final[tuple[Colour, ...]] = (
+    (230, 25, 75), (60, 180, 75), (255, 225, 25), (0, 130, 200), (245, 130, 48),
+    (145, 30, 180), (70, 240, 240), (240, 50, 230), (210, 245, 60), (250, 190, 212),
+)  # fmt: skip
+"""Of the first, second, … instance; easy to tell apart, also with most colour blindness."""
+
+AXIS_COLOURS: Final[tuple[Colour, ...]] = ((255, 60, 60), (60, 255, 60), (90, 140, 255))
+"""x red, y green, z blue, as everywhere."""
+
+_COVER: Final = 0.65
+"""Opacity of a mask."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +45,9 @@ class Tile:
 def contact_sheet(tiles: Sequence[Tile], columns: int = 4, tile_width: int = 320) -> Picture:
     """Lay tiles out row by row on white, each scaled to one width with its shape kept.
 
-    A row has ``columns`` tiles at most; ``tile_width`` is in pixels.
-
-    Raises:
-        ValueError: There are no tiles, or a size is below 1.
+    A row has ``columns`` tiles at most; ``tile_width`` is in pixels. A ValueError without tiles.
     """
-    if not tiles or columns < 1 or tile_width < 1:
-        raise ValueError(
-            f"a sheet needs tiles, columns and a width, got {len(tiles)}, {columns}, {tile_width}"
-        )
-    gap = _GAP_PX
+    gap = 6
     drawn = [
         np.pad(_draw_tile(tile, tile_width), ((gap, 0), (gap, 0), (0, 0)), constant_values=255)
         for tile in tiles
@@ -66,3 +71,79 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
     strip = np.full((_CAPTION_PX, width, 3), 255, np.uint8)
     strip[: coverage.shape[0], : coverage.shape[1]] = np.rint(255 * (1 - coverage))
     return np.concatenate([picture, strip])
+
+
+def grid(pictures: Sequence[Picture], columns: int) -> Picture:
+    """Put pictures side by side, row by row, on white; a ValueError, if there is none to put."""
+    if not pictures or columns < 1:
+        raise ValueError(f"a grid needs pictures and columns, got {len(pictures)} and {columns}")
+    rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
+    width = max(sum(one.shape[1] for one in row) for row in rows)
+    bands = []
+    for row in rows:
+        band = np.full((max(one.shape[0] for one in row), width, 3), 255, np.uint8)
+        left = 0
+        for one in row:
+            band[: one.shape[0], left : left + one.shape[1]] = one
+            left += one.shape[1]
+        bands.append(band)
+    return np.concatenate(bands)
+
+
+def message_picture(width: int, height: int, text: str) -> Picture:
+    """Return an empty picture that says why it is empty; lines beyond its height are cut."""
+    picture = np.full((height, width, 3), 225, np.uint8)
+    size = max(10, int(0.05 * width))
+    # A character is half as wide as the line is high, in the mean.
+    per_line = max(10, int((width - 2 * size) / (0.52 * size)))
+    for number, line in enumerate(textwrap.wrap(text, per_line)):
+        top = size + number * (size + size // 4)
+        if top + size > height:
+            break
+        draw_text(picture, line, (size, top), size, (255, 255, 255))
+    return picture
+
+
+def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:
+    """Paint each instance's visible pixels in its colour on the darkened, grey image."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None].repeat(3, axis=2)
+    panel = 0.35 * grey.astype(np.float64)
+    for number, mask in enumerate(masks):
+        if mask is not None:
+            colour = np.array(COLOURS[number % len(COLOURS)])
+            panel[mask] = (1 - _COVER) * grey[mask] + _COVER * colour
+    return np.asarray(np.rint(panel), np.uint8)
+
+
+def depth_panel(depth: DepthMap, shown: Mask) -> tuple[Picture, str]:
+    """Colour depth from near (red) to far (blue), unknown black; return the ends in words, too.
+
+    The scale is for the ``shown`` pixels, the objects': a plane that reaches far behind them would
+    leave them one colour.
+    """
+    known = depth > 0
+    scale = depth[known & shown] if (known & shown).any() else depth[known]
+    if not scale.size:
+        return np.zeros((*depth.shape, 3), np.uint8), "no depth"
+    near, far = float(scale.min()), float(scale.max())
+    # A tenth of the objects' range at both ends, or a millimetre: also of a flat depth.
+    margin = max(0.1 * (far - near), 1e-3)
+    near, far = max(near - margin, 0.0), far + margin
+    share = np.clip((far - depth) / (far - near), 0, 1)
+    coloured = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
+    panel = cv2.cvtColor(coloured, cv2.COLOR_BGR2RGB)
+    panel[~known] = 0
+    return np.asarray(panel, np.uint8), f"depth: red {near:.3f} m to blue {far:.3f} m"
+
+
+def draw_axes(image: Picture, ends: Float[np.ndarray, "4 2"], thickness: int = 2) -> None:
+    """Draw the object frame's axes IN PLACE.
+
+    ``ends`` is where the origin and the tips of x, y and z are seen, pixels; a line whose end is
+    not finite or far outside is left out.
+    """
+    # A tip that far outside of the image belongs to an object beside the camera.
+    bound = 10 * max(image.shape)
+    for tip, colour in zip(ends[1:], AXIS_COLOURS, strict=True):
+        if (np.abs([ends[0], tip]) < bound).all():
+            draw_line(image, ends[0], tip, colour, thickness)

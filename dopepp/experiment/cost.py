@@ -28,8 +28,7 @@ from dopepp.core.files import write_png, write_whole
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample
 from dopepp.data.transforms.resize import pad_sample, resize_sample
-from dopepp.drawing.curves import figure_image
-from dopepp.drawing.panels import PlotLine, lines_figure
+from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig

@@ -83,6 +83,13 @@ def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
     return np.asarray(np.arctan2(np.linalg.norm(axial, axis=-1), trace - 1.0))
 
 
+def rotation_to_z(axis: Vector) -> RotationMatrix:
+    """Return a rotation that turns a unit axis to z, whichever way x and y come to point."""
+    right = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(axis, right), axis])
+
+
 def random_rotation(rng: np.random.Generator) -> RotationMatrix:
     """Draw a rotation uniformly over SO(3): a normalised 4-D Gaussian is a uniform quaternion."""
     return quaternion_to_matrix(rng.normal(size=4))

@@ -93,15 +93,10 @@ BUILTIN: Final[dict[str, Callable[[], Part]]] = {
 def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
-    Args:
-        path_or_name: ``servoholder``, ``pivconnector``, or the path of a mesh file.
-        unit: The file's unit; None takes the one it has by its format, or millimetres, which the
-            log says. A built-in part has its size without it, so that one unit can go with a list
-            of files and built-in parts.
-
-    Raises:
-        UserError: There is no such part or file, or the file cannot be used (see
-            :func:`~dopepp.parts.mesh.read.read_mesh`).
+    ``unit`` is the file's; None takes the one it has by its format, or millimetres, which the log
+    says. A built-in part has its size without it, so that one unit can go with a list of files and
+    built-in parts. A UserError: there is no such part or file, or the file cannot be used (see
+    :func:`~dopepp.parts.mesh.read.read_mesh`).
     """
     text = str(path_or_name)
     if text in BUILTIN:

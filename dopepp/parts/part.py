@@ -105,11 +105,7 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Make a part, without its mesh, from what :meth:`to_record` returned.
-
-        Raises:
-            UserError: A field is missing, unknown, or not what ``to_record`` writes.
-        """
+        """Make a part, without its mesh, from what :meth:`to_record` returned, or a UserError."""
         if not isinstance(record, dict) or {*record} != {*FIELDS}:
             got = type(record).__name__
             if isinstance(record, dict):
@@ -130,7 +126,6 @@ class Part:
 FIELDS: Final = tuple(field.name for field in fields(Part) if field.name != "mesh")
 """Of a part's record: all but the mesh."""
 
-
 Parts = Sequence[Part]
 
 
@@ -146,16 +141,13 @@ def make_part(
     """Measure a mesh and make the part it describes.
 
     A mesh of over 200,000 triangles is measured as it is, so that poses, errors and the hash do not
-    depend on it, and then decimated for rendering, which the log says.
-
-    ``mesh`` is None for an object known by its ADD points only; ``points`` are by default 2,000
-    fixed-seed samples of the surface; ``unit`` is that of the file, named when the size is
-    unlikely.
+    depend on it, and then decimated for rendering, which the log says. ``mesh`` is None for an
+    object known by its ADD points only; ``points`` are by default 2,000 fixed-seed samples of the
+    surface; ``unit`` is that of the file, named when the size is unlikely.
 
     Raises:
         UserError: The name is empty or too long, the diameter lies outside 5 mm – 5 m, or the mesh
             has too many triangles of which no larger ones can be made.
-        ValueError: There is neither a mesh nor points.
     """
     check_name(name)
     outline = points if mesh is None else mesh.vertices
@@ -209,11 +201,7 @@ def _check_diameter(diameter: float, name: str, unit: str) -> None:
 
 
 def check_name(name: object) -> str:
-    """Return a part's name after checking that it can label instances.
-
-    Raises:
-        UserError: It is no text, empty, over 200 characters or has characters that do not print.
-    """
+    """Return a name that can label instances: a text of 1 to 200 printable characters."""
     if isinstance(name, str) and 0 < len(name) <= MAX_NAME and name.isprintable():
         return name
     got = (

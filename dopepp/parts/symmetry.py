@@ -2,11 +2,13 @@
 
 A rotation is a symmetry when it takes no point of the surface farther from the surface than a
 tolerance, a share of the diameter. Mirror images are none: no motion makes one out of a part.
-Texture is not looked at.
+Texture is not looked at. The search is on a normalised shape: its surface's centroid, which every
+symmetry leaves where it is, at the origin, and a diameter of 1.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -14,11 +16,22 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
-from dopepp.geometry.rotation import RotationMatrix, Vector, rotation_angle
+from dopepp.geometry.rotation import (
+    RotationMatrix,
+    Vector,
+    rotation_angle,
+    rotation_vector_to_matrix,
+)
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
-from dopepp.parts.mesh.measure import Points, SurfaceTree, largest_distance
+from dopepp.parts.mesh.measure import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
-from dopepp.parts.symmetry_candidates import Candidates, turn
+
+_ROUGH: Final = 0.06
+"""Mean distance, in diameters, from which on a turn is no symmetry seen from 2.6° beside it."""
+
+_GIVE: Final = 0.02
+"""Distance, in diameters, from which on a point pulls with constant force: it may belong to a
+feature that has no counterpart."""
 
 TOLERANCE: Final = 0.01
 """Share of the diameter by which a symmetry may miss the surface."""
@@ -29,36 +42,18 @@ SMALLEST_TOLERANCE: Final = 1e-4
 MAX_ORDER: Final = 12
 """Turns in a full one about an axis of discrete symmetry, at most."""
 
-_PRIMES: Final = (11, 7, 5, 3, 2)
-"""Every axis of up to twelve turns has one of these. The largest first: it finds round shapes."""
-
-_NUM_ANGLES: Final = 36
-"""Turns that tell a round shape, spread over all angles by the golden ratio, so that they hit the
-worst angle of a prism with any number of sides within a few per cent of a side."""
-
 _NUM_PROBES: Final = 8000
-_CLOSER_LOOK: Final = 48
-"""Triangles that a point is measured against before it is said to miss the surface."""
-_AT_A_TIME: Final = 300
-_DIGITS: Final = 12
 
 Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry, ...]]
 
 
 def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
-    """Find the rigid transforms that map a mesh onto itself.
+    """Find the rigid transforms that map a mesh onto itself, however its surface is cut.
 
-    Args:
-        mesh: The part's triangles, metres; how a surface is cut into triangles does not matter.
-        tolerance: Largest distance of a moved surface point from the surface, in diameters.
-
-    Returns:
-        The discrete symmetries without the identity, metres: with the identity they form a group,
-        and a round part's flip stands for all its flips. And the axes of continuous symmetry as
-        (axis, offset), three for a ball.
-
-    Raises:
-        UserError: The tolerance is not in 1e-4 … 0.1.
+    The discrete ones come without the identity, metres: with the identity they form a group, and a
+    round part's flip stands for all its flips. Then come the axes of continuous symmetry as (axis,
+    offset), three for a ball. ``tolerance`` is the largest distance of a moved surface point from
+    the surface, in diameters; a UserError, if it is not in 1e-4 … 0.1.
     """
     if not SMALLEST_TOLERANCE <= tolerance <= LARGEST_TOLERANCE:
         raise UserError(
@@ -102,16 +97,18 @@ class _Shape:
             # the farthest first.
             rough = self.surface.distances(moved, neighbours=1)
             doubtful = moved[np.argsort(-rough)[: (rough > self.tolerance).sum()]]
-            for start in range(0, len(doubtful), _AT_A_TIME):
-                some = doubtful[start : start + _AT_A_TIME]
-                if self.surface.distances(some, _CLOSER_LOOK).max() > self.tolerance:
+            for start in range(0, len(doubtful), 300):
+                some = doubtful[start : start + 300]
+                if self.surface.distances(some, neighbours=48).max() > self.tolerance:
                     return False
         return True
 
     def is_round(self, axis: Vector) -> bool:
         """Tell whether every turn about an axis fits."""
+        # Spread over all angles by the golden ratio, 36 turns hit the worst angle of a prism with
+        # any number of sides within a few per cent of a side.
         golden = (np.sqrt(5) - 1) / 2
-        angles = 2 * np.pi * (golden * np.arange(1, _NUM_ANGLES + 1) % 1)
+        angles = 2 * np.pi * (golden * np.arange(1, 37) % 1)
         return all(self.fits(turn(axis, float(angle))) for angle in angles)
 
     def order(self, axis: Vector, prime: int) -> int:
@@ -138,14 +135,16 @@ def _search(shape: _Shape) -> tuple[Vector | None, list[RotationMatrix]]:
     candidates = Candidates(shape.surface)
     generators: list[tuple[int, RotationMatrix]] = []
     group = np.eye(3)[None]
-    for prime in _PRIMES:
+    # Every axis of up to twelve turns has one of these. The largest first: it finds round shapes.
+    for prime in (11, 7, 5, 3, 2):
         for axis in candidates.axes(prime):
             rotation = turn(axis, 2 * np.pi / prime)
             away = rotation_angle(rotation @ np.swapaxes(group, 1, 2)).min()
             if away <= SAME_TURN or not shape.fits(rotation):
                 continue
             if shape.is_round(axis):
-                return _signed(axis), []
+                # Its largest coordinate is positive.
+                return axis * np.sign(axis[np.abs(axis).argmax()]), []
             order = shape.order(axis, prime)
             generators.append((order, turn(axis, 2 * np.pi / order)))
             known = exact_group(np.array([one for _, one in generators]))
@@ -167,16 +166,123 @@ def _largest_group(
     return group[1:]
 
 
+class Candidates:
+    """Axes about which a turn by 2π / order may be a symmetry."""
+
+    def __init__(self, surface: SurfaceTree) -> None:
+        self._surface = surface
+        self._moments = second_moments(surface)
+        self._special = special_axes(surface)
+        self._axes = np.concatenate([self._special, half_sphere(1500)])  # each 2.6° away at most
+        self._rough_probes = surface.spread(48, seed=1)[0]
+        self._probes = surface.spread(400, seed=2)[0]
+
+    def axes(self, order: int) -> Iterator[Vector]:
+        """Yield refined axes of a prime order, those with the smallest rough distance first."""
+        turns = turn(self._axes, 2 * np.pi / order)
+        change = turns @ self._moments @ np.swapaxes(turns, 1, 2) - self._moments
+        scale = np.linalg.norm(self._moments)
+        # A half turn that is 2.6° off changes the moments of a rod by 0.13 of them.
+        possible = np.linalg.norm(change, axis=(1, 2)) <= 0.2 * scale
+        index = np.flatnonzero(possible)
+        moved = self._rough_probes @ np.swapaxes(turns[index], 1, 2)
+        rough = self._surface.distances(moved, neighbours=1).mean(axis=1)
+        index, rough = index[rough < _ROUGH], rough[rough < _ROUGH]
+        taken: list[Vector] = []
+        for number in index[np.argsort(rough, kind="stable")]:
+            axis = self._axes[number]
+            # Of axes within 8°, the best is refined.
+            if taken and np.abs(np.array(taken) @ axis).max() > np.cos(np.radians(8.0)):
+                continue
+            taken.append(axis)
+            yield self._refined(axis, order, special=number < len(self._special))
+            if len(taken) == 24:  # the most that a solid has are the icosahedron's 15
+                return
+
+    def _refined(self, axis: Vector, order: int, special: bool) -> Vector:
+        """Aim an axis so that the turned surface lies on the surface as well as it can."""
+        rotation = turn(axis, 2 * np.pi / order)
+        for _ in range(12):
+            step = self._step(rotation)
+            rotation = turn(step, 1.0) @ rotation
+            if np.linalg.norm(step) < 1e-6:  # a thousandth of any tolerance
+                break
+        # The axis as an eigenvector: a half turn's skew part, which others would give, vanishes.
+        better = np.asarray(np.linalg.eigh(rotation + rotation.T)[1][:, -1])
+        better = better if better @ axis > 0 else -better
+        # Special axes are exact, such as one along an edge: only a much smaller error tells more.
+        if special and self._error(better, order) > 0.8 * self._error(axis, order):
+            return axis
+        return better
+
+    def _step(self, rotation: RotationMatrix) -> Vector:
+        """Return the rotation vector that brings the turned points nearest to their planes."""
+        moved = self._probes @ rotation.T
+        closest, normals = self._surface.nearest(moved)
+        away = ((closest - moved) * normals).sum(axis=1)
+        weight = np.minimum(1.0, _GIVE / np.maximum(np.abs(away), _GIVE))
+        lever = np.cross(moved, normals)
+        # The damping stands still in directions that slide the surface along itself.
+        normal_matrix = (lever * weight[:, None]).T @ lever + 1e-4 * np.eye(3)
+        return np.asarray(np.linalg.solve(normal_matrix, lever.T @ (weight * away)))
+
+    def _error(self, axis: Vector, order: int) -> float:
+        moved = self._probes @ turn(axis, 2 * np.pi / order).T
+        return float(np.sqrt((self._surface.distances(moved) ** 2).mean()))
+
+
+def turn(axis: Float[np.ndarray, "*batch 3"], angle: float) -> Float[np.ndarray, "*batch 3 3"]:
+    """Return the rotation by an angle (radians) about a unit axis."""
+    return rotation_vector_to_matrix(angle * axis)
+
+
+def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
+    """Return the mean of x·xᵀ over the surface, exactly."""
+    corners = surface.triangles
+    sums = corners.sum(axis=1)
+    # Over a triangle the mean of x·xᵀ is (Σ vᵢvᵢᵀ + s·sᵀ)/12 with s = Σ vᵢ.
+    products = np.einsum("nki,nkj->nij", corners, corners) + sums[:, :, None] * sums[:, None]
+    return np.asarray(np.tensordot(surface.areas, products / 12, axes=1) / surface.areas.sum())
+
+
+def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
+    """Return axes that are exact where they are right.
+
+    They are the coordinate axes, the principal axes of the moments, the directions of the largest
+    flat areas, and these directions' sums, differences and cross products, which are the axes of
+    regular solids.
+    """
+    normals = _main_normals(surface)
+    first, second = np.triu_indices(len(normals), 1)
+    pairs = normals[first], normals[second]
+    axes = np.concatenate(
+        [
+            np.eye(3), np.linalg.eigh(second_moments(surface))[1].T, normals,
+            pairs[0] + pairs[1], pairs[0] - pairs[1], np.cross(*pairs),
+        ]
+    )  # fmt: skip
+    lengths = np.linalg.norm(axes, axis=1)
+    return np.asarray(axes[lengths > 0.1] / lengths[lengths > 0.1, None])
+
+
+def _main_normals(surface: SurfaceTree) -> Float[np.ndarray, "clusters 3"]:
+    """Return the directions with the most area, opposite ones as one."""
+    # The largest triangles suffice: flat areas that matter have some among them.
+    largest = np.argsort(-surface.areas, kind="stable")[:3000]
+    normals, areas = surface.normals[largest], surface.areas[largest].copy()
+    found: list[Vector] = []
+    while len(found) < 8 and areas.any():
+        alike = np.abs(normals @ normals[areas.argmax()]) > np.cos(np.radians(5.0))
+        found.append(normals[areas.argmax()])
+        areas[alike] = 0
+    return np.array(found)
+
+
 def _across(axis: Vector) -> Vector:
     """Return a direction across an axis, a coordinate axis where one is."""
     nearest = np.eye(3)[np.abs(axis).argmin()]
     across = nearest - (nearest @ axis) * axis
     return np.asarray(across / np.linalg.norm(across))
-
-
-def _signed(axis: Vector) -> Vector:
-    """Point an axis so that its largest coordinate is positive."""
-    return axis if axis[np.abs(axis).argmax()] > 0 else -axis
 
 
 def _some(points: Points) -> Float[np.ndarray, "some 3"]:
@@ -186,4 +292,4 @@ def _some(points: Points) -> Float[np.ndarray, "some 3"]:
 
 def _clean(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Round away what sine and cosine leave of zeros and ones."""
-    return np.asarray(np.round(values, _DIGITS) + 0.0)
+    return np.asarray(np.round(values, 12) + 0.0)

@@ -4,8 +4,7 @@ from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.distractors import Distractors
-from dopepp.virtual.presets.lighting import Lighting
-from dopepp.virtual.presets.materials import Materials
+from dopepp.virtual.presets.looks import Lighting, Materials
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,

@@ -29,23 +29,8 @@ from dopepp.virtual.surface import Surface, make_surface
 
 _log = logging.getLogger(__name__)
 
-REACH: Final = 0.2
-"""Of the part's extent on the image, read to each side of the contour."""
-
-LEAST_REACH_PX: Final = 6
-SHARP: Final = 0.12
-BROAD: Final = 0.4
-"""Widths of "at the contour", of the reach: the sharp one tells good poses apart, the broad one bad
-ones."""
-
-WIDEST_CREASE: Final = 0.9
-"""Cosine between the normals of neighbouring pixels below which there is a crease (26°)."""
-
 MOST_POINTS: Final = 1500
 """Contour pixels that are read."""
-
-BLUR_PX: Final = 1.0
-"""Of the image before its gradient is taken, against noise."""
 
 FLOOR: Final = 2.0
 """Gradient, grey levels a pixel, that noise has: a profile of nothing else agrees with nothing."""
@@ -62,11 +47,14 @@ def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Su
     contour, extent = _contour(SceneObject(surface, T_cam_obj), K, image.shape[1::-1])
     if not len(contour):
         return 0.0
-    reach = max(LEAST_REACH_PX, round(REACH * extent))
+    # Pixels that are read to each side of the contour.
+    reach = max(6, round(0.2 * extent))
     profiles = _profiles(image, contour, reach)
     offsets = np.arange(-reach, reach + 1)
     total = 0.0
-    for width in (SHARP, BROAD):
+    # "At the contour" is so wide, of the reach: the sharp width tells good poses apart, the broad
+    # one bad ones.
+    for width in (0.12, 0.4):
         kernel = np.exp(-0.5 * (offsets / (width * reach)) ** 2)
         shifted = cv2.filter2D(profiles, -1, kernel[None], borderType=cv2.BORDER_CONSTANT)
         best = shifted.max(axis=1) + FLOOR**2 * kernel.sum()
@@ -81,13 +69,8 @@ def meshes_of(
 
     ``given`` are built-in parts, which need not be given, mesh files named as the part, or
     ``NAME=FILE``. A single file stands for a single part whatever its name. ``unit`` is the files'.
-
-    Returns:
-        A surface for every known part, by name. A mesh other than the one that was trained on is
-        used, and the log warns of it.
-
-    Raises:
-        UserError: A part has no mesh, a given one is not known, or a file cannot be used.
+    A mesh other than the one that was trained on is used, and the log warns of it. A UserError: a
+    part has no mesh, a given one is not known, or a file cannot be used.
     """
     names = [part.name for part in known]
     chosen = {name: name for name in names if name in BUILTIN}
@@ -155,7 +138,8 @@ def _edges(item: SceneObject, ids: Int[np.ndarray, "height width"]) -> Mask:
     edges = np.zeros(ids.shape, bool)
     # Every pixel with the one below it, then with the one to the right.
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        crease = (drawn[first] * drawn[second]).sum(axis=-1) < WIDEST_CREASE
+        # Of a crease, the normals differ by over 26°.
+        crease = (drawn[first] * drawn[second]).sum(axis=-1) < 0.9
         edges[first] |= crease & ((ids[first] >= 0) | (ids[second] >= 0))
     return edges
 
@@ -173,7 +157,8 @@ def _profiles(
     image: Picture, contour: Float[np.ndarray, "points 4"], reach: int
 ) -> Float[np.ndarray, "points offsets"]:
     """Return the squared gradient along the normals, from ``-reach`` to ``reach`` pixels."""
-    soft = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+    # Blurred by a pixel against noise.
+    soft = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
     # Scharr's filter weighs 16 on each side, two pixels apart.
     gx = cv2.Scharr(soft, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(soft, cv2.CV_32F, 0, 1, scale=1 / 32)

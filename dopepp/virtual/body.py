@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,12 +15,6 @@ from dopepp.parts.mesh.measure import Vertices
 from dopepp.parts.part import Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface
-
-_COPLANAR_DEG: Final = 0.05
-"""Neighbouring triangles of a hull whose normals differ by less are one face."""
-
-_LEAST_SHARE: Final = 0.002
-"""Faces under which a body comes to rest more rarely than this are left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +99,7 @@ class Hull:
         largest = np.zeros(number, np.int64)
         order = np.argsort(areas, kind="stable")
         largest[self.facets[order]] = order  # the last one written is the largest
-        chosen = np.flatnonzero(stable & (shares > _LEAST_SHARE))
+        chosen = np.flatnonzero(stable & (shares > 0.002))  # rarer ones are left out
         if not len(chosen):
             # A ball of thousands of faces rests on any of them, each rarely.
             chosen = np.flatnonzero(stable)
@@ -145,9 +138,9 @@ def _outward(hull: ConvexHull) -> Int[np.ndarray, "triangles 3"]:
 
 
 def _facets(hull: ConvexHull) -> Int[np.ndarray, "triangles"]:
-    """Number the flat faces: neighbouring triangles with one normal share a number."""
+    """Number the flat faces: neighbours whose normals differ by less than 0.05° share a number."""
     normals = hull.equations[:, :3]
-    cosine = np.cos(np.radians(_COPLANAR_DEG))
+    cosine = np.cos(np.radians(0.05))
     numbers = np.full(len(normals), -1)
     for seed in range(len(normals)):
         if numbers[seed] >= 0:

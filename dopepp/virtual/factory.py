@@ -31,13 +31,9 @@ class Factory:
     """Renders labelled images of parts; image (epoch, index) depends on nothing but the seed.
 
     A factory can be pickled and forked: it holds no generator, so any process renders the same
-    bytes for the same (seed, epoch, index), in any order.
-
-    Args:
-        seed: Non-negative seed of the whole supply.
-        backgrounds: Where backgrounds come from; procedural ones if not given.
-        negatives: Parts that are shown among the distractors, so that a network learns not to
-            find them; the built-in parts that are no targets are always among them.
+    bytes for the same (seed, epoch, index), in any order. Backgrounds are procedural if not given.
+    ``negatives`` are parts that are shown among the distractors, so that a network learns not to
+    find them; the built-in parts that are no targets are always among them.
 
     Raises:
         UserError: There is no part, a part has no mesh, two share a name, a negative is a target
@@ -77,11 +73,8 @@ class Factory:
         """Render an image with its ground truth, as the scene's sensor takes it.
 
         ``scale`` is how many times as large its parts appear: the camera of the same scene, moved
-        (see :mod:`dopepp.virtual.arrange.random_scene`).
-
-        Raises:
-            UserError: The preset cannot show the part, or the camera cannot stand there (see
-                :func:`random_scene`).
+        (see :mod:`dopepp.virtual.arrange.random_scene`). A UserError, where the preset cannot show
+        the part, or the camera cannot stand there.
         """
         rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))

@@ -20,7 +20,6 @@ from numpy.random import Generator
 
 from dopepp.core.checks import check_number, check_range
 from dopepp.core.compiled import Array, compiled
-from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.scene import Sensor
 from dopepp.virtual.tone import decode_srgb, encode_srgb
@@ -30,12 +29,6 @@ _NOISE_VALUES: Final = 65536
 
 _NOISE_RUN: Final = 1024
 """So many values are read in a row; then the hash chooses another place of the table and a sign."""
-
-_MAX_MOTION_PX: Final = 200.0
-"""Longest motion blur; its kernel's cost grows with the length."""
-
-_SMALLEST_BLUR_PX: Final = 0.1
-"""A Gaussian this narrow leaves every 8-bit picture as it is."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +102,10 @@ def capture(image: Picture, sensor: Sensor) -> Picture:
 
     Exposure works on linear light. Both blurs work on the sRGB picture, which spreads highlights
     a little less than light would.
-
-    Raises:
-        UserError: A setting is outside of what :class:`~dopepp.virtual.scene.Sensor` says.
     """
-    _check(sensor)
     if sensor.exposure_ev:
         image = np.asarray(cv2.LUT(image, _exposure_curve(sensor.exposure_ev)))
-    if sensor.blur_px >= _SMALLEST_BLUR_PX:
+    if sensor.blur_px >= 0.1:  # a narrower one leaves every 8-bit picture as it is
         image = defocus(image, sensor.blur_px)
     if any(sensor.motion_px):
         image = motion_blur(image, sensor.motion_px)
@@ -234,25 +223,3 @@ def _mixed(h: np.uint32) -> np.uint32:
     h = np.uint32(h ^ (h >> np.uint32(15)))
     h = np.uint32(h * np.uint32(0x846CA68B))
     return np.uint32(h ^ (h >> np.uint32(16)))
-
-
-def _check(sensor: Sensor) -> None:
-    """Refuse settings that no camera has."""
-    quality = sensor.jpeg_quality
-    numbers = (
-        sensor.exposure_ev, sensor.blur_px, *sensor.motion_px, sensor.read_noise, sensor.shot_noise,
-    )  # fmt: skip
-    sensible = (
-        all(math.isfinite(value) for value in numbers)
-        and min(sensor.blur_px, sensor.read_noise, sensor.shot_noise) >= 0
-        and math.hypot(*sensor.motion_px) <= _MAX_MOTION_PX
-        and (quality is None or 1 <= quality <= 100)
-        and 0 <= sensor.noise_seed < 2**32
-    )
-    if not sensible:
-        raise UserError(
-            f"{sensor}",
-            f"finite numbers, blur and noise >= 0, motion up to {_MAX_MOTION_PX:g} px, JPEG "
-            "quality 1 to 100, a seed from 0 to 2**32 - 1",
-            "change the sensor's settings",
-        )

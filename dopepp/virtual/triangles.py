@@ -35,6 +35,8 @@ EdgeFunctions = tuple[float, float, float, float, float, float, float, float, fl
 # Plain literals would turn the arithmetic into float64.
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
+_pool = threading.local()
+
 
 @compiled()
 def project_vertices(vertices: Array, T_cam_obj: Array, K: Array, cam: Array, hom: Array) -> None:
@@ -96,16 +98,11 @@ def rasterise(
 ) -> None:
     """Draw triangles into a sample buffer of inverse depth (1/m, 0 = empty) and triangle ids.
 
-    Args:
-        hom: Homogeneous pixel coordinates of the vertices, shape (V, 3).
-        faces: Vertex indices, shape (F, 3).
-        cull: Drop back faces (watertight meshes only).
-        near: Samples closer than this many metres are dropped.
-        origin: Pixel (x, y) of the buffer's first element.
-        samples: Offsets of a pixel's samples from its centre, shape (S, 2), |offset| <= 1/4.
-        inverse_depth: Buffer of shape (height, width, S), float32, updated in place.
-        ids: Buffer of the same shape, int32, updated in place.
-        first_id: Id of the first triangle.
+    ``hom`` are the vertices' homogeneous pixels, shape (V, 3), ``faces`` their indices, shape (F,
+    3); ``cull`` drops back faces (watertight meshes only). Samples nearer than ``near`` metres are
+    dropped. ``origin`` is the pixel (x, y) of the buffer's first element; ``samples`` are a pixel's
+    offsets from its centre, shape (S, 2), up to 1/4. Updated in place, both of shape (height,
+    width, S), are ``inverse_depth``, float32, and ``ids``, int32, which count from ``first_id``.
     """
     height, width, num_samples = inverse_depth.shape
     x0, y0 = origin
@@ -225,13 +222,9 @@ def open_share(u: Scalar, v: Scalar, inverse: Scalar, inverse_depth: Array) -> S
 def lit_share(x: Scalar, y: Scalar, z: Scalar, inverse_depth: Array, P: Array) -> Scalar:
     """Return the share of a point's neighbourhood in a shadow map that sees the light.
 
-    Args:
-        x: The point, like y and z; metres, float32.
-        y: Idem.
-        z: Idem.
-        inverse_depth: The map, 1/m, shape (height, width, 1), float32.
-        P: Projects the point into the map: homogeneous pixels, of which the third is the depth,
-            shape (3, 4), float32.
+    The point is in metres; ``inverse_depth`` is the map, 1/m, shape (height, width, 1). ``P``
+    projects the point into it: homogeneous pixels, of which the third is the depth, shape (3, 4).
+    All are float32.
     """
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     if depth <= _ZERO:
@@ -242,30 +235,14 @@ def lit_share(x: Scalar, y: Scalar, z: Scalar, inverse_depth: Array, P: Array) -
     return open_share(u, v, inverse, inverse_depth)
 
 
-class _Pool(threading.local):
-    """One thread's memory by name; it grows to the largest image and stays.
-
-    Large arrays come from the system as fresh pages, each cleared on its first touch: 3 to 5 ms
-    of an image of 640×480 pixels.
-    """
-
-    def __init__(self) -> None:
-        self.blocks: dict[str, NDArray[np.uint8]] = {}
-
-
-_pool = _Pool()
-
-
 def scratch(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array of any content, valid until this thread asks for the same name again.
 
-    Args:
-        name: Who uses it for what; two arrays in use at a time need two names.
-        shape: Of the array.
-        dtype: Of its elements.
+    The memory grows to the largest image and stays. Fresh one comes from the system as pages that
+    are cleared on their first touch: 3 to 5 ms of an image of 640×480 pixels.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    block = _pool.blocks.get(name)
-    if block is None or len(block) < size:
-        block = _pool.blocks[name] = np.empty(size, np.uint8)
-    return block[:size].view(dtype).reshape(shape)
+    blocks: dict[str, NDArray[np.uint8]] = vars(_pool)
+    if name not in blocks or len(blocks[name]) < size:
+        blocks[name] = np.empty(size, np.uint8)
+    return blocks[name][:size].view(dtype).reshape(shape)

@@ -108,9 +108,3 @@ def test_ratios_are_evenly_spaced_and_marked_where_they_were_measured():
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0.5", "1", "2"]
     left, middle, right = axes.transData.transform([(x, 0) for x in (0.5, 1, 2)])[:, 0]
     assert middle - left == pytest.approx(right - middle)
-
-
-@pytest.mark.parametrize(("panels", "columns"), [({}, 2), ({"a": {}}, 0)])
-def test_nothing_to_draw_is_refused(panels, columns):
-    with pytest.raises(ValueError, match=f"got {len(panels)} and {columns}"):
-        rates_figure(panels, "x", columns)

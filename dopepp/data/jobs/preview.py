@@ -16,9 +16,8 @@ from dopepp.data.jobs.job import Job
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.drawing.overlay import Wireframe, overlay
-from dopepp.drawing.panels import COLOURS, depth_panel, draw_axes, mask_panel
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.drawing.sheet import COLOURS, Tile, contact_sheet, depth_panel, draw_axes, mask_panel
 from dopepp.geometry.camera import CameraMatrix, project, resize_points, transform
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered

@@ -18,11 +18,16 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png, write_whole
 from dopepp.data.sample import Sample
-from dopepp.drawing.curves import accuracy_figure, figure_image, save_accuracy_curves
+from dopepp.drawing.curves import (
+    PlotLine,
+    accuracy_figure,
+    figure_image,
+    lines_figure,
+    save_accuracy_curves,
+)
 from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
-from dopepp.drawing.panels import PlotLine, grid, lines_figure, message_picture
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_picture
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.config.data import chosen_data, trained_on
 from dopepp.experiment.reports.differences import figures, full, headline, notes

@@ -21,15 +21,8 @@ from dopepp.parts.mesh.measure import Faces, Vertices, face_areas
 MAX_FACES: Final = 200_000
 """Triangles of a part's mesh: on a part that fills 640×480 pixels, over one for two pixels."""
 
-_ATTEMPTS: Final = 12
-"""Sizes of the cell that are tried: each brings the number of triangles closer to the limit."""
-
 _WELL_USED: Final = 0.85
 """Share of the limit that is good enough to stop trying."""
-
-_STIFFNESS: Final = 1e-3
-"""Pull towards the mean of a cell's vertices, against the planes' pull of 1: where the planes leave
-a direction open, as on a flat side, it decides."""
 
 
 def decimate(
@@ -46,10 +39,8 @@ def decimate(
     """Replace triangles by at most ``max_faces`` larger ones; return the farthest move, too.
 
     All ``faces`` have an area. Vertices that share a position and a cell but no edge, such as those
-    on both sides of a seam, keep texture coordinates of their own.
-
-    Raises:
-        ValueError: No grid leaves a triangle, because all of them are tiny and apart.
+    on both sides of a seam, keep texture coordinates of their own. A ValueError: no grid leaves a
+    triangle, because all of them are tiny and apart.
     """
     cells, kept = _cluster(vertices, faces, max_faces)
     placed = _place(vertices, faces, cells)
@@ -71,7 +62,7 @@ def _cluster(
     # A square of a surface that passes through a cell becomes two triangles.
     side = float(np.sqrt(2 * face_areas(vertices, faces).sum() / max_faces))
     best_cells, best_kept = np.zeros(len(vertices), np.int64), np.zeros(0, np.int64)
-    for _ in range(_ATTEMPTS):
+    for _ in range(12):
         cells = _cells(vertices, side)
         kept = _surviving(cells[faces])
         if len(best_kept) < len(kept) <= max_faces:
@@ -140,7 +131,8 @@ def _place(
             targets[:, i] += np.bincount(owners, normals[:, i] * heights, minlength=len(means))
             for j in range(3):
                 matrices[:, i, j] += np.bincount(owners, products[:, i, j], minlength=len(means))
-    pull = _STIFFNESS * np.trace(matrices, axis1=1, axis2=2)
+    # Where the planes leave a direction open, as on a flat side, the mean of the vertices decides.
+    pull = 1e-3 * np.trace(matrices, axis1=1, axis2=2)
     # Vertices without any triangle stay at their mean.
     pull = np.where(pull > 0, pull, 1.0)
     matrices += pull[:, None, None] * np.eye(3)

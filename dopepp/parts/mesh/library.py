@@ -30,9 +30,6 @@ from dopepp.parts.mesh.measure import RawMesh, Vertices, weld
 MAX_UNPACKED_BYTES: Final = 50_000_000
 """Of the text in a 3MF file: trimesh takes 17 times as much memory."""
 
-MAX_RATIO: Final = 30
-"""Bytes that a byte of a 3MF file unpacks to, over five megabytes: models have 5 to 15."""
-
 MAX_PIECES: Final = 1000
 """Meshes that make up one part: far above any part's bodies, and a bound on time."""
 
@@ -46,9 +43,6 @@ _STL_HEADER: Final = 84
 _STL_TRIANGLE: Final = 50
 """Bytes. A binary STL file is a title, the number of triangles (uint32), and the triangles."""
 
-_FACET: Final = re.compile(rb"\bfacet\s+normal\b", re.IGNORECASE)
-"""What begins a triangle in text."""
-
 MAX_HEADER_BYTES: Final = 10_000_000
 """Of the JSON: Python takes twenty times as much memory."""
 
@@ -57,16 +51,14 @@ MAX_VALUES: Final = 30_000_000
 
 _FLOAT: Final = 5126
 _TRIANGLES: Final = 4
-_FAN: Final = 6
-"""glTF's numbers of a type and of two modes; lower modes are points and lines."""
+"""glTF's numbers of a type and of a mode; lower modes are points and lines."""
 
 
 def read_stl(path: Path) -> RawMesh:
     """Read a binary or text STL file, with the corners that its triangles share merged.
 
-    Raises:
-        ValueError: The file is cut short, is longer than the number of its triangles says, or has a
-            coordinate that is not finite.
+    A ValueError: it is cut short or longer than the number of its triangles says, or a coordinate
+    is not finite.
     """
     data = path.read_bytes()
     num_triangles = int.from_bytes(data[_STL_HEADER - 4 : _STL_HEADER], "little")
@@ -80,7 +72,8 @@ def read_stl(path: Path) -> RawMesh:
         )
     (vertices, faces, *_), _ = read_scene(data, "stl")
     # trimesh leaves out a text file's last solid if it is cut short.
-    begun = sum(1 for _ in _FACET.finditer(data)) if is_text else len(faces)
+    facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)
+    begun = sum(1 for _ in facets) if is_text else len(faces)
     if begun != len(faces):
         raise ValueError(f"{begun} facets begun and {len(faces)} ended")
     finite = np.isfinite(vertices).all(axis=1)
@@ -94,18 +87,17 @@ def read_stl(path: Path) -> RawMesh:
 
 
 def read_3mf(path: Path) -> RawMesh:
-    """Read what a 3MF file's build shows, in the unit that it states.
+    """Read what a 3MF file's build shows, in the unit that it states; a UserError for an odd one.
 
-    Raises:
-        UserError: The unit is not one of ours.
-        ValueError: The file is no whole archive, unpacks to too much, declares a document type,
-            shows objects of other files, or ones that are not above their users.
+    A ValueError: the file is no whole archive, unpacks to too much, declares a document type, shows
+    objects of other files, or ones that are not above their users.
     """
     size = path.stat().st_size
     _check_size(size)
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
-        _check_size(unpacked, max(MAX_UNPACKED_BYTES // 10, MAX_RATIO * size))
+        # Models unpack to 5 to 15 times their size.
+        _check_size(unpacked, max(MAX_UNPACKED_BYTES // 10, 30 * size))
         names = [name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()]
         if len(names) != 1:
             raise ValueError(f"{len(names)} 3D/3dmodel.model where one must be")
@@ -158,9 +150,8 @@ def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
 def read_glb(path: Path) -> RawMesh:
     """Read what a GLB file's scene shows, in metres, with its one texture.
 
-    Raises:
-        UserError: It needs other files, or its faces have several textures.
-        ValueError: It is cut short, damaged or too large, or has what is not read.
+    A UserError: it needs other files, or its faces have several textures. Other ValueErrors: it is
+    cut short, damaged or too large, or has what is not read.
     """
     header, binary = _chunks(path.read_bytes())
     files = [entry for kind in ("buffers", "images") for entry in header.get(kind, ())]
@@ -215,7 +206,7 @@ def _check(header: dict[str, Any], primitives: list[dict[str, Any]], num_bytes: 
     required = [name for name in header.get("extensionsRequired", ()) if "_materials_" not in name]
     if required:
         raise ValueError(f"the extension {required[0]}, which is not read")
-    if any(primitive.get("mode") == _FAN for primitive in primitives):
+    if any(primitive.get("mode") == 6 for primitive in primitives):
         raise ValueError("a fan of triangles, which is not read")
     accessors = header.get("accessors", ())
     if any("bufferView" not in array or "sparse" in array for array in accessors):
@@ -265,12 +256,9 @@ def _texture(header: dict[str, Any], binary: bytes, picture: int) -> Picture:
 def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     """Let trimesh read a file's content; without a path it can reach no other file.
 
-    Returns:
-        The meshes that it shows as one, with the unit as it names it, and their number.
-
-    Raises:
-        ValueError: A face has a vertex that its mesh has not, or there are too many triangles.
-        Exception: Whatever trimesh makes of a damaged file.
+    The meshes that it shows come as one, with the unit as it names it; then comes their number. A
+    ValueError: a face has a vertex that its mesh has not, or there are too many triangles. Any
+    other exception is what trimesh makes of a damaged file.
     """
     import trimesh  # takes a while: only for those who read such a file
 

@@ -32,14 +32,10 @@ SURFACE_SEED: Final = 2000
 _FEW_CORNERS: Final = 5000
 """Corners of a hull whose distances are all computed: a quarter of a second."""
 
-_NUM_DIRECTIONS: Final = 2500
-"""Directions along which a larger hull is measured: a second for 100,000 corners."""
-
 NUM_COVERING: Final = 60_000
 """Surface points of a :class:`SurfaceTree` besides vertices: about 0.6 % of a compact part's
 diameter apart."""
 
-_COVERING_SEED: Final = 17
 _NUM_NEIGHBOURS: Final = 6
 """Surface points whose triangles are measured: the nearest point's own is not always the nearest
 triangle along an edge."""
@@ -66,8 +62,7 @@ def sample_surface(
 ) -> Points:
     """Draw points uniformly over the surface: by area, and the same ones for the same seed.
 
-    Raises:
-        ValueError: The triangles have no area.
+    A ValueError, if the triangles have no area.
     """
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(face_areas(vertices, faces))
@@ -143,7 +138,7 @@ def _longest_of_directions(points: Points) -> Iterator[tuple[float, int]]:
     # Along a direction that is off the diameter's by an angle φ, they are apart by its cos φ at
     # least, and 2,500 directions leave φ under 2.42°.
     # Single precision finds the extreme points as well, in half of the time.
-    directions = half_sphere(_NUM_DIRECTIONS).astype(np.float32)
+    directions = half_sphere(2500).astype(np.float32)
     columns = np.ascontiguousarray((points - points.mean(axis=0)).T, np.float32)
     for start in range(0, len(directions), 16):
         along = directions[start : start + 16] @ columns
@@ -184,10 +179,8 @@ class SurfaceTree:
     """A triangle mesh that answers how far points are from it.
 
     A point is measured against the triangles of its nearest surface points, so that its distance
-    is never too small, and too large by no more than the surface points are apart.
-
-    Raises:
-        ValueError: The triangles have no area.
+    is never too small, and too large by no more than the surface points are apart. A ValueError, if
+    the triangles have no area.
     """
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
@@ -199,7 +192,7 @@ class SurfaceTree:
         normals = np.cross(b - a, c - a)
         self.areas = np.linalg.norm(normals, axis=1) / 2
         self.normals = normals / (2 * self.areas[:, None])
-        points, self._owners = self.spread(NUM_COVERING, _COVERING_SEED)
+        points, self._owners = self.spread(NUM_COVERING, seed=17)
         own = np.arange(len(a))
         # Corners and centres give each triangle of a fine mesh a point of its own.
         self._tree = KDTree(

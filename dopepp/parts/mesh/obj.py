@@ -1,33 +1,80 @@
-"""Wavefront OBJ files: positions, faces, texture coordinates and one texture.
+"""OBJ files with one texture, OFF files, and polygons cut into triangles.
 
-trimesh does not read them: it leaves out faces that are cut short or written with tabs, takes
+trimesh does not read OBJ files: it leaves out faces that are cut short or written with tabs, takes
 index 0 for a vertex and relative ones from the file's end, loses a texture without a word, and
 splits vertices where normals differ, so that the mesh would be another one
 (``tests/parts/mesh/test_library.py``). Here a damaged line is an error that names it. Normals,
 groups, lines, colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its
-texture. The files that a mesh names are looked for in its own folder only.
+texture. The files that a mesh names are looked for in its own folder only. Nor does trimesh read
+OFF files: of one that is cut short it makes a smaller mesh, and it fails at polygons of more than
+four corners.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
-from dopepp.parts.mesh.measure import RawMesh
-from dopepp.parts.mesh.polygons import FoldedPolygonError, fans
+from dopepp.parts.mesh.measure import Faces, RawMesh, Vertices
+
+MAX_OFF_BYTES: Final = 50_000_000
+"""Of an OFF file: its words take fifteen times as much memory."""
 
 MAX_MATERIAL_BYTES: Final = 10_000_000
 """Size of a material file: a hundred thousand materials, and a bound on memory."""
 
 NO_COORDINATE: Final = -1
 """Index of the texture coordinate of a corner that has none."""
+
+
+def read_obj(path: Path) -> RawMesh:
+    """Read an OBJ file: vertices in the file's unit, faces, and uv and texture where it has one.
+
+    A textured vertex that has several texture coordinates (on a seam) becomes several vertices. A
+    UserError: a line is damaged, a polygon is not convex, a material file or a texture is missing,
+    outside of the folder or damaged, or there is more than one texture.
+    """
+    obj = ObjFile()
+    for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):
+        try:
+            obj.add(line, number)
+        except ValueError as error:
+            raise UserError(
+                f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})",
+                "a whole OBJ file whose faces name vertices above them",
+                "export the mesh again",
+            ) from error
+    positions = np.array(obj.positions, np.float64).reshape(-1, 3)
+    corners = np.array(obj.corners, np.int64).reshape(-1, 2)
+    try:
+        corners = corners[fans(positions, corners[:, 0], np.array(obj.counts, np.int64))]
+    except FoldedPolygonError as error:
+        raise UserError(
+            f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}",
+            "triangles and convex polygons",
+            "switch on 'triangulate' when exporting the mesh",
+        ) from error
+    texture = _texture(obj, path)
+    if texture is None:
+        return RawMesh(positions, corners[..., 0])
+    if (corners[..., 1] == NO_COORDINATE).any():
+        raise UserError(
+            f"textured mesh {path} with faces without texture coordinates",
+            "texture coordinates (vt) on every face",
+            "unwrap the whole mesh, or delete its map_Kd line",
+        )
+    pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
+    return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
 
 
 @dataclass
@@ -91,49 +138,6 @@ def _index(word: str, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def read_obj(path: Path) -> RawMesh:
-    """Read an OBJ file: vertices in the file's unit, faces, and uv and texture where it has one.
-
-    A textured vertex that has several texture coordinates (on a seam) becomes several vertices.
-
-    Raises:
-        UserError: A line is damaged, a polygon is not convex, a material file or a texture is
-            missing, outside of the folder or damaged, or there is more than one texture.
-    """
-    obj = ObjFile()
-    for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):
-        try:
-            obj.add(line, number)
-        except ValueError as error:
-            raise UserError(
-                f"mesh {path} with the damaged line {number} {line.strip()[:60]!r} ({error})",
-                "a whole OBJ file whose faces name vertices above them",
-                "export the mesh again",
-            ) from error
-    positions = np.array(obj.positions, np.float64).reshape(-1, 3)
-    corners = np.array(obj.corners, np.int64).reshape(-1, 2)
-    try:
-        corners = corners[fans(positions, corners[:, 0], np.array(obj.counts, np.int64))]
-    except FoldedPolygonError as error:
-        raise UserError(
-            f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}",
-            "triangles and convex polygons",
-            "switch on 'triangulate' when exporting the mesh",
-        ) from error
-    texture = _texture(obj, path)
-    if texture is None:
-        return RawMesh(positions, corners[..., 0])
-    if (corners[..., 1] == NO_COORDINATE).any():
-        raise UserError(
-            f"textured mesh {path} with faces without texture coordinates",
-            "texture coordinates (vt) on every face",
-            "unwrap the whole mesh, or delete its map_Kd line",
-        )
-    pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-    uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
-    return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
-
-
 def _texture(obj: ObjFile, path: Path) -> Picture | None:
     """Read the one texture that the used materials name, or return None if they name none."""
     if not obj.libraries:
@@ -195,10 +199,8 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
     """Return the path of a file that a mesh file names.
 
     ``name`` is relative to the mesh's folder, Windows separators are understood; ``statement``
-    tells, for the error, where it stands.
-
-    Raises:
-        UserError: The name leads out of the mesh's folder, or there is no such file.
+    tells, for the error, where it stands. A UserError: the name leads out of the mesh's folder, or
+    there is no such file.
     """
     folder = mesh_path.parent.resolve()
     written = PureWindowsPath(name)  # splits at / and at \, and knows C:
@@ -219,11 +221,7 @@ def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
 
 
 def read_texture(path: Path) -> Picture:
-    """Return an image as RGB, first row on top.
-
-    Raises:
-        UserError: It is no image, is damaged, or is larger than 8,192 pixels a side.
-    """
+    """Return an image as RGB; a UserError for a damaged one or one over 8,192 pixels a side."""
     try:
         return read_picture(path)
     except ValueError as error:
@@ -232,3 +230,81 @@ def read_texture(path: Path) -> Picture:
             f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels",
             "replace the image",
         ) from error
+
+
+def read_off(path: Path) -> RawMesh:
+    """Read an OFF file of triangles and convex polygons; colours are left out.
+
+    A ValueError: the file has other lines than it promises, a line fewer numbers than it promises,
+    or a polygon is not convex.
+    """
+    if path.stat().st_size > MAX_OFF_BYTES:
+        raise ValueError(f"over {MAX_OFF_BYTES / 1e6:.0f} MB of text")
+    header, mark, text = re.sub("#.*", "", path.read_text("utf-8")).partition("OFF")
+    if not mark or header.strip() not in ("", "C"):
+        raise ValueError("no OFF header")
+    promised, *rows = [line.split() for line in text.splitlines() if line.strip()]
+    num_vertices, num_faces = map(int, promised[:2])
+    if min(num_vertices, num_faces) < 0 or len(rows) != num_vertices + num_faces:
+        raise ValueError(
+            f"{len(rows)} lines where its header promises {num_vertices} vertices and "
+            f"{num_faces} faces"
+        )
+    vertices = np.array([row[:3] for row in rows[:num_vertices]], np.float64).reshape(-1, 3)
+    polygons = [[int(word) for word in row[: int(row[0]) + 1]] for row in rows[num_vertices:]]
+    for number, (count, *corners) in enumerate(polygons):
+        if len(corners) != count:
+            raise ValueError(f"face {number} of {count} corners, {len(corners)} in its line")
+    counts = np.array([count for count, *_ in polygons], np.int64)
+    row_of_corners = np.array([i for _, *corners in polygons for i in corners], np.int64)
+    return RawMesh(vertices, row_of_corners[fans(vertices, row_of_corners, counts)])
+
+
+def fans(
+    vertices: Vertices, corners: Int[np.ndarray, " corners"], counts: Int[np.ndarray, " polygons"]
+) -> Int[np.ndarray, "triangles 3"]:
+    """Cut polygons into fans of triangles around their first corners, as places in ``corners``.
+
+    ``corners`` has the vertex at each corner, one polygon behind the other; ``counts`` the corners
+    of each. A ValueError: a polygon has fewer than three corners or, as a
+    :class:`FoldedPolygonError`, is not convex. A vertex that is not there is the caller's to name.
+    """
+    if (counts < 3).any():
+        raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")
+    polygons = np.repeat(np.arange(len(counts)), counts - 2)
+    first = (np.cumsum(counts) - counts)[polygons]
+    # The how-many-th triangle of its polygon each one is.
+    turn = np.arange(len(polygons)) - (np.cumsum(counts - 2) - (counts - 2))[polygons]
+    triangles = np.stack([first, first + turn + 1, first + turn + 2], axis=1)
+    faces = corners[triangles]
+    if (counts > 3).any() and 0 <= faces.min() <= faces.max() < len(vertices):
+        folded = _folded(vertices, faces, polygons)
+        if folded.any():
+            raise FoldedPolygonError(int(polygons[folded.argmax()]))
+    return triangles
+
+
+class FoldedPolygonError(ValueError):
+    """The polygon of a number, from 0, is not convex: its fan of triangles is not its area."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"a polygon that is not convex, face {number}")
+        self.number = number
+
+
+def _folded(
+    vertices: Vertices, faces: Faces, polygons: Int[np.ndarray, " faces"]
+) -> Bool[np.ndarray, " faces"]:
+    """Tell triangles that face against their polygon, or whose polygon cancels out."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    totals = np.zeros((int(polygons[-1]) + 1, 3))
+    np.add.at(totals, polygons, normals)
+    squared = np.einsum("pi,pi->p", totals, totals)
+    # A triangle that is flat but for rounding may point anywhere.
+    folded = np.einsum("fi,fi->f", normals, totals[polygons]) < -1e-9 * squared[polygons]
+    # A bow tie's two halves cancel out.
+    parts = np.bincount(polygons, np.einsum("fi,fi->f", normals, normals))
+    tiny = 1e-12 * np.square(np.ptp(vertices, axis=0)).sum()
+    cancelled = (squared <= 1e-9 * parts) & (parts > tiny * tiny)
+    return np.asarray(folded | cancelled[polygons])

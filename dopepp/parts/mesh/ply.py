@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.parts.mesh.measure import RawMesh
-from dopepp.parts.mesh.obj import companion_path, read_texture
-from dopepp.parts.mesh.polygons import fans
+from dopepp.parts.mesh.obj import companion_path, fans, read_texture
 
 TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -63,10 +62,9 @@ Table = dict[str, NDArray[Any]]
 def read_ply(path: Path) -> RawMesh:
     """Read a PLY file and the texture it names in a ``TextureFile`` comment.
 
-    Raises:
-        UserError: The texture is missing, damaged or outside of the folder.
-        ValueError: The file is damaged, has no vertices or faces, has a polygon that is not convex,
-            or names several textures, or one without texture coordinates per vertex.
+    A UserError: the texture is missing, damaged or outside of the folder. Other ValueErrors: the
+    file is damaged, has no vertices or faces, has a polygon that is not convex, or names several
+    textures, or one without texture coordinates per vertex.
     """
     header, body = _split(path.read_bytes())
     lines = [line.split() for line in header.decode("utf-8", "surrogateescape").splitlines()]

@@ -1,7 +1,11 @@
 """Mesh files and YCB-Video models, in metres, checked before they are used.
 
-To add a format, write a reader that returns a `RawMesh` and raises for a
-damaged file, and one line in :data:`READERS`.
+Triangles are made to face the same way, and no vertex is moved. Self-intersecting triangles are not
+looked for: the depth test of every renderer shows the outermost surface whether triangles pass
+through each other or not.
+
+To add a format, write a reader that returns a :class:`RawMesh` and raises for a damaged file, and
+one line in :data:`READERS`.
 """
 
 from __future__ import annotations
@@ -9,22 +13,23 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from dopepp.core.errors import UserError
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
-from dopepp.parts.mesh.measure import Faces, Points, RawMesh, Vertices, face_areas
-from dopepp.parts.mesh.obj import read_obj
+from dopepp.parts.mesh.measure import Faces, Points, RawMesh, Vertices, face_areas, weld
+from dopepp.parts.mesh.obj import read_obj, read_off
 from dopepp.parts.mesh.ply import read_ply
-from dopepp.parts.mesh.polygons import read_off
-from dopepp.parts.mesh.topology import find_topology, opposed_faces, turn_over
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
 
 logger = logging.getLogger(__name__)
-
 ASSUMED_UNIT: Final = "mm"
 """What CAD programs write into files that cannot state a unit."""
 
@@ -46,17 +51,13 @@ READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
-    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file.
+    """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, as its suffix says, in metres.
 
-    Args:
-        path: The file; its suffix tells the format.
-        unit: The file's unit: mm, cm, m or inch. None takes the one that a 3MF file states, metres
-            for GLB, and millimetres for all others, which the log says.
-
-    Returns:
-        The mesh in metres: duplicate STL vertices merged, flat triangles dropped, triangles turned
-        to face as their neighbours do, uv and texture where an OBJ or PLY names a texture in its
-        own folder or a GLB has one. It may have open edges and triangles that intersect each other.
+    ``unit`` is the file's: mm, cm, m or inch. None takes the one that a 3MF file states, metres for
+    GLB, and millimetres for all others, which the log says. Duplicate STL vertices are merged, flat
+    triangles dropped, triangles turned to face as their neighbours do. There are uv and texture
+    where an OBJ or PLY names a texture in its own folder or a GLB has one. Edges may be open, and
+    triangles may intersect each other.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
@@ -100,21 +101,12 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     return mesh, taken
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long, for one
-        return False
-
-
 def ycb_part(root: str | Path, name: str) -> Part:
     """Make a part from a YCB-Video folder: ``models/NAME/points.xyz`` and ``textured.obj``.
 
     The ADD points are all of ``points.xyz``. Without a ``textured.obj`` the part has no mesh, and
-    its points give cuboid and diameter. Both files are in metres.
-
-    Raises:
-        UserError: The folder has no models, no model of that name, or one of its files is damaged.
+    its points give cuboid and diameter. Both files are in metres. A UserError: the folder has no
+    models, no model of that name, or one of its files is damaged.
     """
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
@@ -129,6 +121,13 @@ def ycb_part(root: str | Path, name: str) -> Part:
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
     mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
     return make_part(name, mesh, _read_points(points_path), unit="m")
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long, for one
+        return False
 
 
 def _read_points(path: Path) -> Points:
@@ -191,3 +190,112 @@ def _outward(path: Path, vertices: Vertices, faces: Faces) -> Faces:
 def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
     allowed = f"a whole mesh with triangles and finite coordinates, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {got}", allowed, fix)
+
+
+@dataclass(frozen=True)
+class Topology:
+    """The edges of triangles, where corners at one position are one.
+
+    Attributes:
+        num_open: Edges of one triangle: the rim of a hole.
+        neighbours: The two triangles at every other edge.
+        opposed: Whether these two run along the edge in the same direction, so that one of them
+            shows its inside where the other one shows its outside.
+    """
+
+    num_open: int
+    num_crowded: int
+    neighbours: Int[np.ndarray, "edges 2"]
+    opposed: Bool[np.ndarray, " edges"]
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether every edge has exactly two triangles."""
+        return self.num_open == self.num_crowded == 0
+
+
+def find_topology(vertices: Vertices, faces: Faces) -> Topology:
+    """Find the edges of triangles that all have an area."""
+    positions, corners = weld(vertices, faces)
+    start, end = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
+    # Both directions of an edge get one number; 2³¹ vertices squared still fit into an int64.
+    edges = np.minimum(start, end) * len(positions) + np.maximum(start, end)
+    order = np.argsort(edges, kind="stable")
+    first = np.flatnonzero(np.diff(edges[order], prepend=-1))
+    uses = np.diff(first, append=len(edges))
+    pairs = first[uses == 2]
+    one, other = order[pairs], order[pairs + 1]
+    return Topology(
+        num_open=int((uses == 1).sum()),
+        num_crowded=int((uses > 2).sum()),
+        neighbours=np.stack([one // 3, other // 3], axis=1),
+        opposed=start[one] == start[other],
+    )
+
+
+def opposed_faces(
+    vertices: Vertices, faces: Faces, topology: Topology
+) -> Bool[np.ndarray, " faces"]:
+    """Find triangles to turn over so that all of a connected surface face the same way.
+
+    In every connected surface those that face one way are kept and the others turned, whichever
+    have less area. A surface with one side only, such as a Möbius strip, is left as it is. Where
+    the surface is closed and faces inwards as a whole, everything is turned; so is then a single
+    body that faces inwards, unless the box of another one holds it, as it does for a cavity.
+    """
+    turned = np.zeros(len(faces), bool)
+    if topology.opposed.any():
+        turned = _minority(face_areas(vertices, faces), topology)
+    if topology.is_closed:
+        if _signed_volumes(vertices, turn_over(faces, turned)).sum() < 0:
+            turned = ~turned
+        turned ^= _inverted_bodies(vertices, turn_over(faces, turned), topology)
+    return turned
+
+
+def turn_over(faces: Faces, turned: Bool[np.ndarray, " faces"]) -> Faces:
+    """Reverse the corners of the marked triangles."""
+    return np.where(turned[:, None], faces[:, ::-1], faces)
+
+
+def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np.ndarray, " faces"]:
+    """Return the triangles that face against most of their connected surface."""
+    # Each triangle is two nodes of a graph, as it is and turned over, and an edge joins the nodes
+    # that face the same way. A surface with two sides falls into two components: each is one way of
+    # facing, and triangle f is to be turned if the component of its turned node is the better one.
+    num_faces = len(areas)
+    one, other = topology.neighbours.T
+    swap = np.where(topology.opposed, num_faces, 0)
+    rows = np.concatenate([one, one + num_faces])
+    columns = np.concatenate([other + swap, other + num_faces - swap])
+    joined = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(2 * num_faces,) * 2)
+    as_is, over = connected_components(joined, directed=False)[1].reshape(2, num_faces)
+    weight = np.bincount(as_is, areas, minlength=int(max(as_is.max(), over.max())) + 1)
+    better = weight[over] > weight[as_is]
+    tied = (weight[over] == weight[as_is]) & (over < as_is)
+    return np.asarray(better | tied)
+
+
+def _inverted_bodies(
+    vertices: Vertices, faces: Faces, topology: Topology
+) -> Bool[np.ndarray, " faces"]:
+    """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
+    one, other = topology.neighbours.T
+    joined = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(faces),) * 2)
+    num_bodies, bodies = connected_components(joined, directed=False)
+    volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=num_bodies)
+    corners = vertices[faces]
+    lower, upper = np.full((num_bodies, 3), np.inf), np.full((num_bodies, 3), -np.inf)
+    np.minimum.at(lower, bodies, corners.min(axis=1))
+    np.maximum.at(upper, bodies, corners.max(axis=1))
+    inverted = np.zeros(num_bodies, bool)
+    for body in np.flatnonzero(volumes < 0):
+        around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
+        inverted[body] = not around.any()
+    return np.asarray(inverted[bodies])
+
+
+def _signed_volumes(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
+    """Return the volume between each triangle and the middle, negative where it faces that."""
+    a, b, c = (vertices - vertices.mean(axis=0))[faces].swapaxes(0, 1)
+    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)

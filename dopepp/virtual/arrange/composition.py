@@ -7,7 +7,6 @@ is drawn once, alone; trying another costs that one object, not the whole scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -25,18 +24,6 @@ from dopepp.virtual.renderers.raster.visibility import (
     project_object,
 )
 from dopepp.virtual.scene import NEAR, Material, SceneObject
-
-_SMALLEST_PX: Final = 2.0
-"""A target whose image is smaller than this both ways is not shown by any camera."""
-
-_WIDTH_PX: Final = 160
-"""Width of the depth image; smaller images are looked at as they are."""
-
-_WIDEST: Final = 4.0
-"""An object whose image is longer than so many frames is none that a camera is pointed at."""
-
-_MARGIN: Final = 0.03
-"""Added to the smallest visible fraction, because coarse pixels are counted."""
 
 
 class Composition:
@@ -90,17 +77,18 @@ class Composition:
             centre = project(transform(item.T_cam_obj, item.part.cuboid[CENTROID]), self.K)
             if not ((centre >= -0.5) & (centre < np.array(self.size) - 0.5)).all():
                 return False
-        return bool(np.ptp(project(extremes, self.K), axis=0).max() >= _SMALLEST_PX)
+        # No camera shows a target whose image is smaller both ways.
+        return bool(np.ptp(project(extremes, self.K), axis=0).max() >= 2.0)
 
 
 class Preview:
     """The objects accepted so far, seen coarsely."""
 
     def __init__(self, K: CameraMatrix, size: Size, min_visible: float) -> None:
-        scale = min(_WIDTH_PX / size[0], 1.0)
+        scale = min(160 / size[0], 1.0)  # smaller images are looked at as they are
         self._width, self._height = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
         self._K = resize_camera(K, self._width / size[0], self._height / size[1])
-        self._least = min_visible + _MARGIN
+        self._least = min_visible + 0.03  # because coarse pixels are counted
         self._nearest = np.zeros((self._height, self._width), np.float32)
         self._owners = np.full((self._height, self._width), -1, np.int64)
         self._visible: list[int] = []
@@ -136,7 +124,7 @@ class Preview:
         """Draw an object alone; None if it reaches the camera or is far larger than the frame."""
         seen = project_object(item, self._K)
         left, top, right, bottom = seen.extent
-        if not max(right - left, bottom - top) <= _WIDEST * max(self._width, self._height):
+        if not max(right - left, bottom - top) <= 4 * max(self._width, self._height):
             return None
         box = centres_within(seen.extent)
         return box, draw_alone(item, seen.hom, box)[0]

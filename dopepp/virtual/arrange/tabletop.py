@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import cv2
 import numpy as np
@@ -27,33 +26,6 @@ from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 
-_VIEWS: Final = 8
-"""Draws of the camera's place; another one is drawn where no target finds room in the image."""
-
-_ROUNDS: Final = 6
-"""So often an object is turned anew, until it fits."""
-
-_PLACES: Final = 6
-"""Draws of where an object lies, for each turning."""
-
-_COMPARED: Final = 2
-"""Turnings among whose places the lowest is taken on a heap, where things slide down."""
-
-_CELL_SHARE: Final = 0.01
-"""Size of the height map's cells over the largest target's diameter."""
-
-_MAX_HALF_CELLS: Final = 512
-"""The height map has at most so many cells to either side."""
-
-_FARTHEST: Final = 3.0
-"""Nothing is placed farther away than so many camera distances, where it would be tiny."""
-
-_MAX_CELLS: Final = 1024
-"""Cells along a footprint, at most; an object that needs more finds no place."""
-
-_NEAR: Final = 0.25
-"""Below the least depth, 1/2, that a height is turned into."""
-
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
     """Choose a view, place targets and distractors, and return T_cam_table (plane z = 0, z up).
@@ -61,7 +33,8 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
     They are added to an empty ``composition``; no target if none finds a place.
     """
     rng = composition.rng
-    for _ in range(_VIEWS):
+    # Another view is drawn where no target finds room in the image.
+    for _ in range(8):
         composition.clear()
         setting = _Setting(composition, table, targets)
         for body in targets:
@@ -97,13 +70,14 @@ class _Setting:
         self._radius = diameter * self.rng.uniform(*table.heap_radius)
         # A heap needs fine cells but little room; on a free table it is the other way round.
         reach = self._radius + 2 * diameter if table.heaped else 2 * distance
-        self._map = HeightMap(max(_CELL_SHARE * diameter, reach / _MAX_HALF_CELLS), reach)
+        # A cell is a hundredth of the largest target; at most 512 are to either side.
+        self._map = HeightMap(max(0.01 * diameter, reach / 512), reach)
         self._inverse_depth = inverse_depth_row(plane_of(self.T_cam_table), composition.K)
 
     def place(self, body: Body) -> bool:
         """Lay a body down; tell whether it found a place."""
         material = self.composition.draw_material(body)
-        for _ in range(_ROUNDS):
+        for _ in range(6):  # turned anew, until it fits
             for lying in self._candidates(body):
                 T_cam_obj = self.T_cam_table @ lying.T_table_obj
                 if self.composition.add(body, T_cam_obj, material):
@@ -115,7 +89,8 @@ class _Setting:
         """Draw ways in which a body could lie; on a heap, the lowest first."""
         if not self.table.heaped:
             return self._turned(body)
-        several = [lying for _ in range(_COMPARED) for lying in self._turned(body)]
+        # Things slide down: the lowest of two turnings' places.
+        several = [lying for _ in range(2) for lying in self._turned(body)]
         return sorted(several, key=lambda lying: lying.centre)
 
     def _turned(self, body: Body) -> Iterator[_Lying]:
@@ -124,12 +99,13 @@ class _Setting:
         footprint = self._map.footprint(body.surface, rotation, lowest)
         if footprint is None:
             return
-        for _ in range(_PLACES):
+        cell, (rows, columns) = self._map.cell, footprint.top.shape
+        for _ in range(6):
             drawn = self._draw_place()
             if drawn is None:
                 continue
-            middle, cell = footprint.middle, self._map.cell
-            place = round(drawn[0] / cell) - middle[0], round(drawn[1] / cell) - middle[1]
+            x, y = (round(value / cell) for value in drawn)
+            place = x - footprint.corner[0] - columns // 2, y - footprint.corner[1] - rows // 2
             height = self._map.height(footprint, place)
             if height is None or not (self.table.heaped or self._map.is_free(footprint, place)):
                 continue
@@ -146,7 +122,8 @@ class _Setting:
             return radius * math.cos(angle), radius * math.sin(angle)
         pixel = np.array([*(rng.uniform(0, 1, 2) * self.composition.size - 0.5), 1.0])
         inverse_depth = float(self._inverse_depth @ pixel)
-        if inverse_depth < 1 / (_FARTHEST * self.T_cam_table[2, 3]):
+        # Farther than three camera distances it would be tiny.
+        if inverse_depth < 1 / (3 * self.T_cam_table[2, 3]):
             return None
         point = np.linalg.solve(self.composition.K, pixel) / inverse_depth
         x, y, _ = self.T_cam_table[:3, :3].T @ (point - self.T_cam_table[:3, 3])
@@ -168,12 +145,6 @@ class Footprint:
     bottom: Float32[np.ndarray, "rows columns"]
     top: Float32[np.ndarray, "rows columns"]
     corner: tuple[int, int]
-
-    @property
-    def middle(self) -> tuple[int, int]:
-        """Its middle, x and y relative to the object's origin, in cells."""
-        rows, columns = self.top.shape
-        return self.corner[0] + columns // 2, self.corner[1] + rows // 2
 
 
 class HeightMap:
@@ -200,7 +171,7 @@ class HeightMap:
         x0, y0 = math.ceil(x.min()) - 1, math.ceil(y.min()) - 1
         x1, y1 = math.floor(x.max()) + 1, math.floor(y.max()) + 1
         shape = (max(y1 - y0, 2) + 1, max(x1 - x0, 2) + 1)
-        if max(shape) > _MAX_CELLS:
+        if max(shape) > 1024:
             return None
         heights = z - lowest / self.cell
         span = max(float(heights.max()), 1.0)
@@ -225,32 +196,25 @@ class HeightMap:
 
         ``place`` is x and y of its origin, in cells.
         """
-        window = self._window(footprint, place)
-        if window is None:
+        rows, columns = window = self._window(footprint, place)
+        if min(rows.start, columns.start) < 0 or max(rows.stop, columns.stop) > len(self._heights):
             return None
         return max(float((self._heights[window] - footprint.bottom).max()), 0.0)
 
     def put(self, footprint: Footprint, place: tuple[int, int], height: float) -> None:
         """Set an object down where :meth:`height` said."""
         window = self._window(footprint, place)
-        if window is None:
-            raise ValueError(f"place {place} beyond the map")
         np.maximum(self._heights[window], footprint.top + height, out=self._heights[window])
 
     def is_free(self, footprint: Footprint, place: tuple[int, int]) -> bool:
         """Tell whether nothing lies where the object would, neither under nor over it."""
         window = self._window(footprint, place)
-        if window is None:
-            return False
         return not bool((self._heights[window][np.isfinite(footprint.bottom)] > 0).any())
 
-    def _window(self, footprint: Footprint, place: tuple[int, int]) -> tuple[slice, slice] | None:
+    def _window(self, footprint: Footprint, place: tuple[int, int]) -> tuple[slice, slice]:
         rows, columns = footprint.top.shape
         left = place[0] + footprint.corner[0] + self._half
         top = place[1] + footprint.corner[1] + self._half
-        side = len(self._heights)
-        if left < 0 or top < 0 or left + columns > side or top + rows > side:
-            return None
         return slice(top, top + rows), slice(left, left + columns)
 
 
@@ -269,5 +233,6 @@ def _greatest(
     z = 1.0 / (1.0 + values)
     hom = np.stack([x * z, y * z, z], axis=1)
     greatest, ids = np.zeros((*shape, 1), np.float32), np.empty((*shape, 1), np.int32)
-    rasterise(hom, faces, cull, _NEAR, corner, CENTRE_SAMPLE, greatest, ids, 0)
+    # No depth is below 1/2.
+    rasterise(hom, faces, cull, 0.25, corner, CENTRE_SAMPLE, greatest, ids, 0)
     return np.asarray(greatest[..., 0])

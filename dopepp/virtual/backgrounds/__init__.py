@@ -6,16 +6,41 @@ To add a kind, write a class with the methods of :class:`Backgrounds` and name i
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import logging
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Final, Protocol
 
+import cv2
+import numpy as np
 from numpy.random import Generator
 
-from dopepp.drawing.pictures import Picture
-from dopepp.virtual.backgrounds.photos import PhotoBackgrounds, bundled_photos
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import MAX_SIDE, Picture, read_picture
 from dopepp.virtual.backgrounds.procedural import ProceduralBackgrounds
 
 __all__ = ["Backgrounds", "PhotoBackgrounds", "ProceduralBackgrounds", "find_backgrounds"]
+
+logger = logging.getLogger(__name__)
+
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+
+BUNDLED: Final = (
+    "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png",
+    "grass.png", "gravel.png", "motorcycle_left.png", "motorcycle_right.png", "rocket.jpg",
+)  # fmt: skip
+"""Photos in scikit-image's wheel; its other pictures are drawings, scans and microscopy."""
+
+_LONGEST_PHOTO_PX: Final = 1000
+"""Photos are kept reduced to this side: a 640×480 crop of them is still sharp. JPEG decodes at a
+half, a quarter or an eighth, so that a camera's 4000 pixels take 20 ms less than with 1024 here."""
+
+_KEPT_BYTES: Final = 200_000_000
+"""Decoded photos a process keeps: about 350 of VOC2007."""
 
 
 class Backgrounds(Protocol):
@@ -32,13 +57,133 @@ def find_backgrounds(choice: str | Path | None) -> Backgrounds:
     """Return the backgrounds that a user names.
 
     ``choice`` is None or ``procedural``, the same on every machine; ``skimage`` for the photos in
-    an installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
-
-    Raises:
-        UserError: The folder is missing or holds no photo, or scikit-image is not installed.
+    an installed scikit-image; or a folder of photos (``./skimage`` for one of that name). A
+    UserError: the folder is missing or holds no photo, or scikit-image is not installed.
     """
     if choice is None or choice == "procedural":
         return ProceduralBackgrounds()
     if choice == "skimage":
         return bundled_photos()
     return PhotoBackgrounds(Path(choice))
+
+
+class PhotoBackgrounds:
+    """Random crops of photos, mirrored and dimmed at random.
+
+    A damaged photo is replaced by the next one that the generator draws, so that an image stays a
+    pure function of the generator and the files. It is named in the log; more than 10 of them, or
+    more than 1 % of all photos, are a UserError, as is a folder without any.
+
+    The folder is searched recursively for :data:`PHOTO_SUFFIXES`, but for hidden files and folders
+    and links to folders; or ``names`` are its files. The photos' order is that of their relative
+    paths; none is opened.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str] | None = None) -> None:
+        self.folder = Path(folder)
+        found = _photo_names(self.folder) if names is None else names
+        self.paths = [self.folder / name for name in sorted(found)]
+        if not self.paths:
+            raise UserError(
+                f"no photo in the background folder {folder}",
+                f"a folder with {', '.join(PHOTO_SUFFIXES)} files",
+                "correct the path, or leave it out to use procedural backgrounds",
+            )
+        self.bad: dict[Path, str] = {}
+        self._photos: OrderedDict[Path, Picture] = OrderedDict()
+        self._kept_bytes = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Send another process the paths, not hundreds of megabytes of decoded photos."""
+        return self.__dict__ | {"_photos": OrderedDict(), "_kept_bytes": 0}
+
+    def identity(self) -> list[str]:
+        """Return the kind, and a hash of the photos' relative paths and sizes."""
+        digest = hashlib.sha256()
+        for path in self.paths:
+            name = path.relative_to(self.folder).as_posix()
+            digest.update(f"{name}\0{path.stat().st_size}\0".encode("utf-8", "surrogateescape"))
+        return ["photos", str(len(self.paths)), digest.hexdigest()]
+
+    def draw(self, rng: Generator, width: int, height: int) -> Picture:
+        """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
+        photo = None
+        while photo is None:
+            photo = self._photo(self.paths[int(rng.integers(len(self.paths)))])
+        rows, columns = photo.shape[:2]
+        scale = min(columns / width, rows / height) * rng.uniform(0.4, 1.0)
+        crop_width, crop_height = max(int(width * scale), 1), max(int(height * scale), 1)
+        left = int(rng.integers(columns - crop_width + 1))
+        top = int(rng.integers(rows - crop_height + 1))
+        crop = photo[top : top + crop_height, left : left + crop_width]
+        interpolation = cv2.INTER_AREA if crop_width > width else cv2.INTER_LINEAR
+        image = cv2.resize(crop, (width, height), interpolation=interpolation)
+        if rng.random() < 0.5:
+            image = cv2.flip(image, 1)
+        return np.asarray(cv2.convertScaleAbs(image, alpha=float(rng.uniform(0.5, 1.1))), np.uint8)
+
+    def _photo(self, path: Path) -> Picture | None:
+        """Return a photo, reduced, or None for a damaged one; the most recent ones are kept."""
+        if path in self._photos:
+            self._photos.move_to_end(path)
+            return self._photos[path]
+        if path in self.bad:
+            return None
+        try:
+            photo = read_picture(path, _LONGEST_PHOTO_PX)
+        except ValueError as error:
+            self._quarantine(path, str(error))
+            return None
+        self._photos[path] = photo
+        self._kept_bytes += photo.nbytes
+        while self._kept_bytes > _KEPT_BYTES and len(self._photos) > 1:
+            self._kept_bytes -= self._photos.popitem(last=False)[1].nbytes
+        return photo
+
+    def _quarantine(self, path: Path, damage: str) -> None:
+        """Remember a damaged photo, and refuse too many of them."""
+        self.bad[path] = damage
+        most = min(10, int(0.01 * len(self.paths)))
+        if len(self.bad) > most:
+            listed = "; ".join(f"{bad}: {reason}" for bad, reason in self.bad.items())
+            raise UserError(
+                f"{len(self.bad)} damaged of {len(self.paths)} background photos ({listed})",
+                f"whole photos of at most {MAX_SIDE} pixels a side; {most} damaged ones of these",
+                "remove or replace them",
+            )
+        logger.warning(
+            "background photo %s left out: %s (%d damaged of at most %d)",
+            path, damage, len(self.bad), most,
+        )  # fmt: skip
+
+
+def bundled_photos() -> PhotoBackgrounds:
+    """Return the photos in scikit-image's package, a UserError without; nothing is downloaded."""
+    # Looked up, not imported: the package's folder is all that is needed.
+    package = importlib.util.find_spec("skimage")
+    folder = Path(package.origin).parent / "data" if package and package.origin else None
+    names = [name for name in BUNDLED if folder and (folder / name).is_file()]
+    if folder is None or not names:
+        raise UserError(
+            "backgrounds=skimage without scikit-image and its photos",
+            "an installed scikit-image",
+            "pip install scikit-image, or give a folder of photos",
+        )
+    return PhotoBackgrounds(folder, names)
+
+
+def _photo_names(folder: Path) -> Iterator[str]:
+    """Yield the relative paths of a folder's photos."""
+    if not folder.is_dir():
+        return
+    pending = [""]
+    while pending:
+        prefix = pending.pop()
+        with os.scandir(folder / prefix) as entries:
+            for entry in entries:
+                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg, which is none
+                    continue
+                if entry.is_dir(follow_symlinks=False):
+                    pending.append(f"{prefix}{entry.name}/")
+                elif entry.name.lower().endswith(PHOTO_SUFFIXES) and entry.is_file():
+                    yield f"{prefix}{entry.name}"

@@ -20,9 +20,6 @@ Field = Float32[np.ndarray, "height width"]
 _SHARP_WIDTH_PX: Final = 256
 """Textures up to this width are drawn at full resolution."""
 
-_SMOOTH_CELL_PX: Final = 32
-"""Noise with larger cells than this loses nothing by being enlarged from a quarter of its size."""
-
 
 class ProceduralBackgrounds:
     """Textures made from noise, gradients, tiles, bricks, wood and scattered shapes."""
@@ -82,7 +79,8 @@ def _noise(rng: Generator, width: int, height: int, cells: int) -> Field:
     """Return smooth noise in [0, 1] with about ``cells`` cells along the image's width."""
     rows = max(round(cells * height / width), 1)
     grid = rng.random((rows + 1, cells + 1), np.float32)
-    if cells * _SMOOTH_CELL_PX <= width:
+    if cells * 32 <= width:
+        # Such large cells lose nothing by being enlarged from a quarter of their size.
         quarter = (width // 4, max(height // 4, 1))
         grid = np.asarray(cv2.resize(grid, quarter, interpolation=cv2.INTER_CUBIC))
         return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR))

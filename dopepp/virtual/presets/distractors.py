@@ -9,19 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 from numpy.random import Generator
 
-from dopepp.core.checks import check_counts, check_number, check_range
+from dopepp.core.checks import check_number, check_range
 from dopepp.parts.part import Mesh
 from dopepp.virtual.body import Body
 from dopepp.virtual.surface import Surface, make_surface
-
-_SMALLEST_STRETCH: Final = 0.5
-"""A primitive's axes are stretched by 0.5 to 1 of its size each, so none looks like another."""
 
 
 @dataclass(frozen=True)
@@ -46,24 +42,22 @@ class Distractors:
     lookalike_scale: tuple[float, float] = (0.7, 1.3)
 
     def __post_init__(self) -> None:
-        check_counts("number", self.number, 0, 100, of=self)
+        check_range("number", self.number, 0, 100, "a count", of=self)
         check_range("image_share", self.image_share, 1e-3, 10.0, "image widths", of=self)
         check_range("depth", self.depth, 0.01, 100.0, "depths of the first target", of=self)
         check_number("lookalike_share", self.lookalike_share, 0.0, 1.0, "share", of=self)
         check_range("lookalike_scale", self.lookalike_scale, 0.01, 100.0, "factor", of=self)
 
     def draw(self, rng: Generator, width_at_depth: float, negatives: Sequence[Body]) -> Body:
-        """Draw a distractor.
-
-        ``width_at_depth`` is what the image's width shows at its depth, metres.
-        """
+        """Draw a distractor for a depth at which the image's width shows so many metres."""
         if rng.random() < self.lookalike_share and negatives:
             negative = negatives[int(rng.integers(len(negatives)))]
             return negative.stretched(np.full(3, rng.uniform(*self.lookalike_scale)))
         shapes = distractor_shapes()
         radius = 0.5 * rng.uniform(*self.image_share) * width_at_depth
         shape = shapes[int(rng.integers(len(shapes)))]
-        return shape.stretched(radius * rng.uniform(_SMALLEST_STRETCH, 1.0, 3))
+        # Stretched by another factor along each axis, none looks like another.
+        return shape.stretched(radius * rng.uniform(0.5, 1.0, 3))
 
 
 @cache

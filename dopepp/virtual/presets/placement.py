@@ -24,16 +24,8 @@ from dopepp.geometry.rotation import (
 )
 from dopepp.parts.mesh.measure import Points
 
-_CENTRING_STEPS: Final = 10
-_CENTRED_PX: Final = 0.05
-"""Perspective moves a tilted part's box off its centre's image; a few steps bring it back."""
-
 _FARTHEST: Final = 1000.0
 """Metres; nothing that a camera is to see is farther away."""
-
-_MAX_STEPS: Final = 80
-_SHARE_TOLERANCE: Final = 1e-4
-"""A filled share is found to a hundredth of a percent, far below a pixel."""
 
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation that turns an object's +z face towards the camera, +x staying on the right."""
@@ -200,7 +192,8 @@ class FillPlacement(Placement):
         offset = rng.uniform(-0.5, 0.5, 2)
         centre = (rotated_hull.min(axis=0) + rotated_hull.max(axis=0)) / 2
         pixel, hull = np.array(size) / 2 - 0.5, rotated_hull - centre
-        for _ in range(_CENTRING_STEPS):
+        # Perspective moves a tilted part's box off its centre's image; a few steps bring it back.
+        for _ in range(10):
             ray = np.linalg.solve(K, [*pixel, 1.0])
             depth = _depth_that_fills(share, ray, K, size, hull)
             image = project(hull + depth * ray, K)
@@ -208,7 +201,7 @@ class FillPlacement(Placement):
             # The bounding box moves as far as it has room; one that fills the image cannot move.
             wanted = np.array(size) / 2 - 0.5 + offset * (size - (upper - lower))
             missing = wanted - (lower + upper) / 2
-            if np.abs(missing).max() < _CENTRED_PX:
+            if np.abs(missing).max() < 0.05:
                 break
             pixel = pixel + missing
         return np.asarray(depth * ray - centre)
@@ -222,10 +215,10 @@ def _depth_that_fills(
     rays, rows, columns = centred_hull @ K[:2].T, ray @ K[:2].T, np.array(size, np.float64)
     low, high = closest, np.inf
     depth = 2 * closest + float(np.abs(centred_hull).max())
-    for step in range(_MAX_STEPS):
+    for step in range(80):
         pixels = (rays + depth * rows) / (centred_hull[:, 2:] + depth)
         filled = float(((pixels.max(axis=0) - pixels.min(axis=0)) / columns).max())
-        if abs(filled / share - 1) < _SHARE_TOLERANCE:
+        if abs(filled / share - 1) < 1e-4:  # far below a pixel
             break
         low, high = (depth, high) if filled > share else (low, depth)
         # The share falls nearly as 1/depth. That guess alternates with bisection, because close

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
-from dopepp.core.checks import check_counts, check_number
+from dopepp.core.checks import check_number, check_range
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera, resize_camera
 from dopepp.virtual.presets.distractors import Distractors
-from dopepp.virtual.presets.lighting import Lighting
-from dopepp.virtual.presets.materials import Materials
+from dopepp.virtual.presets.looks import Lighting, Materials
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
@@ -72,17 +71,11 @@ class Preset:
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
-        check_counts("targets_per_image", self.targets_per_image, 0, 100, of=self)
+        check_range("targets_per_image", self.targets_per_image, 0, 100, "a count", of=self)
         for name in ("width", "height"):
             check_number(name, getattr(self, name), 8, 16384, "pixels", of=self)
         check_number("min_visible_fraction", self.min_visible_fraction, 0.0, 0.95, "share", of=self)
         check_number("horizontal_fov_deg", self.horizontal_fov_deg, 5.0, 150.0, "degrees", of=self)
-        if self.intrinsics_px is not None and len(self.intrinsics_px) != 4:
-            raise UserError(
-                f"intrinsics_px={self.intrinsics_px} of preset {self.name}",
-                "four numbers, fx, fy, cx and cy in pixels, or None",
-                "change intrinsics_px",
-            )
         check_camera(self.K, (self.width, self.height), f"preset {self.name}")
 
     @property
@@ -169,11 +162,8 @@ def customised_preset(name: str, changes: Mapping[str, Any]) -> Preset:
 
     ``changes`` give a value by field or, for a field that is itself a group of fields, a mapping,
     e.g. ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A group that the preset
-    lacks (``table`` of ``paper``) starts from its defaults; None takes it away.
-
-    Raises:
-        UserError: The name or a field is unknown, or a value is of the wrong kind or outside of
-            what the field allows.
+    lacks (``table`` of ``paper``) starts from its defaults; None takes it away. A UserError: the
+    name or a field is unknown, or a value is of the wrong kind or outside of what the field allows.
     """
     if name not in PRESETS:
         raise UserError(f"preset {name!r}", ", ".join(PRESETS), "choose one of them")

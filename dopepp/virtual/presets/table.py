@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
-from dopepp.core.checks import check_flag, check_number, check_range
+from dopepp.core.checks import check_number, check_range
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
-from dopepp.geometry.rotation import RotationMatrix, Vector, rotation_vector_to_matrix
+from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
 from dopepp.virtual.scene import Plane, triple
-
-_FARTHEST: Final = 8.0
-"""The picture of the table ends at so many camera distances: there, another one begins."""
-
-_MIDDLE: Final = (0.35, 0.65)
-"""Where in the picture the camera looks, in widths and heights."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +50,6 @@ class Table:
         check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
         check_number("tilted_share", self.tilted_share, 0.0, 1.0, "share", of=self)
         check_range("tilt_deg", self.tilt_deg, 0.0, 90.0, "degrees", of=self)
-        check_flag("heaped", self.heaped, of=self)
         check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
         check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
 
@@ -74,15 +66,16 @@ class Table:
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
         """Draw how an object lies: on one of its stable faces, any way round, or leaning.
 
-        Returns:
-            The rotation from the object to the table frame, and the height of the object's lowest
-            point relative to its origin, metres.
+        The rotation is from the object to the table frame; with it comes the height of the object's
+        lowest point relative to its origin, metres.
         """
         normals, shares = hull.rests
         down = normals[int(np.searchsorted(np.cumsum(shares)[:-1], rng.random(), side="right"))]
         turn, lean = rng.uniform(0, 2 * np.pi), rng.random() < self.tilted_share
         azimuth, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*self.tilt_deg))
-        rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, turn])) @ _downwards(down)
+        right, across, up = rotation_to_z(down)
+        level = np.stack([right, -across, -up])
+        rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, turn])) @ level
         if lean:
             axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             rotation = rotation_vector_to_matrix(tilt * axis) @ rotation
@@ -100,11 +93,11 @@ class Table:
         width, height = size
         picture = backgrounds.draw(rng, width, height)
         metres = rng.uniform(*self.picture_width) * T_cam_table[2, 3]
-        middle = rng.uniform(*_MIDDLE, 2) * size
+        middle = rng.uniform(0.35, 0.65, 2) * size  # to which the camera looks
         angle, scale = rng.uniform(0, 2 * np.pi), width / metres
         cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
         picture_table = np.array([[cosine, -sine, middle[0]], [sine, cosine, middle[1]], [0, 0, 1]])
-        end = _FARTHEST * float(T_cam_table[2, 3])
+        end = 8 * float(T_cam_table[2, 3])
         in_view = _beyond(end, K, size, T_cam_table) is not None
         surroundings = backgrounds.draw(rng, width, height) if in_view else None
         return TablePicture(picture, picture_table, end, surroundings)
@@ -151,14 +144,6 @@ def inverse_depth_row(plane: Plane, K: CameraMatrix) -> Vector:
     A ray r (with z = 1) meets the plane at depth offset/(normal · r).
     """
     return np.asarray(np.array(plane.normal) @ np.linalg.inv(K) / plane.offset)
-
-
-def _downwards(direction: Vector) -> RotationMatrix:
-    """Return a rotation that turns a unit direction to −z."""
-    helper = np.eye(3)[np.abs(direction).argmin()]
-    across = np.cross(helper, direction)
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(across, direction), -direction])
 
 
 def _beyond(end: float, K: CameraMatrix, size: Size, T_cam_table: Transform) -> Mask | None:

@@ -23,11 +23,7 @@ RENDERERS: Final = {
 
 
 def find_renderer(name: str) -> Renderer:
-    """Return a renderer by name.
-
-    Raises:
-        UserError: The name is unknown, or the renderer's extra is not installed or cannot run here.
-    """
+    """Return a renderer by name; a UserError where it is unknown or its extra not installed."""
     if name not in RENDERERS:
         raise UserError(f"renderer {name!r}", ", ".join(RENDERERS), "choose one of them")
     render: Renderer = import_module(RENDERERS[name]).render

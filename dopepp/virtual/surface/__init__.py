@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.mesh.measure import Faces, Points, Vertices
 from dopepp.parts.part import Mesh
-from dopepp.virtual.surface.normals import corner_normals, is_closed, merge_vertices, smooth_patches
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture
 
@@ -24,6 +27,9 @@ _HULL_DIRECTIONS: Final = 400
 
 _NUM_POINTS: Final = 400
 """Points that stand for a mesh where a plane is darkened beside it."""
+
+_MOST_CORNERS: Final = 1024
+"""Normals around a vertex of more corners are not averaged: that takes the square of the number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,26 +65,6 @@ class Surface:
         """Largest distance of a vertex from the object frame's origin, metres."""
         return float(np.linalg.norm(self.hull, axis=1).max())
 
-    @property
-    def area(self) -> float:
-        """Surface area, m²."""
-        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-    @property
-    def uv_area(self) -> float:
-        """Area of the faces in texture space (1 = the whole texture)."""
-        if self.texture is None:
-            return 0.0
-        a, b, c = self.uv[self.faces].transpose(1, 0, 2)
-        (along, across) = (b - a).T, (c - a).T
-        return float(np.abs(along[0] * across[1] - along[1] * across[0]).sum() / 2)
-
-    @property
-    def textures(self) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-        """The texture and its halvings as images, the finest first; empty without one."""
-        return () if self.texture is None else self.texture.images
-
     def scaled(self, scale: Vector) -> Surface:
         """Return the surface stretched along its axes by positive factors.
 
@@ -100,9 +86,8 @@ class Surface:
 def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surface:
     """Prepare a mesh for rendering (a quarter of a second; do it once per part).
 
-    Raises:
-        UserError: The mesh has no faces, a vertex or a texture coordinate that is not finite, or a
-            face with a vertex that does not exist.
+    A UserError: the mesh has no faces, a vertex or a texture coordinate that is not finite, or a
+    face with a vertex that does not exist.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
@@ -119,12 +104,12 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
             f"vertices 0 to {len(vertices) - 1}",
             "repair the mesh or export it again",
         )
-    merged = merge_vertices(vertices)[faces]
+    merged = _merge_vertices(vertices)[faces]
     edges = vertices[faces[:, [1, 2, 0]]] - vertices[faces]
     doubled = np.cross(edges[:, 0], edges[:, 1])
     length = np.linalg.norm(doubled, axis=1)
-    normals = corner_normals(merged, doubled, length, edges, crease_angle_deg)
-    closed = is_closed(merged, vertices[faces])
+    normals = _corner_normals(merged, doubled, length, edges, crease_angle_deg)
+    closed = _is_closed(merged, vertices[faces])
     uv, texture = np.zeros((0, 2), np.float32), None
     if mesh.uv is not None and mesh.texture is not None:
         uv = np.ascontiguousarray(mesh.uv, np.float32)
@@ -140,7 +125,7 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
         faces=faces,
         normals=normals,
         # Texture coordinates may differ where positions do not.
-        patches=smooth_patches(merged if texture is None else faces, normals, length > 0),
+        patches=_smooth_patches(merged if texture is None else faces, normals, length > 0),
         uv=uv,
         texture=texture,
         sky=bake_open_sky(vertices, faces, normals, closed),
@@ -173,3 +158,111 @@ def _spread_points(
     share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
     a, b, c = corners[chosen].transpose(1, 0, 2)
     return np.asarray(a + share[:, :1] * (b - a) + share[:, 1:] * (c - a))
+
+
+def _merge_vertices(vertices: Vertices) -> Int[np.ndarray, "vertices"]:
+    """Number vertices so that equal positions share a number."""
+    # STL and UV seams split vertices. Those of one cell of a grid this fine are one, and three such
+    # coordinates fit into one integer of 64 bits.
+    step = max(float(np.ptp(vertices, axis=0).max()), 1e-12) / (2**21 - 1)
+    cells = np.round((vertices - vertices.min(axis=0)) / step).astype(np.int64)
+    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.int64)
+
+
+def _is_closed(merged: Faces, triangles: Float[np.ndarray, "faces 3 3"]) -> bool:
+    """Tell whether every directed edge has exactly one opposite and the volume is positive."""
+    collapsed = (merged == merged[:, [1, 2, 0]]).any(axis=1)
+    start, end = merged[~collapsed], merged[~collapsed][:, [1, 2, 0]]
+    count = int(merged.max()) + 1
+    forward = np.sort((start * count + end).reshape(-1))
+    if len(forward) == 0 or (forward[1:] == forward[:-1]).any():
+        return False
+    if not np.array_equal(forward, np.sort((end * count + start).reshape(-1))):
+        return False
+    a, b, c = (triangles - triangles.reshape(-1, 3).mean(axis=0)).transpose(1, 0, 2)
+    return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)
+
+
+def _corner_normals(
+    merged: Faces,
+    doubled: Float[np.ndarray, "faces 3"],
+    length: Float[np.ndarray, "faces"],
+    edges: Float[np.ndarray, "faces 3 3"],
+    crease_angle_deg: float,
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
+
+    ``merged`` is the merged vertex of every corner; ``doubled`` the cross product of two ``edges``
+    of every face (its normal, twice its area long), ``length`` its length. Faces that meet at more
+    than ``crease_angle_deg`` keep a sharp edge.
+    """
+    face_normals = doubled / np.maximum(length, 1e-300)[:, None]
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
+    cosines = -(unit * unit[:, [2, 0, 1]]).sum(axis=2)
+    weights = np.arccos(np.clip(cosines, -1.0, 1.0)) * (length > 0)[:, None]
+    corners = np.argsort(merged.reshape(-1), kind="stable")
+    counts = np.bincount(merged.reshape(-1), minlength=int(merged.max()) + 1)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    normals = np.empty((len(merged), 3, 3), np.float32)
+    cosine = float(np.cos(np.radians(crease_angle_deg)))
+    _average_normals(face_normals, weights, offsets, corners, cosine, normals)
+    return normals
+
+
+@compiled()
+def _average_normals(
+    face_normals: Array, weights: Array, offsets: Array, corners: Array, cosine: float, out: Array
+) -> None:
+    """Average, at every corner, the normals of the faces around its vertex within an angle.
+
+    Faces have unit normals, zero for degenerate ones, and corners ``weights`` (their angles), both
+    of shape (F, 3). ``corners`` are the numbers 3·face + k sorted by vertex, shape (3F,), of which
+    each vertex's start at ``offsets``, shape (V + 1,). Faces that differ by more than ``cosine``
+    are not averaged. ``out`` are normals, shape (F, 3, 3), float32.
+    """
+    for vertex in range(offsets.shape[0] - 1):
+        for p in range(offsets[vertex], offsets[vertex + 1]):
+            face, k = corners[p] // 3, corners[p] % 3
+            nx, ny, nz = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
+            sx, sy, sz = 0.0, 0.0, 0.0
+            # Every pair of a vertex's faces is compared; a hub of a million faces is left flat.
+            first, last = offsets[vertex], offsets[vertex + 1]
+            if last - first > _MOST_CORNERS:
+                first, last = p, p + 1
+            for q in range(first, last):
+                other, m = corners[q] // 3, corners[q] % 3
+                ox, oy, oz = face_normals[other, 0], face_normals[other, 1], face_normals[other, 2]
+                if nx * ox + ny * oy + nz * oz >= cosine:
+                    sx += weights[other, m] * ox
+                    sy += weights[other, m] * oy
+                    sz += weights[other, m] * oz
+            norm = math.sqrt(sx * sx + sy * sy + sz * sz)
+            if norm > 0.0:
+                out[face, k, 0], out[face, k, 1], out[face, k, 2] = sx / norm, sy / norm, sz / norm
+            else:
+                out[face, k, 0], out[face, k, 1], out[face, k, 2] = nx, ny, nz
+
+
+def _smooth_patches(
+    corners: Faces, normals: Float[np.ndarray, "faces 3 3"], usable: Bool[np.ndarray, "faces"]
+) -> Int[np.ndarray, "faces"]:
+    """Number faces so that those connected by edges without a crease share a number.
+
+    ``corners`` are vertices; where attributes differ, vertices must too. An edge is smooth where
+    the normals of both its faces agree. ``usable`` is False for faces without an area, which
+    connect nothing.
+    """
+    count = int(corners.max()) + 1
+    start, end = corners, corners[:, [1, 2, 0]]
+    keys = (np.minimum(start, end) * np.int64(count) + np.maximum(start, end)).reshape(-1)
+    order = np.argsort(keys, kind="stable")
+    shared = np.flatnonzero(np.diff(keys[order]) == 0)
+    one, other = order[shared] // 3, order[shared + 1] // 3
+    meet = corners[one][:, :, None] == corners[other][:, None]
+    products = normals[one][:, :, None] * normals[other][:, None]
+    agree = products.sum(axis=-1, dtype=np.float64) > 0.999
+    smooth = usable[one] & usable[other] & (agree | ~meet).all(axis=(1, 2))
+    edges = (np.ones(int(smooth.sum()), bool), (one[smooth], other[smooth]))
+    joined = coo_array(edges, shape=(len(corners), len(corners)))
+    return np.asarray(connected_components(joined, directed=False)[1], np.int32)

@@ -20,29 +20,8 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.parts.mesh.measure import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
-_DIRECTIONS: Final = (24, 256)
-"""Fewest and most directions a mesh is drawn from."""
-
-_DRAWN_FACES: Final = 6_000_000
-"""Triangles drawn in all; a huge mesh is drawn from fewer directions."""
-
-_MAP_SIDE: Final = 192
-"""Texels across a depth map."""
-
 _FINEST: Final = 1 / 96
 """Spacing of the points over the mesh's size, and the most steps along a triangle's edge."""
-
-_EXTRA_POINTS: Final = 40_000
-"""Points in all beyond the triangles' corners."""
-
-_MOST_COMPARED: Final = 1000
-"""Triangles up to which it pays to see whether a mesh is convex; that takes their square."""
-
-_DISTANCE: Final = 20.0
-"""Of a direction's camera from the mesh, in radii: as good as parallel."""
-
-_MOST_BAKED: Final = 32
-"""Meshes whose open sky is kept: more than the parts of a run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +58,7 @@ def bake_open_sky(
     key = digest.digest()
     baked = _BAKED.get(key)
     if baked is None:
-        if len(_BAKED) >= _MOST_BAKED:
+        if len(_BAKED) >= 32:  # more than the parts of a run
             _BAKED.pop(next(iter(_BAKED)), None)
         baked = _BAKED[key] = _bake_mesh(vertices, faces, normals, closed)
     return baked
@@ -90,7 +69,8 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
-    if _hides_nothing(vertices, faces, flat, closed):
+    # Comparing all with all pays for so many; a convex mesh cannot hide its own sky.
+    if len(faces) <= 1000 and _is_convex(corners, flat, closed):
         steps, firsts = np.ones(len(faces), np.int32), np.zeros(len(faces), np.int64)
         return OpenSky(steps, firsts, np.ones((2, 3), np.float32))
     used = corners.reshape(-1, 3)
@@ -101,9 +81,10 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
     ground = np.empty(count, np.int32)
     _spread(corners, normals, steps, firsts, points, upright, ground)
     sums = np.zeros((4, count), np.float32)
-    directions = spread_directions(int(np.clip(_DRAWN_FACES // len(faces), *_DIRECTIONS)))
+    # A huge mesh is drawn from fewer directions.
+    directions = spread_directions(int(np.clip(6_000_000 // len(faces), 24, 256)))
     _bake(
-        vertices, faces, closed, centre, radius, directions, _MAP_SIDE, CENTRE_SAMPLE, points,
+        vertices, faces, closed, centre, radius, directions, 192, CENTRE_SAMPLE, points,
         upright, flat, ground, sums,
     )  # fmt: skip
     # A point that no direction sees from outside (a face without area) counts as open.
@@ -111,34 +92,18 @@ def _bake_mesh(vertices: Array, faces: Array, normals: Array, closed: bool) -> O
     return OpenSky(steps, firsts, values.astype(np.float32))
 
 
-def _hides_nothing(vertices: Array, faces: Array, flat: Array, closed: bool) -> bool:
-    """Tell whether a mesh is convex, or flat if it is open, so that it cannot hide its own sky."""
-    if len(faces) > _MOST_COMPARED:
-        return False
-    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
-    return bool(_is_convex(vertices, faces, flat, not closed, 1e-4 * size))
-
-
-@compiled()
-def _is_convex(vertices: Array, faces: Array, flat: Array, both: bool, slack: float) -> bool:
-    """Tell whether all corners lie behind every face's plane (or, for ``both``, on it)."""
-    for f in range(faces.shape[0]):
-        a = faces[f, 0]
-        for other in range(faces.shape[0]):
-            for k in range(3):
-                v = faces[other, k]
-                height = 0.0
-                for r in range(3):
-                    height += flat[f, r] * (vertices[v, r] - vertices[a, r])
-                if height > slack or (both and height < -slack):
-                    return False
-    return True
+def _is_convex(corners: Array, flat: Array, closed: bool) -> bool:
+    """Tell whether all corners lie behind every face's plane, or on it for an open mesh."""
+    points = corners.reshape(-1, 3)
+    slack = 1e-4 * float(np.ptp(points, axis=0).max())
+    heights = points @ flat.T - (corners[:, 0] * flat).sum(axis=1)
+    return bool(heights.max() <= slack and (closed or heights.min() >= -slack))
 
 
 def _grids(corners: Array, size: float) -> tuple[Array, Array, int]:
     """Choose every triangle's steps so that the points are few and evenly spaced."""
     longest = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
-    spacing, most = _FINEST * size, 3 * len(corners) + _EXTRA_POINTS
+    spacing, most = _FINEST * size, 3 * len(corners) + 40_000
     for _ in range(13):
         steps = np.ceil(longest / spacing).clip(1, round(1 / _FINEST)).astype(np.int32)
         sizes = (steps.astype(np.int64) + 1) * (steps + 2) // 2
@@ -198,7 +163,7 @@ def _bake(
     face of each, shape (n,), ``flat`` every face's normal. ``sums`` are open front, all front, open
     back and all back, shape (4, n), updated in place.
     """
-    distance = _DISTANCE * radius
+    distance = 20.0 * radius  # as good as parallel
     focal = 0.5 * (side - 4) * distance / radius
     K = np.array([[focal, 0.0, 0.5 * side], [0.0, focal, 0.5 * side], [0.0, 0.0, 1.0]])
     # As for shadows: a point lifted by more than √2 texels is not hidden by its own plane.

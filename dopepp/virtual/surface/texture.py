@@ -42,11 +42,6 @@ class Texture:
     texels: UInt8[np.ndarray, "texels 3"]
     levels: Int[np.ndarray, "levels 3"]
 
-    @property
-    def images(self) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-        """All levels as images."""
-        return tuple(self.image(level) for level in range(len(self.levels)))
-
     def image(self, level: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
         """Return a level as an image."""
         first, rows, columns = (int(value) for value in self.levels[level])
@@ -71,8 +66,12 @@ def make_texture(image: Picture, uv: Float[np.ndarray, "vertices 2"], faces: Fac
             texture.image(level - 1), shares[-2], SRGB_TO_LINEAR, LINEAR_TO_SRGB,
             texture.image(level), shares[-1],
         )  # fmt: skip
+    # Texels that nothing uses take the colour of the next coarser level.
     for level in range(len(shapes) - 2, -1, -1):
-        _fill(texture.image(level), shares[level], texture.image(level + 1))
+        (rows, columns), coarser = shapes[level], texture.image(level + 1)
+        j, i = np.nonzero(shares[level] == 0)
+        finer = coarser[j * coarser.shape[0] // rows, i * coarser.shape[1] // columns]
+        texture.image(level)[j, i] = finer
     return texture
 
 
@@ -118,18 +117,6 @@ def _halve(
             out[j, i, 0] = np.uint8(encode[min(int(red * scale + 0.5), CODE_STEPS)] + 0.5)
             out[j, i, 1] = np.uint8(encode[min(int(green * scale + 0.5), CODE_STEPS)] + 0.5)
             out[j, i, 2] = np.uint8(encode[min(int(blue * scale + 0.5), CODE_STEPS)] + 0.5)
-
-
-@compiled()
-def _fill(image: Array, share: Array, coarser: Array) -> None:
-    """Give texels that nothing uses the colour of the next coarser level."""
-    for j in range(image.shape[0]):
-        for i in range(image.shape[1]):
-            if share[j, i] == 0.0:
-                y = min(j * coarser.shape[0] // image.shape[0], coarser.shape[0] - 1)
-                x = min(i * coarser.shape[1] // image.shape[1], coarser.shape[1] - 1)
-                for c in range(3):
-                    image[j, i, c] = coarser[y, x, c]
 
 
 @compiled(fastmath=True, inline="always")

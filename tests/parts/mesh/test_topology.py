@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from trimesh.exchange.stl import export_stl
 
 from dopepp.parts import read_mesh, servoholder
-from dopepp.parts.mesh.topology import find_topology, opposed_faces, turn_over
+from dopepp.parts.mesh.read import find_topology, opposed_faces, turn_over
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

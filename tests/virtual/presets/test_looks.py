@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.virtual import Distractors, FacingTurning, Materials, Table, make_surface
-from dopepp.virtual.presets.lighting import Lighting, black_body_rgb
-from dopepp.virtual.presets.placement import DistancePlacement, FillPlacement, OffsetPlacement
+from dopepp.virtual import (
+    DistancePlacement,
+    Distractors,
+    FacingTurning,
+    FillPlacement,
+    Lighting,
+    Materials,
+    OffsetPlacement,
+    Table,
+    make_surface,
+)
+from dopepp.virtual.presets.looks import black_body_rgb
 
 
 def planck_rgb(temperature: float) -> np.ndarray:

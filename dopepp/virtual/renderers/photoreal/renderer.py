@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import zlib
 from functools import cache
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.util import find_spec
 from pathlib import Path
+from runpy import run_path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +33,6 @@ from dopepp.virtual.renderers.photoreal.table import (
     Area,
     TableTop,
     View,
-    Window,
     cast,
     make_view,
     pixel_rays,
@@ -40,7 +41,7 @@ from dopepp.virtual.renderers.photoreal.table import (
 )
 from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads
 from dopepp.virtual.renderers.raster.rasteriser import visible_fractions
-from dopepp.virtual.renderers.raster.visibility import backdrop, box_around, project_object
+from dopepp.virtual.renderers.raster.visibility import Box, backdrop, box_around, project_object
 from dopepp.virtual.scene import Rendered, Scene
 from dopepp.virtual.tone import CODE_STEPS, TONE_CURVE
 
@@ -48,9 +49,6 @@ require("mitsuba", "renderer 'photoreal'", "photoreal")
 require("pyoidn", "renderer 'photoreal'", "photoreal")
 
 SAMPLES_PER_PIXEL: Final = 16
-
-_GUIDE_SAMPLES: Final = 4
-"""Samples a pixel of what guides the denoiser, which is far less noisy than light."""
 
 _PATHS: Final = {"type": "path", "max_depth": 6, "hide_emitters": True}
 """Light that bounces off at most five surfaces; lamps are seen in reflections only."""
@@ -66,19 +64,14 @@ _RADIANCE_OF_CODE: Final = np.interp(
 ).astype(np.float32)
 """The radiance that the tone curve shows as a code of 0–255."""
 
-_COVERAGE: Final = {"type": "depth"}
-"""The fourth channel of any integrator is the share of rays that hit something."""
-
-_CPU_DEVICE: Final = 1
 _FLOAT3: Final = 3
-"""Values of ``OIDN_DEVICE_TYPE_CPU`` and ``OIDN_FORMAT_FLOAT3``."""
+"""``OIDN_FORMAT_FLOAT3``."""
 
 
 def render(scene: Scene) -> Rendered:
     """Render a scene; one without objects is its background.
 
-    Raises:
-        UserError: Mitsuba cannot run in this process (see ``variant``).
+    A UserError, where Mitsuba cannot run in this process (see ``variant``).
     """
     image, depth, instances = backdrop(scene)
     fractions = visible_fractions(scene)
@@ -99,7 +92,7 @@ def render(scene: Scene) -> Rendered:
     return Rendered(image, depth, instances, fractions, scene)
 
 
-def _objects_window(scene: Scene) -> Window | None:
+def _objects_window(scene: Scene) -> Box | None:
     """Return the part of the image that objects may touch; None if they touch none."""
     box = box_around(project_object(item, scene.K).box(scene.size) for item in scene.objects)
     if box is None:
@@ -115,7 +108,7 @@ def _label(
     mi: Any,
     scene: Scene,
     shapes: list[Any],
-    window: Window,
+    window: Box,
     depth: Float32[np.ndarray, "height width"],
     instances: np.ndarray,
 ) -> None:
@@ -132,7 +125,7 @@ def _paint_on_table(
     mi: Any,
     scene: Scene,
     shapes: list[Any],
-    window: Window | None,
+    window: Box | None,
     plane: Float32[np.ndarray, "height width"],
     image: Picture,
 ) -> None:
@@ -143,10 +136,11 @@ def _paint_on_table(
         return
     area, view = _slices(window), make_view(scene.K, window)
     film = _trace(mi, scene, {**_world(shapes), "table": table.shape(mi)}, view)
-    # Whether light comes from an object or from the table is a second, cheap picture.
-    film[..., 3] = _picture(mi, _world(shapes), view, _COVERAGE, SAMPLES_PER_PIXEL, _seed(scene))[
-        ..., 3
-    ]
+    # Whether light comes from an object or from the table is a second, cheap picture: the fourth
+    # channel of any integrator is the share of rays that hit something.
+    depth = {"type": "depth"}
+    hit = _picture(mi, _world(shapes), view, depth, SAMPLES_PER_PIXEL, _seed(scene))
+    film[..., 3] = hit[..., 3]
     film = view.resampled(film)
     alpha = np.clip(film[..., 3], 0.0, 1.0)
     light, kept = split_light(film[..., :3], alpha, table.unshadowed(area))
@@ -165,7 +159,8 @@ def _trace(
     surroundings = make_surroundings(mi, scene, bounding_sphere(scene))
     lit = {**world, **surroundings}
     film = _picture(mi, lit, view, _PATHS, SAMPLES_PER_PIXEL, _seed(scene))
-    guides = _picture(mi, world, view, _GUIDES, _GUIDE_SAMPLES, _seed(scene))
+    # Four samples a pixel, as it is far less noisy than light.
+    guides = _picture(mi, world, view, _GUIDES, 4, _seed(scene))
     film[..., :3] = denoise(film[..., :3], guides[..., :3], guides[..., 3:6])
     return film
 
@@ -199,7 +194,7 @@ def _over(
     return np.where(alpha > 0, (TONE_CURVE[steps] + 0.5).astype(np.uint8), behind)
 
 
-def _slices(window: Window) -> Area:
+def _slices(window: Box) -> Area:
     left, top, right, bottom = window
     return slice(top, bottom), slice(left, right)
 
@@ -237,16 +232,10 @@ def denoise(
 @cache
 def _device() -> tuple[Any, Any]:
     """Return pyoidn's C interface and a device, made once a process."""
-    package = find_spec("pyoidn")
-    assert package is not None
-    assert package.origin is not None
-    spec = spec_from_file_location("pyoidn_capi", Path(package.origin).with_name("capi.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    interface = module_from_spec(spec)
-    spec.loader.exec_module(interface)
+    origin = getattr(find_spec("pyoidn"), "origin", "")
+    interface = SimpleNamespace(**run_path(str(Path(origin).with_name("capi.py"))))
     library = interface.oidn_Capi
-    device = library.oidnNewDevice(_CPU_DEVICE)
+    device = library.oidnNewDevice(1)  # OIDN_DEVICE_TYPE_CPU
     library.oidnSetDeviceInt(device, b"numThreads", num_threads())
     # Pinned threads of several workers would share cores while others idle.
     library.oidnSetDeviceBool(device, b"setAffinity", False)

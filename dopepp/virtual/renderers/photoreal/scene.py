@@ -17,10 +17,12 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dopepp.geometry.camera import CameraMatrix, transform
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.camera import CameraMatrix, Transform, transform
+from dopepp.geometry.rotation import Vector, rotation_to_z
+from dopepp.parts.mesh.measure import face_areas
 from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import Surface
+from dopepp.virtual.surface.texture import Texture
 from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 Sphere = tuple[Vector, float]
@@ -28,12 +30,6 @@ Sphere = tuple[Vector, float]
 
 LAMP_SHARE: Final = 0.06
 """A lamp's radius over its distance: a bulb of 6 cm across at half a metre."""
-
-_LAMP_CLEARANCE: Final = 0.5
-"""A lamp reaches no further than this share of the way to an object, the camera or the table."""
-
-_LEAST_LAMP: Final = 1e-3
-"""Radius, metres, of a lamp that has no room."""
 
 _MAX_ALBEDO: Final = 0.95
 """Nothing reflects all light; more would also keep paths alive without end."""
@@ -87,7 +83,8 @@ def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
     ]
     if scene.plane is not None:
         room.append(float(np.array(scene.plane.normal) @ position) - scene.plane.offset)
-    return max(min(LAMP_SHARE * distance, _LAMP_CLEARANCE * min(room)), _LEAST_LAMP)
+    # It reaches at most half of the way to an object, the camera or the table.
+    return max(min(LAMP_SHARE * distance, 0.5 * min(room)), 1e-3)
 
 
 def rgb(values: Vector) -> dict[str, Any]:
@@ -155,11 +152,11 @@ def _roughness(material: Material) -> float:
 
 def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     """Return the albedo: constant, mottled or a texture, linear RGB."""
-    surface, material = item.surface, item.material
+    material, texture = item.material, item.surface.texture
     colour = np.asarray(material.colour, np.float32)
-    if len(surface.uv):
-        texels = SRGB_TO_LINEAR[surface.textures[_texture_level(item, K)]] * colour
-        return _bitmap(mi, texels, np.eye(4))
+    if texture is not None:
+        codes = texture.image(_texture_level(item.surface, texture, item.T_cam_obj, K))
+        return _bitmap(mi, SRGB_TO_LINEAR[codes] * colour, np.eye(4))
     if material.noise == 0.0:
         return rgb(np.clip(colour, 0.0, _MAX_ALBEDO))
     # Random from cell to cell, always the same: only the look of a rough surface.
@@ -180,16 +177,20 @@ def _bitmap(
     }
 
 
-def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
+def _texture_level(
+    surface: Surface, texture: Texture, T_cam_obj: Transform, K: CameraMatrix
+) -> int:
     """Return the texture level whose texels are about half as large as the object's pixels."""
-    surface, depth = item.surface, float(item.T_cam_obj[2, 3])
-    if surface.uv_area == 0.0 or depth <= 0.0:
+    depth = float(T_cam_obj[2, 3])
+    a, b, c = surface.uv[surface.faces].transpose(1, 2, 0)
+    along, across = b - a, c - a
+    used = float(np.abs(along[0] * across[1] - along[1] * across[0]).sum() / 2)
+    if used == 0.0 or depth <= 0.0:
         return 0
-    rows, columns = surface.textures[0].shape[:2]
-    texels = surface.uv_area * rows * columns
-    pixels = surface.area * K[0, 0] * K[1, 1] / depth**2
+    texels = used * texture.levels[0, 1] * texture.levels[0, 2]
+    pixels = face_areas(surface.vertices, surface.faces).sum() * K[0, 0] * K[1, 1] / depth**2
     level = math.floor(0.5 * math.log2(max(texels / pixels, 1.0))) - 1
-    return min(max(level, 0), len(surface.textures) - 1)
+    return min(max(level, 0), len(texture.levels) - 1)
 
 
 def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
@@ -197,8 +198,7 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
     pixels = np.empty((_SKY_ROWS, 2 * _SKY_ROWS, 3), np.float32)
     pixels[: _SKY_ROWS // 2], pixels[_SKY_ROWS // 2 :] = ambient.above, ambient.below
     up = np.array(ambient.up) / np.linalg.norm(ambient.up)
-    side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
-    side /= np.linalg.norm(side)
+    right, across, up = rotation_to_z(up)
     place = np.eye(4)
-    place[:3, :3] = np.stack([side, up, np.cross(side, up)], axis=1)  # Mitsuba's zenith is +y
+    place[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f(place)}

@@ -22,19 +22,11 @@ from dopepp.drawing.pictures import Picture, Size
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, rgb
+from dopepp.virtual.renderers.raster.visibility import Box
 from dopepp.virtual.scene import NEAR, Scene
 from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 
-Window = tuple[int, int, int, int]
-"""(left, top, right, bottom) in pixels of the image, right and bottom excluded."""
-
 Area = tuple[slice, slice]
-
-_REACH: Final = 6.0
-"""Radius of the disc, in radii of the sphere around all objects."""
-
-_FADE: Final = 0.6
-"""From this share of the disc's radius outwards, its shadows fade away."""
 
 _ALBEDO: Final = (0.05, 0.8)
 """Bounds of the disc's albedo, which is estimated from the plane's picture and its light."""
@@ -44,9 +36,6 @@ _LEAST_LIGHT: Final = 1e-3
 
 _SPREAD_PX: Final = 2.0
 """Width over which a shadow is carried on under an object's rim, pixels."""
-
-_BRIGHTEST: Final = 4.0
-"""Largest factor on the background: light thrown on a table in deep shade."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +48,7 @@ class View:
         film_from_window: Affine map, 2×3, from the window's pixels to the film's.
     """
 
-    window: Window
+    window: Box
     size: Size
     focal_px: float
     centre_px: tuple[float, float]
@@ -105,7 +94,7 @@ class View:
         return np.asarray(np.maximum(picture, np.float32(0)))
 
 
-def make_view(K: CameraMatrix, window: Window) -> View:
+def make_view(K: CameraMatrix, window: Box) -> View:
     """Return the view of a window of the image."""
     left, top, right, bottom = window
     focal = float(max(K[0, 0], K[1, 1]))
@@ -124,7 +113,7 @@ def make_view(K: CameraMatrix, window: Window) -> View:
     return View(window, size, focal, (-float(low[0]) - 0.5, -float(low[1]) - 0.5), rays)
 
 
-def pixel_rays(K: CameraMatrix, window: Window) -> Float[np.ndarray, "height width 3"]:
+def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 3"]:
     """Return the points at depth 1 m that the window's pixel centres see."""
     left, top, right, bottom = window
     y, x = np.mgrid[top:bottom, left:right]
@@ -183,14 +172,14 @@ class TableTop:
         self._scene, self._normal = scene, np.array(scene.plane.normal, np.float64)
         middle, radius = bounding_sphere(scene)
         self.centre = middle - (self._normal @ middle - scene.plane.offset) * self._normal
-        self.radius = _REACH * radius
+        self.radius = 6 * radius
         self._points = pixel_rays(scene.K, (0, 0, *scene.size)) * depth[..., None]
         away = np.linalg.norm(self._points - self.centre, axis=-1) / self.radius
         self._away = np.where(depth > 0, away, np.inf)
         self._light = np.where((self._away < 1)[..., None], self._full_light(), 0.0)
         self.albedo = self._estimated_albedo()
 
-    def window(self, objects: Window | None) -> Window | None:
+    def window(self, objects: Box | None) -> Box | None:
         """Return the part of the image with the disc and the objects; None if neither is seen."""
         seen = self._away < 1
         if objects is not None:
@@ -220,7 +209,7 @@ class TableTop:
         self, kept: Float[np.ndarray, "height width 3"], area: Area
     ) -> Float[np.ndarray, "height width 3"]:
         """Return the shares of light with no step at the disc's rim, and 1 beside it."""
-        share = np.clip((1 - self._away[area]) / (1 - _FADE), 0.0, 1.0)[..., None]
+        share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
         # Smoothstep: no visible line where the fading begins and ends.
         return 1 + (kept - 1) * share * share * (3 - 2 * share)
 
@@ -260,7 +249,7 @@ def split_light(
     """
     known = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
     kept = np.where(known[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
-    kept = np.clip(kept, 0.0, _BRIGHTEST)
+    kept = np.clip(kept, 0.0, 4.0)  # over 1: light thrown on a table in deep shade
     # At an object's rim both are mixed; the shadow beside it goes on there.
     weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
     spread = cv2.GaussianBlur(np.where(known[..., None], kept, 0.0), (0, 0), _SPREAD_PX)

@@ -47,9 +47,6 @@ PLACES: Final = (
 )
 """Where Debian, Fedora, Arch and Homebrew put libLLVM; the environment names one elsewhere."""
 
-_TRIAL_SECONDS: Final = 60.0
-"""A library that takes longer is passed over this time, and tried again the next."""
-
 _TRIAL: Final = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -63,9 +60,8 @@ print("mean", float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[0])
 def mitsuba() -> Any:
     """Return the ``mitsuba`` module with its variant and threads set.
 
-    Raises:
-        UserError: It is not installed, a setting is wrong, or this process was forked from one
-            that has rendered, whose threads it lacks.
+    A UserError: it is not installed, a setting is wrong, or this process was forked from one that
+    has rendered, whose threads it lacks.
     """
     require("mitsuba", "renderer 'photoreal'", "photoreal")
     pid = _start()
@@ -148,7 +144,7 @@ def is_usable(library: Path) -> bool:
     try:
         done = subprocess.run(
             [sys.executable, "-c", _TRIAL], env=environment, capture_output=True, text=True,
-            timeout=_TRIAL_SECONDS, check=False,
+            timeout=60.0, check=False,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
         _log.warning("%s could not be tried: %s", library, error)

@@ -17,22 +17,12 @@ from jaxtyping import Float, Float32
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import transform
-from dopepp.geometry.rotation import Vector
-from dopepp.virtual.renderers.raster.light import ambient_row
-from dopepp.virtual.renderers.raster.shadow import ShadowMap, hidden_sky
+from dopepp.geometry.rotation import Vector, rotation_to_z
+from dopepp.virtual.renderers.raster.shadow import ShadowMap, ambient_row, hidden_sky
 from dopepp.virtual.renderers.raster.visibility import Box, Samples, inverse_depth_of
 from dopepp.virtual.scene import NEAR, Plane, Scene
 from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
-
-_LAMP_ANGLE: Final = 0.04
-"""Diameter of a lamp as seen from the plane, radians; it makes a high object's shadow soft."""
-
-_SMOOTHING: Final = 0.7
-"""Smallest blur of a shadow on the plane, texels: the map's outlines are not anti-aliased."""
-
-_WIDEST: Final = 1 / 16
-"""Largest blur of a shadow on the plane, over the map's longer side."""
 
 _VISIBLE: Final = np.float32(0.005)
 """Share of hidden light from which on a picture of 256 levels changes."""
@@ -48,7 +38,9 @@ def darken_plane(
     ``samples`` are what the pixels with objects see, those full of objects left out; ``image`` is
     the uint8 background, updated in place.
     """
-    frame = _plane_frame(plane)
+    # Camera-frame points to (x, y) on the plane and the height above it, metres.
+    rotation = rotation_to_z(np.array(plane.normal, np.float64))
+    frame = np.column_stack([rotation, [0.0, 0.0, -plane.offset]])
     sky = hidden_sky(frame, scene.objects)
     if sky is None:
         return
@@ -78,15 +70,6 @@ def darken_plane(
     )  # fmt: skip
 
 
-def _plane_frame(plane: Plane) -> Float[np.ndarray, "3 4"]:
-    """Return the rows that map camera-frame points to (x, y) on the plane and the height."""
-    normal = np.array(plane.normal, np.float64)
-    first = np.cross(np.eye(3)[np.abs(normal).argmin()], normal)
-    first /= np.linalg.norm(first)
-    rotation = np.stack([first, np.cross(normal, first), normal])
-    return np.asarray(np.column_stack([rotation, [0.0, 0.0, -plane.offset]]))
-
-
 def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows columns"], int]:
     """Return the share of every texel that hides the plane from the light, penumbra included.
 
@@ -111,7 +94,9 @@ def _cast(plane: Plane, shadow: ShadowMap) -> tuple[Float32[np.ndarray, "rows co
     # Like triangles: the penumbra is as wide as the lamp seen from the object, times the gap.
     gap = float(np.median(1 / ground[hit] - 1 / drawn[hit]))
     texel = shadow.texel * float(np.median(1 / ground[hit]))
-    sigma = min(max(0.25 * _LAMP_ANGLE * gap / texel, _SMOOTHING), _WIDEST * max(rows, columns))
+    # The plane sees the lamp 0.04 radians wide. The map's outlines are not anti-aliased: a blur of
+    # at least 0.7 texels makes them smooth.
+    sigma = min(max(0.25 * 0.04 * gap / texel, 0.7), max(rows, columns) / 16)
     margin = math.ceil(3 * sigma)
     cast = cv2.copyMakeBorder(cast, *4 * (margin,), cv2.BORDER_CONSTANT, value=0.0)
     return np.asarray(cv2.GaussianBlur(cast, (0, 0), sigma)), margin
@@ -178,11 +163,10 @@ def _darken(
     width = shades.shape[2]
     total, lost = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
     for j in range(shades.shape[1]):
-        left, right = _dark_span(shades, j)
-        if left < right:
+        if shades[:, j].max() > _VISIBLE:
             v = corner[1] + j
             _light_row(corner, j, to_point, normal, shades, sky, lights, P, total, lost)
-            for i in range(left, right):
+            for i in range(width):
                 u = corner[0] + i
                 inverse = to_point[3, 0] * u + to_point[3, 1] * v + to_point[3, 2]
                 if not 0.0 < inverse * near <= 1.0 or _is_full(ids, v - origin[1], u - origin[0]):
@@ -192,22 +176,6 @@ def _darken(
                         kept = max(_ONE - lost[c, i] / total[c, i], _ZERO)
                         step = int(decode[image[v, u, c]] * kept * steps + 0.5)
                         image[v, u, c] = np.uint8(encode[step] + 0.5)
-
-
-@compiled()
-def _dark_span(shades: Array, j: int) -> tuple[int, int]:
-    """Return the first column of a row where light is hidden, and the one after the last."""
-    left, right = shades.shape[2], 0
-    for k in range(shades.shape[0]):
-        for i in range(left):
-            if shades[k, j, i] > _VISIBLE:
-                left = i
-                break
-        for i in range(shades.shape[2] - 1, right - 1, -1):
-            if shades[k, j, i] > _VISIBLE:
-                right = i + 1
-                break
-    return left, right
 
 
 @compiled()

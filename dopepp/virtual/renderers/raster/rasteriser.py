@@ -39,9 +39,6 @@ from dopepp.virtual.triangles import (
 _MOST_PX: Final = 1_000_000
 """A full silhouette whose box is larger than this is counted at a reduced scale."""
 
-_HULL_SLACK: Final = 0.02
-"""Share of an object's depth by which its hull's points may fall short of its vertices."""
-
 
 def render(scene: Scene) -> Rendered:
     """Render a scene with 2×2 anti-aliasing; one without objects is its background."""
@@ -151,7 +148,7 @@ def _depths(item: SceneObject) -> tuple[float, float]:
     depth = item.surface.hull @ item.T_cam_obj[2, :3] + item.T_cam_obj[2, 3]
     least, most = float(depth.min()), float(depth.max())
     # The hull's extreme points miss a little of a round object.
-    slack = _HULL_SLACK * (most - least)
+    slack = 0.02 * (most - least)
     return least - slack, most + slack
 
 

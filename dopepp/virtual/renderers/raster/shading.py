@@ -2,7 +2,10 @@
 
 The steps follow one another over all fragments of an object: what they are (``fragments``), their
 colour (``surface.texture``, noise), their normals (grooves), the sky above them
-(``surface.occlusion``), and each light (``light``). Every step writes arrays over all fragments.
+(``surface.occlusion``), and each light (``shadow``). Every step writes arrays over all fragments.
+A fragment has a position, camera frame, metres, a unit normal towards the camera and an albedo,
+linear RGB, each of shape (3, n), and alpha, the width of GGX, of shape (n,); all are float32. π is
+left out of every term: a white diffuse surface under intensity 1 has radiance 1.
 
 Grooves are the layer lines of a print and the streaks of brushed metal: their profile is a sine of
 the distance along an axis, mixed with noise for irregular ones. Averaged over a pixel, a sine keeps
@@ -23,13 +26,7 @@ import numpy as np
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
-from dopepp.virtual.renderers.raster.light import (
-    ambient_row,
-    lit_shares,
-    reflect_ambient,
-    reflect_light,
-)
-from dopepp.virtual.renderers.raster.shadow import ShadowMap
+from dopepp.virtual.renderers.raster.shadow import ShadowMap, ambient_row, lit_shares
 from dopepp.virtual.renderers.raster.visibility import Projected, Samples
 from dopepp.virtual.scene import Grooves, Scene, SceneObject
 from dopepp.virtual.surface.occlusion import look_up_sky
@@ -37,12 +34,10 @@ from dopepp.virtual.surface.texture import sample_texture
 from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.triangles import scratch
 
-_SHARPEST: Final = 0.002
-"""Smallest width of a highlight: one under a point light would be narrower than any pixel."""
-
-_LIFT_TEXELS: Final = 1.5
-"""Lift of a point before it is looked up in a shadow map; √2 keeps a plane from shadowing itself,
-the rest is for rounding."""
+# Plain literals would turn the arithmetic into float64.
+_ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
+_GRAZING = np.float32(1e-3)
+_TINY = np.float32(1e-6)
 
 _SIDE: Final = 32
 _MASK: Final = _SIDE - 1
@@ -73,7 +68,8 @@ def shade_object(
     position, normal, count = fragments.position, fragments.normal, len(fragments.pixel)
     albedo = _albedo(item, seen, scene, fragments)
     alpha = scratch("alpha", (count,), np.float32)
-    alpha.fill(max(material.roughness**2, _SHARPEST))
+    # A highlight under a point light may be narrower than any pixel.
+    alpha.fill(max(material.roughness**2, 0.002))
     if material.grooves is not None:
         _cut_grooves(item, material.grooves, scene, fragments, alpha)
     lit, opened = (scratch(name, (count,), np.float32) for name in ("lit", "sky"))
@@ -84,9 +80,10 @@ def shade_object(
         radiance,
     )  # fmt: skip
     for shadow in lights:
+        # Lifted by √2 texels, a plane does not shadow itself; the rest is for rounding.
         lit_shares(
             position, normal, fragments.bulge, shadow.light, shadow.inverse_depth, shadow.P,
-            _LIFT_TEXELS * shadow.texel, lit,
+            1.5 * shadow.texel, lit,
         )  # fmt: skip
         reflect_light(
             position, normal, albedo, alpha, lit, shadow.light, material.specular,
@@ -232,6 +229,84 @@ def _streak_noise(noise: Array, x: Scalar) -> Scalar:
     a = noise[(i >> 10) & _MASK, (i >> 5) & _MASK, i & _MASK]
     b = noise[(j >> 10) & _MASK, (j >> 5) & _MASK, j & _MASK]
     return (a * (1 - share) + b * share) / 127.0
+
+
+@compiled(fastmath=True)
+def reflect_ambient(
+    position: Array, normal: Array, albedo: Array, alpha: Array, opened: Array, ambient: Array,
+    metallic: float, radiance: Array,
+) -> None:  # fmt: skip
+    """Set the radiance to the reflected ambient light.
+
+    A dielectric scatters the hemisphere around its normal; the little gloss on top is left out. A
+    metal mirrors the hemisphere's colour in the reflected direction, the sharper the smoother it
+    is, and tints it with its albedo. ``opened``, of shape (n,), is the share of the ambient light
+    that reaches each point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for
+    metals; ``radiance``, linear RGB of shape (3, n), is overwritten.
+    """
+    ux, uy, uz = ambient[0], ambient[1], ambient[2]
+    for p in range(position.shape[1]):
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        height = nx * ux + ny * uy + nz * uz
+        above = 0.5 + 0.5 * height
+        mirrored = above
+        if metallic > 0.0:
+            px, py, pz = position[0, p], position[1, p], position[2, p]
+            length = math.sqrt(px * px + py * py + pz * pz)
+            turn = -2.0 * (nx * px + ny * py + nz * pz) / length
+            mirror = (ux * px + uy * py + uz * pz) / length + turn * height
+            # A smooth metal shows the horizon as an edge as wide as its lobe.
+            sharpness = 1.0 / (0.1 + 0.9 * alpha[p])
+            mirrored = min(max(0.5 + 0.5 * sharpness * mirror, 0.0), 1.0)
+        for c in range(3):
+            scattered = above * ambient[3 + c] + (1.0 - above) * ambient[6 + c]
+            gloss = mirrored * ambient[3 + c] + (1.0 - mirrored) * ambient[6 + c]
+            light = (1.0 - metallic) * scattered + metallic * gloss
+            radiance[c, p] = opened[p] * albedo[c, p] * light
+
+
+@compiled(fastmath=True)
+def reflect_light(
+    position: Array, normal: Array, albedo: Array, alpha: Array, lit: Array, light: Array,
+    specular: float, metallic: float, radiance: Array,
+) -> None:  # fmt: skip
+    """Add one point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
+
+    ``lit``, of shape (n,), is the share of the light that reaches each point, ``light`` comes from
+    :func:`light_row`, ``specular`` is the reflectance of the dielectric part at normal incidence,
+    ``metallic`` 1 for a metal, whose reflectance is its albedo; ``radiance``, linear RGB of shape
+    (3, n), is updated in place.
+    """
+    base, metal = np.float32(specular), np.float32(metallic)
+    matt = _ONE - metal
+    for p in range(position.shape[1]):
+        px, py, pz = position[0, p], position[1, p], position[2, p]
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        lx, ly, lz = light[0] - px, light[1] - py, light[2] - pz
+        square = lx * lx + ly * ly + lz * lz + _TINY
+        norm = _ONE / math.sqrt(square)
+        n_l = max((nx * lx + ny * ly + nz * lz) * norm, _ZERO)
+        away = _ONE / math.sqrt(px * px + py * py + pz * pz)
+        n_v = max(-(nx * px + ny * py + nz * pz) * away, _GRAZING)
+        # |l + v|² = 2 + 2 l·v, and v·h = (1 + l·v)/|l + v|.
+        l_v = -(lx * px + ly * py + lz * pz) * (norm * away)
+        half = _ONE / math.sqrt(_TWO + _TWO * l_v + _TINY)
+        n_h = min((n_l + n_v) * half, _ONE)
+        alpha2 = alpha[p] * alpha[p]
+        d = n_h * n_h * (alpha2 - _ONE) + _ONE
+        k = _HALF * alpha[p]
+        smith = _FOUR * (n_l * (_ONE - k) + k) * (n_v * (_ONE - k) + k)
+        lobe = alpha2 / (d * d * smith)
+        grazing = _ONE - (_ONE + l_v) * half
+        grazing2 = grazing * grazing
+        grazing5 = grazing2 * grazing2 * grazing
+        # No branch: a point that is not lit adds nothing, and the loop stays a vector loop.
+        strength = lit[p] * n_l / square
+        for c in range(3):
+            upright = base + metal * (albedo[c, p] - base)
+            fresnel = upright + (_ONE - upright) * grazing5
+            diffuse = matt * albedo[c, p] * (_ONE - fresnel)
+            radiance[c, p] += strength * light[3 + c] * (diffuse + fresnel * lobe)
 
 
 @compiled(fastmath=True)

@@ -16,38 +16,23 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
 
-from dopepp.core.compiled import Array, compiled
+from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.geometry.camera import Transform, make_transform, transform
-from dopepp.geometry.rotation import Vector
-from dopepp.virtual.renderers.raster.light import light_row
+from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.virtual.renderers.raster.visibility import Projected
-from dopepp.virtual.scene import NEAR, Light, Scene, SceneObject
-from dopepp.virtual.triangles import CENTRE_SAMPLE, project_vertices, rasterise
-
-_TEXELS_PER_PX: Final = 1.0
-"""Resolution of a shadow map, relative to the objects' image."""
-
-_FILL_RESOLUTION: Final = 0.5
-"""Resolution of the shadows of all lights but the first, relative to the first one's."""
-
-_SIDES: Final = (64, 768)
-"""Smallest and largest side of a shadow map, texels."""
+from dopepp.virtual.scene import NEAR, Ambient, Light, Scene, SceneObject
+from dopepp.virtual.triangles import CENTRE_SAMPLE, open_share, project_vertices, rasterise, scratch
 
 _LARGEST_TANGENT: Final = 3.0
 """A light among the objects looks no farther than this to the sides; beyond, all is lit."""
 
-_CELLS: Final = 80
-"""Cells across the longer side of the grid on which the sky over the plane is measured."""
-
 _SKY_DIRECTIONS: Final = 32
 """Directions in which the sky is looked at, one bit each."""
 
-_MARGIN: Final = 2.0
-"""Of the grid around the objects, in units of their height; beyond it little sky is hidden."""
-
-_SPLAT: Final = 0.8
-"""Half the side of a point's spot over the points' spacing; so wide that spots leave no gaps."""
+# Plain literals would turn the arithmetic into float64.
+_ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +40,7 @@ class ShadowMap:
     """What one light sees.
 
     Attributes:
-        light: As of :func:`~dopepp.virtual.renderers.raster.light.light_row`.
+        light: As of :func:`light_row`.
         inverse_depth: 1/m, 0 where nothing is, shape (height, width, 1).
         P: Camera frame to homogeneous pixels of the map, of which the third is the depth from the
             light, shape (3, 4), float32.
@@ -74,7 +59,8 @@ def shadow_maps(scene: Scene, projected: Sequence[Projected]) -> list[ShadowMap]
     extent = max((max(box[2] - box[0], box[3] - box[1]) for box in boxes), default=0)
     lights = []
     for number, light in enumerate(scene.lights):
-        texels = _TEXELS_PER_PX * extent * (_FILL_RESOLUTION if number else 1.0)
+        # One per pixel of the objects' image; for all lights but the first, half as many.
+        texels = extent * (0.5 if number else 1.0)
         lights.append(shadow_map(light, scene.objects, projected, texels))
     return lights
 
@@ -98,7 +84,7 @@ def shadow_map(
         low = np.maximum(tangents.min(axis=0), -_LARGEST_TANGENT)
         high = np.minimum(tangents.max(axis=0), _LARGEST_TANGENT)
     span = np.maximum(high - low, 1e-6)
-    focal = float(np.clip(texels, *_SIDES) / span.max())
+    focal = float(np.clip(texels, 64, 768) / span.max())
     # Two texels of margin, so that the interpolation at the outline stays inside.
     width, height = (math.ceil(focal * side) + 4 for side in span)
     K = np.array([[focal, 0, 2 - focal * low[0]], [0, focal, 2 - focal * low[1]], [0, 0, 1.0]])
@@ -115,16 +101,76 @@ def shadow_map(
     return ShadowMap(light_row(light), inverse_depth, P, 1 / focal)
 
 
+def light_row(light: Light) -> Array:
+    """Return a light's position and its linear RGB at one metre, for compiled code."""
+    return np.array([*light.position, *(light.reach**2 * np.array(light.intensity))], np.float32)
+
+
+def ambient_row(ambient: Ambient) -> Array:
+    """Return the up direction and the light from above and below, for compiled code."""
+    return np.array([*ambient.up, *ambient.above, *ambient.below], np.float32)
+
+
+def lit_shares(
+    position: Array,
+    normal: Array,
+    bulge: Array,
+    light: Array,
+    inverse_depth: Array,
+    P: Array,
+    lift: float,
+    lit: Array,
+) -> None:
+    """Write the share of a light's light that reaches each point; 0 where it faces away.
+
+    ``light`` comes from :func:`light_row`; ``inverse_depth`` and ``P`` are its shadow map's. Before
+    a point is looked up it is lifted along its normal, by ``lift`` metres per metre of distance
+    from the light (from √2 texels on, the four texels around it lie behind it on its own plane,
+    whatever the slope), and by its ``bulge``, metres, shape (n,): a smooth ball of few flat
+    triangles would shadow itself where its normals still face the light. ``lit`` has the shape
+    (n,).
+    """
+    u, v, inverse = scratch("places", position.shape, np.float32)
+    _place(position, normal, bulge, light, P, np.float32(lift), u, v, inverse)
+    _compare(u, v, inverse, inverse_depth, lit)
+
+
+@compiled(fastmath=True)
+def _place(
+    position: Array, normal: Array, bulge: Array, light: Array, P: Array, lift: Scalar, u: Array,
+    v: Array, inverse: Array,
+) -> None:  # fmt: skip
+    """Project lifted points into the map: (u, v) and 1/depth, negative where they face away."""
+    x0, y0, z0 = light[0], light[1], light[2]
+    a, b, c, d = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
+    e, f, g, h = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
+    i, j, k, m = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+    for p in range(position.shape[1]):
+        x, y, z = position[0, p], position[1, p], position[2, p]
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        facing = nx * (x0 - x) + ny * (y0 - y) + nz * (z0 - z)
+        up = bulge[p] + lift * (i * x + j * y + k * z + m)
+        x, y, z = x + up * nx, y + up * ny, z + up * nz
+        scale = _ONE / (i * x + j * y + k * z + m)
+        u[p] = (a * x + b * y + c * z + d) * scale
+        v[p] = (e * x + f * y + g * z + h) * scale
+        inverse[p] = scale if facing > _ZERO else -_ONE
+
+
+@compiled(fastmath=True)
+def _compare(u: Array, v: Array, inverse: Array, inverse_depth: Array, lit: Array) -> None:
+    """Compare projected points with the map."""
+    for p in range(lit.shape[0]):
+        lit[p] = open_share(u[p], v[p], inverse[p], inverse_depth) if inverse[p] > _ZERO else _ZERO
+
+
 def _look_at(light: Light, centre: Vector) -> Transform:
     """Return the transform from the camera frame to a frame at the light that looks at a point."""
     position = np.array(light.position, np.float64)
     forward = centre - position
     distance = float(np.linalg.norm(forward))
     # From the point itself it looks anywhere.
-    forward = forward / distance if distance > 0 else np.array([0.0, 0.0, 1.0])
-    right = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation = rotation_to_z(forward / distance if distance > 0 else np.array([0.0, 0.0, 1.0]))
     return make_transform(rotation, -rotation @ position)
 
 
@@ -143,20 +189,25 @@ def hidden_sky(
     everything = np.concatenate(places) if places else np.zeros((0, 3))
     if len(everything) == 0:
         return None
-    margin = _MARGIN * float(everything[:, 2].max())
+    # Farther away than twice the objects' height, little sky is hidden.
+    margin = 2 * float(everything[:, 2].max())
     low, high = everything[:, :2].min(axis=0) - margin, everything[:, :2].max(axis=0) + margin
-    cell = float((high - low).max()) / _CELLS
+    cell = float((high - low).max()) / 80
     columns, rows = (math.ceil(side) + 1 for side in (high - low) / cell)
     bits, own = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
-    grid = np.array([low[0], low[1], cell])
+    grid, slopes = np.array([low[0], low[1], cell]), _sky_slopes()
     for item, points in zip(objects, places, strict=True):
         own[:] = 0
-        reach = max(_SPLAT * item.surface.spacing / cell, 0.5)
-        _splat(points, reach, _SKY_SLOPES, grid, own)
-        _shrink(own, round(reach - 0.5), bits)
-    hidden = np.empty((rows, columns), np.float32)
-    _count(bits, hidden)
-    hidden = cv2.blur(hidden / _SKY_DIRECTIONS, (3, 3))
+        # Half a spot's side, so wide that spots leave no gaps.
+        reach = max(0.8 * item.surface.spacing / cell, 0.5)
+        _splat(points, reach, slopes, grid, own)
+        # Taken from every direction's spot is what its splats stick out.
+        cells = round(reach - 0.5)
+        padded = np.pad(own, cells, constant_values=np.iinfo(np.uint32).max)
+        windows = sliding_window_view(padded, (2 * cells + 1, 2 * cells + 1))
+        bits |= np.bitwise_and.reduce(windows, axis=(2, 3))
+    counts = np.unpackbits(bits.view(np.uint8), axis=1).reshape(rows, columns, -1).sum(axis=-1)
+    hidden = cv2.blur(counts.astype(np.float32) / _SKY_DIRECTIONS, (3, 3))
     # A little is left at the grid's border; it is faded out over half of the margin.
     edges = (
         np.minimum(np.arange(side), np.arange(side)[::-1]) / (0.5 * margin / cell)
@@ -175,9 +226,6 @@ def _sky_slopes() -> Float[np.ndarray, "directions 2"]:
     return np.asarray(slopes / height[:, None])
 
 
-_SKY_SLOPES: Final = _sky_slopes()
-
-
 @compiled()
 def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
     """Set a direction's bit in the cells, up to a reach, from which a point hides it."""
@@ -194,34 +242,3 @@ def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array)
             for j in range(top, bottom + 1):
                 for i in range(left, right + 1):
                     bits[j, i] |= bit
-
-
-@compiled()
-def _shrink(bits: Array, cells: int, out: Array) -> None:
-    """Take from every direction's spot what its splats stick out, and add it to the others'."""
-    rows, columns = bits.shape
-    row = np.empty_like(bits)
-    for j in range(rows):
-        for i in range(columns):
-            value = bits[j, i]
-            for k in range(max(i - cells, 0), min(i + cells, columns - 1) + 1):
-                value &= bits[j, k]
-            row[j, i] = value
-    for j in range(rows):
-        for i in range(columns):
-            value = row[j, i]
-            for k in range(max(j - cells, 0), min(j + cells, rows - 1) + 1):
-                value &= row[k, i]
-            out[j, i] |= value
-
-
-@compiled()
-def _count(bits: Array, out: Array) -> None:
-    """Count the bits of every cell."""
-    for j in range(bits.shape[0]):
-        for i in range(bits.shape[1]):
-            value, count = bits[j, i], 0
-            while value:
-                value &= value - np.uint32(1)
-                count += 1
-            out[j, i] = count

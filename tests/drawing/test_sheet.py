@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dopepp.drawing import panels
+from dopepp.drawing import curves, sheet
 from dopepp.drawing.curves import figure_image
 from dopepp.drawing.overlay import text_coverage
 from dopepp.drawing.sheet import Tile, contact_sheet
@@ -17,12 +17,12 @@ IMAGE = np.full((30, 40, 3), 100, np.uint8)
 RED, GREY = (200, 10, 10), (90, 90, 90)
 
 
-def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> panels.PlotLine:
-    return panels.PlotLine(name, np.arange(values.shape[1], dtype=float), values, colour)
+def line(values: np.ndarray, name: str = "dope", colour: str = "C0") -> curves.PlotLine:
+    return curves.PlotLine(name, np.arange(values.shape[1], dtype=float), values, colour)
 
 
 def test_several_runs_are_a_mean_in_a_band():
-    figure = panels.lines_figure(
+    figure = curves.lines_figure(
         [line(np.array([[1.0, 2.0], [3.0, 6.0]]))], "step", "loss", log_y=True
     )
     (axes,) = figure.axes
@@ -36,15 +36,15 @@ def test_several_runs_are_a_mean_in_a_band():
 
 
 def test_losses_that_are_not_positive_are_not_drawn_on_a_logarithm():
-    figure = panels.lines_figure([line(np.array([[1.0, 0.0]]))], "step", "loss", log_y=True)
+    figure = curves.lines_figure([line(np.array([[1.0, 0.0]]))], "step", "loss", log_y=True)
     assert figure.axes[0].get_yscale() == "linear"
-    assert panels.lines_figure([], "step", "loss", log_y=True).axes[0].get_legend() is None
+    assert curves.lines_figure([], "step", "loss", log_y=True).axes[0].get_legend() is None
 
 
 def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
     noisy = np.random.default_rng(0).normal(1, 0.5, (1, 500))
     pale, smooth, other = (
-        panels.lines_figure([line(noisy), replace(line(noisy[:, :3]), dashed=True)], "step", "loss")
+        curves.lines_figure([line(noisy), replace(line(noisy[:, :3]), dashed=True)], "step", "loss")
         .axes[0]
         .lines
     )
@@ -57,46 +57,46 @@ def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
 @given(num=st.integers(1, 400), slope=st.floats(-3, 3))
 def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
     values = 5 + slope * np.arange(num, dtype=float)
-    result = panels.smoothed(values)
+    result = curves.smoothed(values)
     assert result.shape == values.shape
     margin = num // 50
     inner = slice(margin, num - margin)
     # An even window lies half a step beside its place.
     np.testing.assert_allclose(result[inner], values[inner], atol=abs(slope) / 2 + 1e-9)
-    np.testing.assert_allclose(panels.smoothed(np.full(num, 2.5)), 2.5)
+    np.testing.assert_allclose(curves.smoothed(np.full(num, 2.5)), 2.5)
 
 
 def test_pictures_stand_in_rows():
     pictures = [np.full((2 + i, 3 + i, 3), 10 * i, np.uint8) for i in range(3)]
-    sheet = panels.grid(pictures, 2)
-    assert sheet.shape == (3 + 4, 3 + 4, 3)
-    assert (sheet[:3, 3:7] == 10).all()
-    assert (sheet[3:, :5] == 20).all()
-    assert (sheet[2, :3] == 255).all()
+    rows = sheet.grid(pictures, 2)
+    assert rows.shape == (3 + 4, 3 + 4, 3)
+    assert (rows[:3, 3:7] == 10).all()
+    assert (rows[3:, :5] == 20).all()
+    assert (rows[2, :3] == 255).all()
     for wrong in (([], 1), (pictures, 0)):
         with pytest.raises(ValueError, match="a grid needs"):
-            panels.grid(*wrong)
+            sheet.grid(*wrong)
 
 
 def test_a_message_is_cut_where_the_picture_ends():
-    picture = panels.message_picture(120, 60, "no file anywhere " * 50)
+    picture = sheet.message_picture(120, 60, "no file anywhere " * 50)
     assert picture.shape == (60, 120, 3)
     assert picture.std() > 1
-    assert (panels.message_picture(40, 30, "")[0] == picture[0, :40]).all()
+    assert (sheet.message_picture(40, 30, "")[0] == picture[0, :40]).all()
 
 
 def test_masks_are_painted_in_their_colours_on_the_darkened_image():
     first, second = np.zeros((2, 30, 40), bool)
     first[5:10, 5:15] = True
     second[20:25, 20:30] = True
-    panel = panels.mask_panel(IMAGE, [first, None, second]).astype(int)
+    panel = sheet.mask_panel(IMAGE, [first, None, second]).astype(int)
     assert (panel[0, 0] == 35).all()
-    for mask, colour in ((first, panels.COLOURS[0]), (second, panels.COLOURS[2])):
+    for mask, colour in ((first, sheet.COLOURS[0]), (second, sheet.COLOURS[2])):
         expected = 0.35 * 100 + 0.65 * np.array(colour)
         assert np.abs(panel[mask] - expected).max() <= 1
-    assert (panels.mask_panel(IMAGE, []) == 35).all()
-    masks = [np.ones((30, 40), bool)] * (len(panels.COLOURS) + 1)  # after the last colour the first
-    assert (panels.mask_panel(IMAGE, masks) == panels.mask_panel(IMAGE, masks[:1])).all()
+    assert (sheet.mask_panel(IMAGE, []) == 35).all()
+    masks = [np.ones((30, 40), bool)] * (len(sheet.COLOURS) + 1)  # after the last colour the first
+    assert (sheet.mask_panel(IMAGE, masks) == sheet.mask_panel(IMAGE, masks[:1])).all()
 
 
 def test_depth_goes_from_red_over_the_objects_range_to_blue():
@@ -105,7 +105,7 @@ def test_depth_goes_from_red_over_the_objects_range_to_blue():
     depth[0] = 0
     objects = np.zeros((30, 40), bool)
     objects[:, :20] = True
-    panel, words = panels.depth_panel(depth, objects)
+    panel, words = sheet.depth_panel(depth, objects)
     assert words == "depth: red 0.180 m to blue 0.420 m"
     assert (panel[0] == 0).all()
     red, blue = panel[5, 0].astype(int), panel[5, 19].astype(int)
@@ -117,19 +117,19 @@ def test_depth_goes_from_red_over_the_objects_range_to_blue():
 def test_depth_without_objects_and_without_anything():
     nothing = np.zeros((30, 40), bool)
     assert (
-        panels.depth_panel(np.full((30, 40), 1.0), nothing)[1]
+        sheet.depth_panel(np.full((30, 40), 1.0), nothing)[1]
         == "depth: red 0.999 m to blue 1.001 m"
     )
-    panel, words = panels.depth_panel(np.zeros((30, 40)), nothing)
+    panel, words = sheet.depth_panel(np.zeros((30, 40)), nothing)
     assert words == "no depth"
     assert not panel.any()
 
 
 def test_axes_end_where_they_should():
     image = np.zeros((60, 80, 3), np.uint8)
-    panels.draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]), thickness=1)
+    sheet.draw_axes(image, np.array([[20.0, 30], [70, 30], [20, 5], [20, 55]]), thickness=1)
     for (column, row), colour in zip(
-        [(60, 30), (20, 8), (20, 50)], panels.AXIS_COLOURS, strict=True
+        [(60, 30), (20, 8), (20, 50)], sheet.AXIS_COLOURS, strict=True
     ):
         # An antialiased line of one pixel keeps nine tenths of its colour at least.
         assert np.abs(image[row, column].astype(int) - colour).max() < 0.1 * 255 + 1
@@ -139,10 +139,10 @@ def test_axes_end_where_they_should():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e12])
 def test_an_axis_that_is_not_seen_is_left_out(bad):
     image = np.zeros((60, 80, 3), np.uint8)
-    panels.draw_axes(image, np.array([[20.0, 30], [bad, bad], [20, 5], [20, 55]]))
+    sheet.draw_axes(image, np.array([[20.0, 30], [bad, bad], [20, 5], [20, 55]]))
     assert image[10, 20].any()
     assert not image[30, 40:].any()
-    panels.draw_axes(image, np.full((4, 2), bad))
+    sheet.draw_axes(image, np.full((4, 2), bad))
 
 
 def plain(colour: tuple[int, int, int], width: int = 40, height: int = 30) -> NDArray[np.uint8]:
