@@ -1,5 +1,6 @@
 """The pages "adding a …", read and run: what they tell a reader to write works as it stands."""
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -16,6 +17,8 @@ from dopepp.core.files import write_png
 from dopepp.experiment.build.registries import CALLBACKS
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.metrics.functional import distances
+from dopepp.models import backbones
+from dopepp.models.registry import Registry
 from dopepp.parts import servoholder
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.renderers import RENDERERS
@@ -51,6 +54,16 @@ def test_the_documented_format_works(monkeypatch, tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(record | {"T_cam_obj": [2.0] * 16}))
     with pytest.raises(UserError, match=r"a\.json: T_cam_obj: no rotation"):
         module.PosedSource(tmp_path, [part])
+
+
+def test_the_documented_backbone_works(monkeypatch):
+    # The page puts the class into backbones.py, so it sees that module's names and one import.
+    monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
+    monkeypatch.setattr(backbones, "Strided", None, raising=False)
+    exec(documented("adding-a-backbone.md"), vars(backbones))
+    registry = Registry.of_module("backbone", backbones.Backbone, backbones)
+    backbone = registry.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
+    assert backbone(torch.zeros(1, 3, 64, 32)).shape == (1, backbone.out_channels, 8, 4)
 
 
 def test_the_documented_renderer_works(monkeypatch):

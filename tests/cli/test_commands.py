@@ -3,8 +3,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -19,13 +17,6 @@ from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.catalogue import pivconnector
 
-SPEC = {
-    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.0625},
-    "attention": {"_target_": "dopepp.models.attention.Identity"},
-    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625},
-    "activation": "exp",
-    "num_objects": 1,
-}
 K = ["--K", "100", "100", "31.5", "31.5"]
 RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]
 
@@ -42,28 +33,30 @@ def refused(*arguments: object) -> str:
     return done.stderr
 
 
-def write_checkpoint(path: Path, **recovery: float) -> Path:
-    weights = build_network(SPEC).state_dict()
-    content = Checkpoint(SPEC, weights, [pivconnector()], (64, 64), 8, 1.0, recovery)
-    write_atomic(content.to_file(), path)
-    return path
+@pytest.fixture
+def write_checkpoint(tiny_spec, tmp_path):
+    def write(**recovery: float) -> Path:
+        weights = build_network(tiny_spec).state_dict()
+        content = Checkpoint(tiny_spec, weights, [pivconnector()], (64, 64), 8, 1.0, recovery)
+        write_atomic(content.to_file(), tmp_path / "best.ckpt")
+        return tmp_path / "best.ckpt"
+
+    return write
 
 
 @pytest.fixture
-def checkpoint(tmp_path: Path) -> Path:
-    return write_checkpoint(tmp_path / "best.ckpt", peak_threshold=1e-4)
+def checkpoint(write_checkpoint):
+    return write_checkpoint(peak_threshold=1e-4)
 
 
 @pytest.fixture
-def picture(tmp_path: Path) -> Path:
+def picture(tmp_path):
     path = tmp_path / "picture.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
     return path
 
 
-def test_predict_prints_json_lines_and_draws(
-    checkpoint: Path, picture: Path, tmp_path: Path
-) -> None:
+def test_predict_prints_json_lines_and_draws(checkpoint, picture, tmp_path):
     drawn = tmp_path / "drawn.png"
     done = call("predict", checkpoint, picture, *K, "--overlay", drawn)
     assert done.exit_code == 0, done.output
@@ -74,15 +67,14 @@ def test_predict_prints_json_lines_and_draws(
     assert cv2.imread(str(drawn)).shape[2] == 3
 
 
-def test_predict_says_in_one_line_why_there_is_nothing(picture: Path, tmp_path: Path) -> None:
-    path = write_checkpoint(tmp_path / "silent.ckpt", centroid_threshold=1.0)
-    done = call("predict", path, picture, *K)
+def test_predict_says_in_one_line_why_there_is_nothing(write_checkpoint, picture):
+    done = call("predict", write_checkpoint(centroid_threshold=1.0), picture, *K)
     assert (done.exit_code, done.stdout) == (0, "")
     assert "pivconnector: no centroid" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-def test_predict_verifies_and_refines(checkpoint: Path, picture: Path, tmp_path: Path) -> None:
+def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
     pytest.importorskip("small_gicp")
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
@@ -102,14 +94,12 @@ def test_predict_verifies_and_refines(checkpoint: Path, picture: Path, tmp_path:
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
 )
-def test_predict_tells_wrong_options(
-    checkpoint: Path, picture: Path, options: list[str], message: str
-) -> None:
+def test_predict_tells_wrong_options(checkpoint, picture, options, message):
     assert message in refused("predict", checkpoint, picture, *K, *options)
     assert refused("predict", picture, picture, *K, *options).startswith("got ")
 
 
-def test_compare_tells_an_unfinished_run(tmp_path: Path) -> None:
+def test_compare_tells_an_unfinished_run(tmp_path):
     (tmp_path / "run" / ".hydra").mkdir(parents=True)
     done = call("compare", tmp_path / "run", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
@@ -117,7 +107,7 @@ def test_compare_tells_an_unfinished_run(tmp_path: Path) -> None:
     assert "missing, which holds no run" in refused("compare", tmp_path / "missing")
 
 
-def test_render_writes_goes_on_and_says_so(tmp_path: Path) -> None:
+def test_render_writes_goes_on_and_says_so(tmp_path):
     arguments = [*RENDER, "--workers", "1", "--out", tmp_path, "-n", "2"]
     done = call(*arguments, "--shard", "1/2")
     assert done.exit_code == 0, done.output
@@ -129,7 +119,7 @@ def test_render_writes_goes_on_and_says_so(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("0*.json"))) == 2
 
 
-def test_render_previews_and_stops(tmp_path: Path) -> None:
+def test_render_previews_and_stops(tmp_path):
     out = tmp_path / "out"
     done = call(*RENDER, "-n", "5000", "--preview", "--out", out)
     assert done.exit_code == 0, done.output
@@ -168,9 +158,7 @@ def test_render_previews_and_stops(tmp_path: Path) -> None:
         (["-n", "5", "--out", "/dev/null/x"], "got folder /dev/null/x: Not a directory"),
     ],
 )
-def test_a_wrong_render_option_is_one_line_and_code_2(
-    arguments: list[str], message: str, tmp_path: Path
-) -> None:
+def test_a_wrong_render_option_is_one_line_and_code_2(arguments, message, tmp_path):
     assert refused(*RENDER, "--out", tmp_path / "out", *arguments).startswith(message)
     assert not (tmp_path / "out").exists()
 
@@ -185,13 +173,11 @@ def test_a_wrong_render_option_is_one_line_and_code_2(
         (["download", "coco"], "got unknown data set 'coco'; allowed: voc2007"),
     ],
 )
-def test_a_wrong_command_is_one_line_and_code_2(arguments: list[str], message: str) -> None:
+def test_a_wrong_command_is_one_line_and_code_2(arguments, message):
     assert refused(*arguments).startswith(message)
 
 
-def test_download_tells_where_the_photos_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_download_tells_where_the_photos_are(tmp_path, monkeypatch):
     photos = tmp_path / "voc2007" / "VOCdevkit" / "VOC2007" / "JPEGImages"
     photos.mkdir(parents=True)
     done = call("download", "voc2007", "--out", tmp_path)
@@ -207,13 +193,11 @@ def test_download_tells_where_the_photos_are(
 
 
 @pytest.fixture
-def plate(shared_data: Path) -> Path:
+def plate(shared_data):
     return shared_data / "parts" / "so_arm100" / "Seeedstudio_Mounting_Plate_SO101.stl"
 
 
-def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(
-    plate: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(plate, tmp_path, caplog):
     out = tmp_path / "out"
     line = refused("render", plate, "--unit", "m", "-n", "5", "--out", out)
     assert "allowed: a diameter of 5 mm – 5 m; fix: state the file's unit: unit=mm" in line
@@ -223,7 +207,7 @@ def test_the_unit_of_a_file_is_guessed_aloud_and_a_wrong_one_named(
 
 
 @pytest.mark.slow
-def test_an_inch_file_comes_out_in_its_size_and_checked(plate: Path, tmp_path: Path) -> None:
+def test_an_inch_file_comes_out_in_its_size_and_checked(plate, tmp_path):
     mesh = trimesh.load_mesh(plate)
     inches, out = tmp_path / "plate.stl", tmp_path / "out"
     corners = mesh.vertices.copy()
@@ -252,7 +236,7 @@ def test_an_inch_file_comes_out_in_its_size_and_checked(plate: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("corner", ["nan nan nan", "30 0 0", None])
-def test_a_mesh_that_is_none_is_one_line(corner: str | None, tmp_path: Path) -> None:
+def test_a_mesh_that_is_none_is_one_line(corner, tmp_path):
     facet = (
         "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 60 0 0\n"
         f"vertex {corner}\nendloop\nendfacet\n"
@@ -266,7 +250,7 @@ def test_a_mesh_that_is_none_is_one_line(corner: str | None, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("layout", ["bop", pytest.param("ndds", marks=pytest.mark.slow)])
-def test_neither_render_nor_check_imports_torch(layout: str, tmp_path: Path) -> None:
+def test_neither_render_nor_check_imports_torch(layout, command, tmp_path):
     # One interpreter does everything a worker does, too: workers are other processes.
     code = f"""
 import sys
@@ -291,13 +275,11 @@ done = CliRunner().invoke(app, ["check", out])
 assert done.exit_code == 0, done.output
 print(sorted({{"torch", "lightning", "torchmetrics", "ray"}} & set(sys.modules)))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.returncode) == ("[]\n", 0), done.stderr
+    done = command("-c", code)
+    assert (done.out, done.code) == ("[]\n", 0), done.err
 
 
-def test_a_full_disk_is_one_line_and_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_one_line_and_code_1(tmp_path, monkeypatch):
     def write(path: Path, content: bytes) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -309,7 +291,6 @@ def test_a_full_disk_is_one_line_and_code_1(
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_the_command_line_starts_light() -> None:
+def test_the_command_line_starts_light(command):
     code = "import sys, dopepp.cli; print({'numpy', 'cv2', 'torch', 'numba'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
+    assert command("-c", code).out == "set()\n"

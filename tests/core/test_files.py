@@ -11,7 +11,7 @@ import pytest
 from dopepp.core.files import write_png, write_whole
 
 
-def test_a_png_keeps_its_pixels_in_rgb(tmp_path: Path) -> None:
+def test_a_png_keeps_its_pixels_in_rgb(tmp_path):
     image = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
     write_png(tmp_path / "new" / "image.png", image)
     back = cv2.imread(str(tmp_path / "new" / "image.png"))[..., ::-1]
@@ -21,15 +21,13 @@ def test_a_png_keeps_its_pixels_in_rgb(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "image", [np.zeros((2, 2, 3)), np.zeros((2, 2), np.uint8), np.zeros((0, 2, 3), np.uint8)]
 )
-def test_what_is_no_image_is_refused(image: np.ndarray, tmp_path: Path) -> None:
+def test_what_is_no_image_is_refused(image, tmp_path):
     with pytest.raises(ValueError, match=r"an image must be uint8 \(H, W, 3\), got"):
         write_png(tmp_path / "image.png", image)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "a.csv"
     write_whole(path, b"old")
 

@@ -11,7 +11,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.futures import completed, connect
 
 
-def test_what_is_done_may_decide_what_comes_next() -> None:
+def test_what_is_done_may_decide_what_comes_next():
     handed_out, told = [], [1]
 
     def items() -> Iterator[int]:
@@ -30,7 +30,7 @@ def test_what_is_done_may_decide_what_comes_next() -> None:
     assert handed_out == [2**power for power in range(10)]
 
 
-def test_no_more_is_handed_out_than_there_is_room() -> None:
+def test_no_more_is_handed_out_than_there_is_room():
     flying: list[Future[int]] = []
 
     def submit(item: int) -> Future[int]:
@@ -47,14 +47,14 @@ def test_no_more_is_handed_out_than_there_is_room() -> None:
     assert sorted(done) == list(range(10))
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"--engine ray without .* pip install 'dopepp\[ray\]'"):
         connect(None, 1)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "127.0.0.1:99999999", "a:b"])
-def test_an_address_without_a_cluster_is_refused_at_once(address: str) -> None:
+def test_an_address_without_a_cluster_is_refused_at_once(address):
     pytest.importorskip("ray")
     with pytest.raises(UserError, match=f"--ray-address {address}: .*ray start --head"):
         connect(address, 1)

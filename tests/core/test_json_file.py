@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -23,7 +22,7 @@ PLAIN = st.recursive(
 
 @settings(max_examples=60, deadline=None)
 @given(PLAIN, st.booleans(), st.sampled_from([None, 1]))
-def test_reads_what_json_writes(value: object, ascii_only: bool, indent: int | None) -> None:
+def test_reads_what_json_writes(value, ascii_only, indent):
     text = json.dumps(value, ensure_ascii=ascii_only, indent=indent)
     text = text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
     assert parse_json(text, "here") == json.loads(text)
@@ -55,7 +54,7 @@ def test_reads_what_json_writes(value: object, ascii_only: bool, indent: int | N
     ],
     ids=lambda value: repr(value)[:20],
 )
-def test_refuses_in_one_line_with_the_place(text: str | bytes, message: str) -> None:
+def test_refuses_in_one_line_with_the_place(text, message):
     with pytest.raises(UserError) as caught:
         parse_json(text, "some/file.json")
     assert "some/file.json" in str(caught.value)
@@ -64,7 +63,7 @@ def test_refuses_in_one_line_with_the_place(text: str | bytes, message: str) -> 
     assert len(str(caught.value)) < 300
 
 
-def test_brackets_in_strings_are_no_nesting() -> None:
+def test_brackets_in_strings_are_no_nesting():
     value = {"a": "[" * 500 + '\\"{{' * 50, "b": ["}"] * 3}
     assert parse_json(json.dumps(value), "here") == value
     deepest = "[" * MAX_DEPTH + "]" * MAX_DEPTH
@@ -73,7 +72,7 @@ def test_brackets_in_strings_are_no_nesting() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=60) | st.text("[]{}\":,\\ntrue1.e-NaInfy 'u", max_size=60))
-def test_any_bytes_give_a_value_or_a_user_error(content: bytes | str) -> None:
+def test_any_bytes_give_a_value_or_a_user_error(content):
     try:
         value = parse_json(content, "here")
     except UserError:
@@ -81,7 +80,7 @@ def test_any_bytes_give_a_value_or_a_user_error(content: bytes | str) -> None:
     assert value == json.loads(content)
 
 
-def test_read_names_the_file_and_bounds_its_size(tmp_path: Path) -> None:
+def test_read_names_the_file_and_bounds_its_size(tmp_path):
     path = tmp_path / "scene_gt.json"
     with pytest.raises(UserError, match=r"scene_gt\.json, no such file"):
         read_json(path)

@@ -27,8 +27,7 @@ def test_a_run_that_goes_on_tells_what_changed(run, call):
     stored = yaml.safe_dump([*yaml.safe_load(before), hostile])
     (run / ".hydra" / "overrides.yaml").write_text(stored)
     done = call("train.py", f"resume={run}", "trainer.max_epochs=2", "optimizer.weight_decay=0.5",
-                "data.batch_size=2", "resume_anyway=true")  # fmt: skip
-    assert done.code == 0, done.err
+                "data.batch_size=2", "resume_anyway=true", code=0)  # fmt: skip
     assert not trace.exists()
     said = [line for line in done.out.splitlines() if line.startswith("changed since")]
     assert [line.partition(": ")[2] for line in said] == [
@@ -58,8 +57,7 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
 
     monkeypatch.setattr(SpatialCrossEntropy, "forward", broken)
     again = ("trainer.max_epochs=4", "callbacks.finite.max_in_a_row=3")
-    done = call("train.py", f"resume={run}", *again)
-    assert done.code == 1
+    done = call("train.py", f"resume={run}", *again, code=1)
     line = done.last_line
     assert "not finite in step 4 (3 steps in a row)" in line
     assert str(run / "nonfinite") in line
@@ -73,16 +71,14 @@ def test_losses_that_are_not_finite_end_the_run_and_keep_what_it_had(run, call, 
     assert dumped["images"].shape == (4, 3, 64, 64)
 
     monkeypatch.undo()
-    done = call("train.py", f"resume={run}", *again)
-    assert done.code == 0, done.err
+    call("train.py", f"resume={run}", *again, code=0)
 
 
 @pytest.mark.slow
 def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypatch, caplog):
     def warnings(*overrides: str) -> list[str]:
         caplog.clear()
-        done = call("evaluate.py", *measured, *overrides)
-        assert done.code == 0, done.err
+        call("evaluate.py", *measured, *overrides, code=0)
         said = [record.getMessage() for record in caplog.records]
         return [line for line in said if line.startswith("the test images are not those of")]
 

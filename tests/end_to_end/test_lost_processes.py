@@ -70,9 +70,8 @@ def test_a_run_goes_on_without_weights_and_biases(command, tiny, tmp_path, find_
     done = command(
         "train.py", *tiny, "logger=wandb", "logger.wandb.offline=false",
         "logger.wandb.settings.init_timeout=3", f"output_dir={tmp_path}", timeout=400,
-        env={**address, "WANDB_MODE": "online", "HOME": str(tmp_path)},
+        env={**address, "WANDB_MODE": "online", "HOME": str(tmp_path)}, code=0,
     )  # fmt: skip
-    assert done.code == 0, done.err[-4000:]
     assert done.err.count("a logger failed") == 1
     assert time.monotonic() - started < 300
     steps = [row["step"] for row in read_csv(find_run(tmp_path) / "metrics.csv")]

@@ -1,51 +1,217 @@
-import json
-from pathlib import Path
+"""Multiruns: their table, and what Weights & Biases and TensorBoard hold of runs."""
 
+import json
+import os
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from wandb.proto import wandb_internal_pb2
 
 from dopepp.experiment.reports.tables import read_csv
 
+BLOCK = 32768
+"""Bytes of a block of LevelDB's log format, which the files have behind seven bytes of their own;
+a record's header is checksum, length and type (1: whole, 2–4: first, middle and last piece)."""
+HEADER = struct.Struct("<IHB")
 
-def only_sweep(output_dir: Path) -> Path:
+
+def records(path: Path) -> Iterator[Any]:
+    """Read a ``.wandb`` file back."""
+    content, place, pieces = path.read_bytes(), 7, b""
+    assert content.startswith(b":W&B")
+    while place + HEADER.size <= len(content):
+        left = BLOCK - place % BLOCK
+        if left < HEADER.size:
+            place += left
+            continue
+        _, length, kind = HEADER.unpack_from(content, place)
+        pieces += content[place + HEADER.size : place + HEADER.size + length]
+        place += HEADER.size + length
+        if kind in (1, 4):
+            record = wandb_internal_pb2.Record()
+            record.ParseFromString(pieces)
+            pieces = b""
+            yield record
+
+
+def values(items: Iterable[Any]) -> dict[str, Any]:
+    return {one.key or "/".join(one.nested_key): json.loads(one.value_json) for one in items}
+
+
+def tracked(path: Path) -> Any:
+    """Return what one file says of its run."""
+    found = SimpleNamespace(config={}, summary={}, history=[])
+    for record in records(path):
+        kind = record.WhichOneof("record_type")
+        if kind == "run":
+            found.name, found.group = record.run.display_name, record.run.run_group
+            found.job_type = record.run.job_type
+            found.config |= values(record.run.config.update)
+        elif kind in ("config", "summary"):
+            getattr(found, kind).update(values(getattr(record, kind).update))
+        elif kind == "history":
+            found.history.append(values(record.history.item))
+        elif kind == "exit":
+            found.exit_code = record.exit.exit_code
+    return found
+
+
+def only(folder: Path) -> Any:
+    (path,) = folder.glob("wandb/offline-run-*/*.wandb")
+    return tracked(path)
+
+
+def sweep_of(output_dir: Path) -> Path:
     (sweep,) = (output_dir / "compare").iterdir()
     return sweep
 
 
-@pytest.mark.slow
-def test_a_failing_job_is_a_row_and_the_others_run(call, tiny, tmp_path):
-    jobs = ("optimizer.lr=-1,1e-3", "seed=1,2")
-    done = call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}")
-    assert done.code == 1
-    sweep = only_sweep(tmp_path)
+@pytest.fixture(scope="module")
+def sweep(call, tiny, tmp_path_factory):
+    """The folder of a multirun of both models that both services follow."""
+    folder = tmp_path_factory.mktemp("sweep")
+    tensorboard = "+logger.tensorboard={_target_: lightning.pytorch.loggers.TensorBoardLogger, "
+    done = call(
+        "train.py", "-m", *tiny, "model=dopepp,dope", "logger=wandb",
+        tensorboard + "name: tensorboard, version: ''}", f"output_dir={folder}", code=0,
+    )  # fmt: skip
+    assert "already in progress" not in done.err
+    assert "comparison" in done.out
+    return sweep_of(folder)
+
+
+def test_they_end_in_one_table_dope_first(sweep):
     rows = read_csv(sweep / "compare.csv")
-    assert [row["method"] for row in rows[:3]] == [
-        "dopepp optimizer.lr=-1 seed=1", "dopepp optimizer.lr=-1 seed=2",
-        "dopepp optimizer.lr=0.001",
-    ]  # fmt: skip
-    assert rows[0]["object"].startswith("failed: got torch.optim.AdamW")
-    assert "| [0](0/) | failed: got torch.optim.AdamW" in (sweep / "README.md").read_text()
-    assert "learning rate" in rows[0]["object"]
-    # The other two differ in their seed only, and were measured on the same images.
-    assert (rows[2]["instances"], rows[2]["seeds"]) == ("3", "1, 2")
-    measured = [json.loads((sweep / job / "metrics.json").read_text()) for job in "23"]
-    assert measured[0]["test_set"] == measured[1]["test_set"] != ""
-    assert len(measured[0]["rotation_deg"]["pivconnector"]) == 3
-    assert measured[0]["diameters"]["pivconnector"] > 0.05
+    assert [row["method"] for row in rows[:2]] == ["dope", "dopepp"]
+    assert rows[0]["Δ ADD-0.1d %"] == ""
+    assert rows[1]["Δ ADD-0.1d %"] not in ("", "n/a")
+    assert rows[1]["Δ ADD-0.1d % verdict"] == "within noise"  # of three instances each
+    assert all(float(row["ms/frame"]) > 0 and float(row["GMACs"]) > 0 for row in rows[:2])
+    # The networks were narrowed: what the full ones cost stands beside it.
+    assert rows[0]["full-size parameters"] == "50,267,350"
+    assert "best constant pose" in [row["method"] for row in rows[2:]]
+
+    text = (sweep / "compare.md").read_text()
+    assert "model.width=0.0625" in text
+    for name in ("compare", "compare_auc", "compare_loss", "compare_pictures"):
+        assert cv2.imread(str(sweep / f"{name}.png")) is not None, name
+    readme = (sweep / "README.md").read_text()
+    assert readme.startswith("# Multirun: finished\n")
+    assert "python train.py -m data=virtual" in readme
+    assert "| [1](1/) | finished |" in readme
+    assert (sweep / "1" / "README.md").read_text().startswith("# dope on virtual: finished")
+    # Both saw the same data.
     prints = [
-        json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "23"
+        json.loads((sweep / job / "versions.json").read_text())["data_fingerprint"] for job in "01"
     ]
-    assert prints[0] != prints[1]  # trained on other images
-    assert "failed: got torch.optim.AdamW" in (sweep / "compare.md").read_text()
-    assert not (sweep / "0" / "metrics.json").exists()
+    assert prints[0] == prints[1]
+
+
+def test_every_job_is_a_run_and_the_comparison_one_more(sweep):
+    for job, model in (("0", "dopepp"), ("1", "dope")):
+        run = only(sweep / job)
+        assert run.name.startswith(f"{model} virtual")
+        assert (run.group, run.job_type, run.exit_code) == (sweep.name, "train", 0)
+        assert run.config["model"]["name"] == model
+        steps = [one["trainer/global_step"] for one in run.history if "train/loss" in one]
+        assert steps == sorted(steps)
+        assert len(steps) == 2  # of this job's two steps, and no other's
+        measured = json.loads((sweep / job / "metrics.json").read_text())
+        assert run.summary["test/pivconnector/auc_10cm"] == pytest.approx(
+            measured["objects"]["pivconnector"]["auc_10cm"]
+        )
+        assert run.summary["reference/best constant pose/pivconnector/add_01d"] == pytest.approx(
+            measured["references"]["best constant pose"]["pivconnector"]["add_01d"]
+        )
+        for kind, names in {
+            "test": {"overlay", "auc"},
+            "val": {"overlay", "auc", "belief"},
+        }.items():
+            folder = f"wandb/offline-run-*/files/media/images/{kind}"
+            assert {one.name.split("_")[0] for one in (sweep / job).glob(f"{folder}/*")} == names
+    comparison = only(sweep)
+    assert (comparison.name, comparison.job_type) == ("comparison", "comparison")
+    assert (comparison.group, comparison.exit_code) == (sweep.name, 0)
+    (file,) = sweep.glob("wandb/offline-run-*/files/media/table/compare_*.table.json")
+    table = json.loads(file.read_text())
+    assert table["columns"][:2] == ["method", "object"]
+    assert [row[0] for row in table["data"]][:2] == ["dope", "dopepp"]
+    pictures = sweep.glob("wandb/offline-run-*/files/media/images/*.png")
+    assert {one.name.rsplit("_", 2)[0] for one in pictures} == {
+        "compare_auc", "compare_pictures", "compare_loss",
+    }  # fmt: skip
+
+
+def test_a_resumed_run_goes_on_in_the_same_run(call, find_run, tiny, tmp_path):
+    call("train.py", *tiny, "logger=wandb", f"output_dir={tmp_path}", code=0)
+    run = find_run(tmp_path)
+    call("train.py", f"resume={run}", "trainer.max_epochs=2", "resume_anyway=true", code=0)
+    paths = sorted(run.glob("wandb/offline-run-*/*.wandb"))
+    assert len(paths) == 2
+    assert paths[0].name == paths[1].name  # it is called after the run's id
+    before, after = map(tracked, paths)
+    assert before.name == after.name
+    assert before.group == after.group == ""
+    first, second = (
+        {one["trainer/global_step"] for one in run.history if "train/loss" in one}
+        for run in (before, after)
+    )
+    assert max(first) < min(second)
+
+
+def test_a_service_that_dies_in_the_middle_ends_nothing(call, tiny, tmp_path, caplog):
+    killed = []
+
+    def kill_service() -> None:
+        until = time.monotonic() + 200
+        while not list(tmp_path.glob("compare/*/0/metrics.csv")):  # after the first epoch
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        command = ["pkill", "-9", "-P", str(os.getpid()), "wandb-core"]
+        killed.append(subprocess.run(command, check=False).returncode)
+
+    killer = threading.Thread(target=kill_service)
+    killer.start()
+    arguments = [*tiny, "trainer.max_epochs=2", "logger=wandb", f"output_dir={tmp_path}"]
+    done = call("train.py", "-m", *arguments, "model/attention=none,cbam")
+    killer.join()
+    assert killed == [0]
+    assert done.code == 0, done.err[-3000:]
+    assert "a logger failed" in caplog.text
+    sweep = sweep_of(tmp_path)
+    assert all((sweep / job / "metrics.json").is_file() for job in "01")
+    assert "comparison" in done.out
+    # The next job starts a service of its own.
+    assert only(sweep / "1").exit_code == 0
+
+
+def test_tensorboard_holds_the_same(sweep):
+    events = EventAccumulator(str(sweep / "0" / "tensorboard")).Reload()
+    tags = events.Tags()
+    assert {"train/loss", "test/pivconnector/add_01d"} <= set(tags["scalars"])
+    assert {"test/overlay", "test/auc", "val/overlay", "val/auc", "val/belief"} <= set(
+        tags["images"]
+    )
+    comparison = EventAccumulator(str(sweep / "tensorboard")).Reload()
+    (text,) = comparison.Tensors("compare/text_summary")
+    assert b"| dopepp" in text.tensor_proto.string_val[0]
+    assert "compare_auc" in comparison.Tags()["images"]
 
 
 def test_a_program_error_is_a_row_and_several_devices_are_refused(call, tiny, tmp_path):
     """What no check foresaw: here, a training that Lightning cannot begin."""
     jobs = ("trainer.gradient_clip_val=wrong", "trainer.devices=1,2")
-    assert call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}").code == 1
-    program_error, refused = (
-        row["object"] for row in read_csv(only_sweep(tmp_path) / "compare.csv")
-    )
+    call("train.py", "-m", *tiny, *jobs, f"output_dir={tmp_path}", code=1)
+    program_error, refused = (row["object"] for row in read_csv(sweep_of(tmp_path) / "compare.csv"))
     assert program_error.startswith("failed: ")
     assert "\n" not in program_error
     assert "trainer.devices=2 in a multirun" in refused

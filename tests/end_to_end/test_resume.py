@@ -31,8 +31,7 @@ def last(run: Path) -> dict[str, Any]:
 def test_resume_goes_on_in_the_same_folder(run, call, find_run):
     before = rows(run)
     assert steps(run) == [0, 1]
-    done = call("train.py", f"resume={run}", "trainer.max_epochs=2")
-    assert done.code == 0, done.err
+    call("train.py", f"resume={run}", "trainer.max_epochs=2", code=0)
     assert find_run(run.parents[1]) == run  # no second folder
     assert steps(run) == [0, 1, 2, 3]
     for old, new in zip(before, rows(run)[:2], strict=True):
@@ -43,19 +42,20 @@ def test_resume_goes_on_in_the_same_folder(run, call, find_run):
 
     # A finished run has nothing to continue: it is measured again, nothing else.
     options = read_overrides(run)
-    done = call("train.py", f"resume={run}")
-    assert done.code == 0, done.err
+    call("train.py", f"resume={run}", code=0)
     assert steps(run) == [0, 1, 2, 3]
     assert read_overrides(run) == options  # none is added to at every resume
 
 
 def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, monkeypatch):
     overrides = [*tiny, "trainer.max_epochs=2"]
-    assert call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}").code == 0
+    call("train.py", *overrides, f"output_dir={tmp_path / 'whole'}", code=0)
     # The last epoch's, though nothing has become better since the first one's.
     assert last(find_run(tmp_path / "whole"))["global_step"] == 4
 
     def press_ctrl_c(system: PoseSystem, batch: object, batch_idx: int) -> None:
+        (text,) = (path.read_text() for path in (tmp_path / "cut").glob("*/*/README.md"))
+        assert text.startswith("# dopepp on virtual: running\n")
         if (system.current_epoch, batch_idx) == (1, 1):
             raise KeyboardInterrupt
 
@@ -71,9 +71,11 @@ def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, 
     saved = "saved up to step 2 in checkpoints/last.ckpt"
     assert done.last_line == f"interrupted; {saved}; go on with resume={run}"
     assert not (run / "metrics.json").exists()
+    readme = (run / "README.md").read_text()
+    assert readme.startswith(f"# dopepp on virtual: interrupted\n\n{saved}; go on with")
+    assert f"python train.py resume={run}  # go on" in readme
 
-    done = call("train.py", f"resume={run}")
-    assert done.code == 0, done.err
+    call("train.py", f"resume={run}", code=0)
     whole, resumed = (rows(folder) for folder in (find_run(tmp_path / "whole"), run))
     assert [row["step"] for row in resumed] == ["0", "1", "2", "3"]
     for name in ("epoch", "train/loss", "val/loss", "lr-AdamW"):
@@ -86,11 +88,10 @@ def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, 
 
 def test_init_from_starts_a_new_run_with_the_weights(run, call, find_run, tiny, tmp_path):
     path = run / "checkpoints" / "best.ckpt"
-    done = call(
+    call(
         "train.py", *tiny, f"init_from={path}", "optimizer.lr=1e-12", "scheduler=constant",
-        "optimizer.weight_decay=0", f"output_dir={tmp_path / 'new'}",
+        "optimizer.weight_decay=0", f"output_dir={tmp_path / 'new'}", code=0,
     )  # fmt: skip
-    assert done.code == 0, done.err
     fresh = find_run(tmp_path / "new")
     assert fresh != run
     assert last(fresh)["global_step"] == 2  # counted anew
@@ -165,18 +166,12 @@ def test_resume_takes_the_newest_whole_checkpoint(how, run, call, caplog):
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_again_in_its_folder(run, call, find_run):
-    before = rows(run)
+    losses = [row["train/loss"] for row in rows(run)]
     for path in (run / "checkpoints").iterdir():
         path.unlink()
-    done = call("train.py", f"resume={run}")
-    assert done.code == 0, done.err
+    done = call("train.py", f"resume={run}", code=0)
     assert f"no checkpoint yet in {run}" in done.out
-    names = [name for name in before[0] if not name.startswith("throughput/")]
-    # The run was another process, whose sums were rounded by another number of threads.
-    for old, new in zip(before, rows(run), strict=True):
-        known = [name for name in names if old[name]]
-        expected = [float(old[name]) for name in known]
-        assert [float(new[name]) for name in known] == pytest.approx(expected, rel=1e-2, abs=1e-3)
+    assert [row["train/loss"] for row in rows(run)] == losses
     assert find_run(run.parents[1]) == run
 
 
@@ -200,8 +195,7 @@ def test_two_killed_processes_end_as_whole_ones(start, command, tiny, tmp_path):
         "callbacks.last.every_s=0.2", "callbacks.last.max_share=1",
     ]  # fmt: skip
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    done = command("train.py", *arguments, f"hydra.run.dir={whole}", timeout=600)
-    assert done.code == 0, done.err[-4000:]
+    done = command("train.py", *arguments, f"hydra.run.dir={whole}", timeout=600, code=0)
     # Both together make one run and one report: of the config's tree, of the images, of the folder.
     for text in ("num_test: 3", "3 test images", "run folder"):
         assert done.out.count(text) == 1, text
@@ -219,8 +213,16 @@ def test_two_killed_processes_end_as_whole_ones(start, command, tiny, tmp_path):
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert last(killed)["global_step"] % per_epoch, "a checkpoint in the middle of an epoch"
-    done = command("train.py", f"resume={killed}", timeout=600)
-    assert done.code == 0, done.err[-4000:]
+    command("train.py", f"resume={killed}", timeout=600, code=0)
     assert steps(killed) == steps(whole) == list(range(3 * per_epoch))
     one, other = (last(run)["state_dict"] for run in (killed, whole))
     assert all(torch.equal(one[name], value) for name, value in other.items())
+
+
+@pytest.mark.timeout(600)
+def test_a_run_killed_three_times_ends_as_one_left_in_peace(command):
+    """At random moments; ``benchmarks/crash.py`` does fifty."""
+    done = command("benchmarks/crash.py", "--kills=3", "--epochs=4", timeout=580, code=0)
+    assert "3 kills: " in done.out
+    assert ", 0 lost []" in done.out
+    assert "differences from the undisturbed run: none" in done.out

@@ -4,7 +4,8 @@ import logging
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ def steps(run: Path) -> list[str]:
     return [row["step"] for row in read_csv(run / "metrics.csv")]
 
 
-def at_step(patch: pytest.MonkeyPatch, step: int, act: Callable[[], object]) -> None:
-    """Do something in the middle of a step."""
+@contextmanager
+def at_step(step: int, act: Callable[[], object]) -> Iterator[None]:
+    """Do something in the middle of a step of the runs within."""
     forward = PoseSystem.training_step
 
     def training_step(system: PoseSystem, *arguments: Any) -> Any:
@@ -32,7 +34,9 @@ def at_step(patch: pytest.MonkeyPatch, step: int, act: Callable[[], object]) -> 
             act()
         return forward(system, *arguments)
 
-    patch.setattr(PoseSystem, "training_step", training_step)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PoseSystem, "training_step", training_step)
+        yield
 
 
 def send(*numbers: int) -> Callable[[], None]:
@@ -49,8 +53,7 @@ def send(*numbers: int) -> Callable[[], None]:
     ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_saves_the_step(number, code, call, find_run, tiny, tmp_path):
-    with pytest.MonkeyPatch.context() as patch:
-        at_step(patch, 0, send(number))
+    with at_step(0, send(number)):
         done = call("train.py", *tiny, f"output_dir={tmp_path}")
     assert done.code == code, done.err
     run = find_run(tmp_path)
@@ -58,12 +61,14 @@ def test_a_signal_saves_the_step(number, code, call, find_run, tiny, tmp_path):
     assert done.last_line.endswith(f"resume={run}")
     assert "Traceback" not in done.err
     assert last_step(run) == 1
-    assert call("train.py", f"resume={run}").code == 0
+    call("train.py", f"resume={run}", code=0)
     assert steps(run) == ["0", "1"]
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(call, find_run, tiny, tmp_path):
+def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(
+    call, find_run, tiny, tmp_path, monkeypatch
+):
     save = torch.save
 
     def interrupted_save(content: dict[str, Any], stream: Any) -> None:
@@ -74,11 +79,9 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(call, find_run, 
         save(content, stream)
 
     each = ("callbacks.last.every_s=0", "callbacks.last.max_share=1")
-    with pytest.MonkeyPatch.context() as patch:
-        at_step(patch, 1, send(signal.SIGINT))
-        patch.setattr(torch, "save", interrupted_save)
-        done = call("train.py", *tiny, *each, f"output_dir={tmp_path}")
-    assert done.code == 130, done.err
+    monkeypatch.setattr(torch, "save", interrupted_save)
+    with at_step(1, send(signal.SIGINT)):
+        done = call("train.py", *tiny, *each, f"output_dir={tmp_path}", code=130)
     run = find_run(tmp_path)
     assert "saved up to step 1" in done.last_line
     assert last_step(run) == 1
@@ -86,25 +89,23 @@ def test_a_second_ctrl_c_while_saving_leaves_the_old_checkpoint(call, find_run, 
 
 
 @pytest.mark.slow
-def test_a_job_that_slurm_requeues_goes_on_in_its_folder(call, find_run, tiny, tmp_path, caplog):
+def test_a_job_that_slurm_requeues_goes_on_in_its_folder(
+    call, find_run, tiny, tmp_path, caplog, monkeypatch
+):
     caplog.set_level(logging.INFO)
     scontrol = tmp_path / "bin" / "scontrol"
     scontrol.parent.mkdir()
     scontrol.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/asked\n')
     scontrol.chmod(0o755)
     command = ("train.py", *tiny, f"output_dir={tmp_path / 'outputs'}")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PATH", f"{scontrol.parent}:{os.environ['PATH']}")
-        patch.setenv("SLURM_JOB_ID", "77")
-        with pytest.MonkeyPatch.context() as once:
-            at_step(once, 0, send(signal.SIGTERM, signal.SIGTERM))
-            done = call(*command)
-        assert done.code == 143, done.err
-        assert done.last_line.endswith("; SLURM requeues job 77")
-        assert (tmp_path / "asked").read_text() == "requeue 77\n"
-        patch.setenv("SLURM_RESTART_COUNT", "1")
-        done = call(*command)
-    assert done.code == 0, done.err
+    monkeypatch.setenv("PATH", f"{scontrol.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("SLURM_JOB_ID", "77")
+    with at_step(0, send(signal.SIGTERM, signal.SIGTERM)):
+        done = call(*command, code=143)
+    assert done.last_line.endswith("; SLURM requeues job 77")
+    assert (tmp_path / "asked").read_text() == "requeue 77\n"
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    call(*command, code=0)
     assert "job 77 was requeued: going on in" in caplog.text
     assert steps(find_run(tmp_path / "outputs")) == ["0", "1"]
 
@@ -112,16 +113,14 @@ def test_a_job_that_slurm_requeues_goes_on_in_its_folder(call, find_run, tiny, t
 @pytest.mark.slow
 def test_an_interrupted_sweep_keeps_what_is_finished(call, tiny, tmp_path):
     seeds: list[int] = []
-    with pytest.MonkeyPatch.context() as patch:
 
-        def second_job() -> None:
-            seeds.append(torch.initial_seed())
-            if len(set(seeds)) == 2:
-                send(signal.SIGTERM)()
+    def second_job() -> None:
+        seeds.append(torch.initial_seed())
+        if len(set(seeds)) == 2:
+            send(signal.SIGTERM)()
 
-        at_step(patch, 0, second_job)
-        done = call("train.py", "-m", *tiny, "seed=1,2,3", f"output_dir={tmp_path}")
-    assert done.code == 143, done.err
+    with at_step(0, second_job):
+        call("train.py", "-m", *tiny, "seed=1,2,3", f"output_dir={tmp_path}", code=143)
     (sweep,) = (tmp_path / "compare").iterdir()
     rows = read_csv(sweep / "compare.csv")
     assert rows[0]["instances"] == "3"
@@ -155,11 +154,11 @@ def fill(disk: Path) -> None:
 
 @pytest.mark.slow
 def test_a_disk_that_is_full_for_a_while_costs_nothing(small_disk, call, find_run, tiny, caplog):
-    with pytest.MonkeyPatch.context() as patch:
-        at_step(patch, 1, lambda: fill(small_disk))
-        at_step(patch, 3, lambda: (small_disk / "filler").unlink())
-        done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
-    assert done.code == 0, done.err
+    with (
+        at_step(1, lambda: fill(small_disk)),
+        at_step(3, lambda: (small_disk / "filler").unlink()),
+    ):
+        call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}", code=0)
     run = find_run(small_disk)
     assert f"cannot save last.ckpt in {run}/checkpoints" in caplog.text
     assert last_step(run) == 4
@@ -168,10 +167,8 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(small_disk, call, find_ru
 
 @pytest.mark.slow
 def test_a_disk_that_stays_full_fails_the_run(small_disk, call, find_run, tiny):
-    with pytest.MonkeyPatch.context() as patch:
-        at_step(patch, 2, lambda: fill(small_disk))
-        done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}")
-    assert done.code == 1, done.err
+    with at_step(2, lambda: fill(small_disk)):
+        done = call("train.py", *tiny, *EVERY_STEP, f"output_dir={small_disk}", code=1)
     run = find_run(small_disk)
     assert done.last_line.startswith("cannot save ")
     assert "No space left on device" in done.last_line
@@ -179,8 +176,7 @@ def test_a_disk_that_stays_full_fails_the_run(small_disk, call, find_run, tiny):
     assert "Traceback" not in done.err
     assert last_step(run) == 2
     (small_disk / "filler").unlink()
-    done = call("train.py", f"resume={run}")
-    assert done.code == 0, done.err
+    call("train.py", f"resume={run}", code=0)
     assert last_step(run) == 4
     assert steps(run) == ["0", "1", "2", "3"]
 

@@ -102,6 +102,6 @@ def fast_training(tmp_path):
 
 
 @pytest.fixture
-def call_fast(in_process, fast_training, tmp_path):
-    """Run it inside this process; returns exit code, output and error output."""
-    return partial(in_process, fast_training, f"output_dir={tmp_path}", "~hydra.callbacks.compare")
+def call_fast(call, fast_training, tmp_path):
+    """Run it inside this process."""
+    return partial(call, fast_training, f"output_dir={tmp_path}", "~hydra.callbacks.compare")

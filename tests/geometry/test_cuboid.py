@@ -4,19 +4,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.geometry.cuboid import EDGES, cuboid_keypoints
 
-NDDS_ORDER = np.array(
-    [
-        (1, -1, 1),
-        (-1, -1, 1),
-        (-1, 1, 1),
-        (1, 1, 1),
-        (1, -1, -1),
-        (-1, -1, -1),
-        (-1, 1, -1),
-        (1, 1, -1),
-        (0, 0, 0),
-    ]
-)
+LEFT_AND_RIGHT = [(1, -1), (-1, -1), (-1, 1), (1, 1)]
+NDDS_ORDER = np.array([(*xy, z) for z in (1, -1) for xy in LEFT_AND_RIGHT] + [(0, 0, 0)])
 
 
 @pytest.mark.parametrize("thickness", [0.007, 0.0])

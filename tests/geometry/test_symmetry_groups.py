@@ -39,12 +39,8 @@ def test_exact_generators_stay_exact():
     half_turns = np.array([np.diag([-1.0, -1, 1]), np.diag([1.0, -1, -1])])
     group = exact_group(half_turns)
     assert group is not None
-    assert {tuple(np.diag(one)) for one in group} == {
-        (1, 1, 1),
-        (-1, -1, 1),
-        (1, -1, -1),
-        (-1, 1, -1),
-    }
+    diagonals = {tuple(np.diag(one)) for one in group}
+    assert diagonals == {(1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1)}
     assert is_group(group)
 
 
@@ -72,3 +68,32 @@ def test_a_ball_has_rotations_all_over_and_a_bounded_number_of_them():
     have = Rotation.from_matrix(group[:, :3, :3])
     away = [(one.inv() * have).magnitude().min() for one in wanted]
     assert max(away) < 0.2
+
+
+def test_group_of_a_can():
+    """A can: any turn about its axis, and upside down. The axis misses the origin."""
+    axis_point = np.array([0.02, -0.01, 0.0])
+    upside_down = np.eye(4)
+    upside_down[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    upside_down[:3, 3] = axis_point - upside_down[:3, :3] @ axis_point
+    group = symmetry_group(upside_down[None], [((0.0, 0.0, 2.0), tuple(axis_point))], 0.01)
+    assert group.shape == (2 * 315, 4, 4)
+    np.testing.assert_array_equal(group[0], np.eye(4))
+    np.testing.assert_allclose(
+        group[:, :3, :3] @ group[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (630, 1, 1)),
+        atol=1e-12,
+    )  # fmt: skip
+    on_axis = group[:, :3, :3] @ axis_point + group[:, :3, 3]
+    np.testing.assert_allclose(on_axis, np.tile(axis_point, (630, 1)), atol=1e-12)
+    angles = Rotation.from_matrix(group[:315, :3, :3]).magnitude()
+    assert np.diff(np.sort(angles)).max() < 2 * 0.01
+    # It is a group: the product of two of its members is one of them.
+    product = group[7] @ group[400]
+    assert np.abs(group - product).max(axis=(1, 2)).min() < 1e-12
+
+
+def test_a_bad_axis_or_step_is_refused():
+    with pytest.raises(ValueError, match="axis of symmetry"):
+        symmetry_group(None, [((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match="max_step"):
+        symmetry_group(max_step=0.0)

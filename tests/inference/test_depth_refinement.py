@@ -4,6 +4,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -36,13 +37,8 @@ TRUE = make_transform(TILTED, np.array([0.03, -0.02, 0.6]))
 
 @pytest.fixture(scope="module")
 def box() -> Part:
-    half = np.array([0.082, 0.107, 0.036])
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return make_part("box", Mesh(signs * half, np.array(faces, np.int32)))
+    whole = trimesh.creation.box((0.164, 0.214, 0.072))
+    return make_part("box", Mesh(np.array(whole.vertices), np.array(whole.faces, np.int32)))
 
 
 def depth_of(part: Part, T: np.ndarray, seed: int = 0, wall: float = 0.9) -> np.ndarray:

@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -25,20 +21,13 @@ from dopepp.inference.estimator import letterboxed, parse_recovery
 from dopepp.maps import MapGeometry, encode
 from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
-from dopepp.parts.part import Part, make_part
+from dopepp.parts.part import make_part
 
-SPEC = {
-    "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": 0.125},
-    "attention": {"_target_": "dopepp.models.attention.CBAM"},
-    "head": {"_target_": "dopepp.models.heads.MultiScale", "width": 0.125},
-    "activation": "exp",
-    "num_objects": 2,
-}
 K_VGA = camera_matrix(560, 565, 318.0, 242.5)
 
 
 @pytest.fixture(scope="session")
-def parts() -> list[Part]:
+def parts():
     corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
     return [
         make_part("bracket", None, corners * [0.08, 0.06, 0.1]),
@@ -47,24 +36,26 @@ def parts() -> list[Part]:
 
 
 @pytest.fixture(scope="session")
-def checkpoint_path(parts: list[Part], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    checkpoint = Checkpoint(
-        spec=SPEC,
-        state_dict=build_network(SPEC).state_dict(),
-        parts=parts,
-        input_size=(416, 416),
-        stride=8,
-        sigma=1.5,
-        recovery={"peak_threshold": 0.03, "max_peaks": 8},
-    )
-    path = tmp_path_factory.mktemp("checkpoint") / "best.ckpt"
-    write_atomic(checkpoint.to_file(), path)
-    return path
+def save(tiny_spec, tmp_path_factory):
+    def write(parts: list[Part], **recovery: float) -> Path:
+        torch.manual_seed(0)
+        spec = {**tiny_spec, "num_objects": 2}
+        weights = build_network(spec).state_dict()
+        checkpoint = Checkpoint(spec, weights, parts, (416, 416), 8, 1.5, recovery)
+        path = tmp_path_factory.mktemp("checkpoint") / "best.ckpt"
+        write_atomic(checkpoint.to_file(), path)
+        return path
+
+    return write
 
 
 @pytest.fixture(scope="session")
-def estimator(checkpoint_path: Path) -> PoseEstimator:
+def checkpoint_path(save, parts):
+    return save(parts, peak_threshold=0.03, max_peaks=8)
+
+
+@pytest.fixture(scope="session")
+def estimator(checkpoint_path):
     return PoseEstimator.load(checkpoint_path)
 
 
@@ -218,23 +209,17 @@ def test_a_recovery_option_of_another_program():
         parse_recovery({"max_peaks": 0})
 
 
-def loaded_after(code: str) -> set[str]:
-    """Which modules a fresh interpreter has loaded after running some code."""
-    command = f"{code}\nimport sys\nprint(*sys.modules)"
-    run = subprocess.run(
-        [sys.executable, "-c", command], capture_output=True, text=True, check=True
-    )
-    return set(run.stdout.split())
+LOADED = "\nimport sys; print(*sys.modules)"
 
 
-def test_importing_dopepp_is_light():
-    loaded = loaded_after("import dopepp")
+def test_importing_dopepp_is_light(command):
+    loaded = set(command("-c", "import dopepp" + LOADED).out.split())
     assert "dopepp" in loaded
     assert not {"torch", "lightning", "cv2", "scipy"} & loaded
 
 
-def test_inference_needs_no_training_and_no_data():
-    loaded = loaded_after("from dopepp import PoseEstimator")
+def test_inference_needs_no_training_and_no_data(command):
+    loaded = set(command("-c", "from dopepp import PoseEstimator" + LOADED).out.split())
     assert "dopepp.inference.estimator" in loaded
     packages = {name.split(".")[0] for name in loaded}
     assert not {"lightning", "hydra", "omegaconf", "wandb", "mitsuba", "ray"} & packages
@@ -249,16 +234,12 @@ def test_an_unknown_name_of_the_package():
         _ = dopepp.PoseEstimater
 
 
-def test_refines_with_depth_where_it_is_given(tmp_path):
+def test_refines_with_depth_where_it_is_given(save):
     pytest.importorskip("small_gicp")
     from dopepp.parts.catalogue import pivconnector, servoholder
     from dopepp.virtual import Scene, SceneObject, make_surface, render
 
-    checkpoint = Checkpoint(
-        SPEC, build_network(SPEC).state_dict(), [servoholder(), pivconnector()], (416, 416), 8, 1.5
-    )
-    path = tmp_path / "parts.ckpt"
-    write_atomic(checkpoint.to_file(), path)
+    path = save([servoholder(), pivconnector()])
     T = make_transform(random_rotation(np.random.default_rng(3)), np.array([0.01, 0.0, 0.4]))
     off = T.copy()
     off[2, 3] += 0.012

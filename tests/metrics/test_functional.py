@@ -10,32 +10,42 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dopepp.geometry.symmetry import symmetry_group
 from dopepp.metrics.functional import (
     add,
     add_s,
+    mspd,
+    mssd,
     reprojection_error,
     rotation_error_deg,
     translation_error,
 )
 
-Array = NDArray[np.float64]
 REL = 1e-9
-K = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+K = torch.tensor([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]]).double()
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+HALF_TURN[:2, 3] = 0.01, -0.02
+IN_PIXELS = {
+    "mspd": lambda *pose: mspd(*pose, K),
+    "reprojection": lambda *pose: reprojection_error(*pose, K),
+}
+ERRORS = {"add": add, "add_s": add_s, "mssd": mssd, **IN_PIXELS}
 
 
-def poses(n: int, seed: int, near: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def poses(n: int, seed: int, near: bool = False) -> list[Tensor]:
+    """Estimated R and t, true R and t."""
     rng = np.random.default_rng(seed)
     R_gt = Rotation.random(n, random_state=rng)
     turn = Rotation.from_rotvec(rng.normal(0, 0.05, (n, 3)))
     R_est = R_gt * turn if near else Rotation.random(n, random_state=rng)
     t_gt = rng.normal([0, 0, 1], 0.1, (n, 3))
     t_est = t_gt + rng.normal(0, 0.01, (n, 3))
-    arrays = (R_est.as_matrix(), t_est, R_gt.as_matrix(), t_gt)
-    return tuple(torch.from_numpy(a) for a in arrays)  # type: ignore[return-value]
+    return [torch.from_numpy(one) for one in (R_est.as_matrix(), t_est, R_gt.as_matrix(), t_gt)]
 
 
 def cloud(n: int, seed: int = 0) -> Tensor:
@@ -43,13 +53,9 @@ def cloud(n: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(rng.uniform(-0.05, 0.05, (n, 3)) * [1, 0.7, 0.1])
 
 
-def placed(R: Tensor, t: Tensor, points: Tensor) -> Array:
-    return np.array(
-        [
-            [R_i @ p + t_i for p in points.numpy()]
-            for R_i, t_i in zip(R.numpy(), t.numpy(), strict=True)
-        ]
-    )
+def placed(R: Tensor, t: Tensor, points: Tensor) -> np.ndarray:
+    every = zip(R.numpy(), t.numpy(), strict=True)
+    return np.array([[R_i @ p + t_i for p in points.numpy()] for R_i, t_i in every])
 
 
 @pytest.mark.parametrize("near", [False, True])
@@ -58,24 +64,35 @@ def test_add_equals_the_loop(near):
     points = cloud(50)
     difference = placed(R_est, t_est, points) - placed(R_gt, t_gt, points)
     expected = np.sqrt((difference**2).sum(-1)).mean(-1)
-    np.testing.assert_allclose(add(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL)
+    assert_allclose(add(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL)
 
 
-def test_add_s_runs_from_true_points_to_estimated_ones():
-    # Points 0 and 1 on a line, the estimate shrunk to one end: true point 1 is 1 away from it,
-    # while seen from the estimate every point would lie on a true one.
-    points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], dtype=torch.float64)
-    eye, zero = torch.eye(3).double()[None], torch.zeros(1, 3).double()
-    assert add_s(0 * eye, zero, eye, zero, points).item() == pytest.approx(0.5, rel=REL)
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.sampled_from([1, 2, 7, 8, 9, 16, 17, 33, 200, 1000]),
+    scale=st.floats(0.5, 2.0),
+)
+def test_add_s_is_exact_for_any_matrix(seed, count, scale):
+    """From true points to the nearest estimated one; rotations, scaled, skewed and flat ones."""
+    R_est, t_est, R_gt, t_gt = poses(5, seed)
+    R_est[1] *= scale
+    R_est[2] += 0.3 * torch.from_numpy(np.random.default_rng(seed).normal(size=(3, 3)))
+    R_est[3, :, 0] = 0.0
+    R_est[4] = 0.0
+    points = cloud(count, seed)
+    points[count // 2 :] = points[: count - count // 2].clone()  # ties
+    both = zip(placed(R_est, t_est, points), placed(R_gt, t_gt, points), strict=True)
+    expected = [KDTree(estimated).query(true)[0].mean() for estimated, true in both]
+    assert_allclose(add_s(R_est, t_est, R_gt, t_gt, points), expected, rtol=REL, atol=1e-15)
 
 
 def test_chunks_change_nothing(monkeypatch):
     pose, points = poses(9, 4), cloud(64)
-    whole = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
+    whole = [error(*pose, points) for error in ERRORS.values()]
     monkeypatch.setattr("dopepp.metrics.functional.distances._CHUNK_POINTS", 128)
-    parts = add(*pose, points), add_s(*pose, points), reprojection_error(*pose, points, K)
-    for a, b in zip(whole, parts, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=0)
+    for error, expected in zip(ERRORS.values(), whole, strict=True):
+        torch.testing.assert_close(error(*pose, points), expected, rtol=1e-12, atol=0)
 
 
 @given(
@@ -96,28 +113,19 @@ def test_a_pure_translation_is_its_own_length(shift, rotvec):
 def test_reprojection_error_equals_opencv():
     R_est, t_est, R_gt, t_gt = poses(5, 6)
     points = cloud(40)
-    camera = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
 
-    def pixels(R: Tensor, t: Tensor) -> Array:
+    def pixels(R: Tensor, t: Tensor) -> np.ndarray:
         rvec = cv2.Rodrigues(R.numpy())[0]
-        return np.asarray(cv2.projectPoints(points.numpy(), rvec, t.numpy(), camera, None)[0])[:, 0]
+        return cv2.projectPoints(points.numpy(), rvec, t.numpy(), K.numpy(), None)[0][:, 0]
 
     expected = [
         np.linalg.norm(pixels(R_est[i], t_est[i]) - pixels(R_gt[i], t_gt[i]), axis=1).mean()
         for i in range(5)
     ]
-    result = reprojection_error(R_est, t_est, R_gt, t_gt, points, torch.from_numpy(camera))
-    np.testing.assert_allclose(result, expected, rtol=REL)
-    each = torch.from_numpy(np.tile(camera, (5, 1, 1)))
-    torch.testing.assert_close(reprojection_error(R_est, t_est, R_gt, t_gt, points, each), result)
-
-
-def test_a_point_behind_the_camera_makes_the_reprojection_infinite():
-    R, t, _, _ = poses(2, 7)
-    behind = t * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
-    errors = reprojection_error(R, behind, R, t, cloud(5), K)
-    assert errors[0] == 0
-    assert errors[1] == math.inf
+    result = reprojection_error(R_est, t_est, R_gt, t_gt, points, K)
+    assert_allclose(result, expected, rtol=REL)
+    each = reprojection_error(R_est, t_est, R_gt, t_gt, points, K.tile(5, 1, 1))
+    torch.testing.assert_close(each, result)
 
 
 @example(math.radians(1e-6), np.array([0.0, 1, 0]), 0)
@@ -128,54 +136,101 @@ def test_rotation_error_equals_scipy(angle, axis, seed):
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-3 else np.array([1.0, 0, 0])
     base = Rotation.random(random_state=seed)
     turned = Rotation.from_rotvec(angle * axis) * base
-    error = rotation_error_deg(
-        torch.from_numpy(turned.as_matrix())[None], torch.from_numpy(base.as_matrix())[None]
-    ).item()
+    matrices = (torch.from_numpy(one.as_matrix())[None] for one in (turned, base))
     # 1e-13 degrees is the rounding of the matrices themselves.
     magnitude = np.degrees((turned * base.inv()).magnitude())
-    assert error == pytest.approx(magnitude, rel=REL, abs=1e-13)
+    assert rotation_error_deg(*matrices).item() == pytest.approx(magnitude, rel=REL, abs=1e-13)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.sampled_from([1, 2, 8, 9, 200]),
+    turning=st.sampled_from([None, (0.0, 0.0, 1.0), (1.0, -1.0, 0.5)]),
+    is_near=st.booleans(),
+)
+def test_mssd_and_mspd_are_their_formulas(seed, count, turning, is_near):
+    """Also where most symmetries are left out early, because others are surely nearer."""
+    axes = [(turning, (0.01, 0.0, 0.0))] if turning else []
+    group = symmetry_group(HALF_TURN[None], axes, 0.2)
+    R_est, t_est, R_gt, t_gt = (one.numpy() for one in poses(4, seed))
+    if is_near:  # true up to a symmetry and a little: many symmetries come close to the best
+        some = group[np.random.default_rng(seed).integers(len(group), size=4)]
+        R_est, t_est = R_gt @ some[:, :3, :3], t_gt + (R_gt @ some[:, :3, 3:])[..., 0] + 1e-4
+    t_gt[3, 2] = 0.0  # some of its points are behind the camera
+    points = cloud(count, seed).numpy()
+    symmetric = points @ group[:, :3, :3].transpose(0, 2, 1) + group[:, None, :3, 3]
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        seen = points @ K.numpy().T
+        return seen[..., :2] / seen[..., 2:]
+
+    surface, image = [], []
+    for n in range(4):
+        estimated, true = points @ R_est[n].T + t_est[n], symmetric @ R_gt[n].T + t_gt[n]
+        surface.append(np.linalg.norm(estimated - true, axis=-1).max(axis=1).min())
+        off = np.linalg.norm(pixels(estimated) - pixels(true), axis=-1)
+        off[(true[..., 2] <= 0) | (estimated[:, 2] <= 0)] = np.inf
+        image.append(off.max(axis=1).min())
+    *pose, symmetries = (torch.from_numpy(x) for x in (R_est, t_est, R_gt, t_gt, points, group))
+    assert_allclose(mssd(*pose, symmetries), surface, rtol=REL, atol=1e-15)
+    assert_allclose(mspd(*pose, K, symmetries), image, rtol=REL, atol=1e-9)
+
+
+def test_mspd_ignores_the_last_row_of_k():
+    pose, odd = [*poses(5, 0), cloud(20)], K.clone()
+    odd[2] = torch.tensor([0.1, 0.2, 2.0])
+    assert_array_equal(mspd(*pose, odd), mspd(*pose, K))
+
+
+def test_symmetries_are_taken_as_they_are():
+    R, t = torch.eye(3).double()[None], torch.tensor([[0.0, 0.0, 1.0]])
+    only_half_turn = torch.from_numpy(HALF_TURN[None])
+    assert float(mssd(R, t, R, t, cloud(9), only_half_turn)[0]) > 0.01
+    assert float(rotation_error_deg(R, R, only_half_turn[:, :3, :3])[0]) == pytest.approx(180)
+    for wrong in (torch.eye(4), torch.zeros(0, 4, 4), torch.zeros(2, 3, 4)):
+        with pytest.raises(ValueError, match="symmetries must be"):
+            mssd(R, t, R, t, cloud(9), wrong)
+
+
+def test_a_point_behind_the_camera_is_a_miss_in_pixels_alone():
+    R, t, _, _ = poses(2, 7)
+    behind = t * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
+    for error in IN_PIXELS.values():
+        assert error(R, behind, R, t, cloud(5)).tolist() == [0, math.inf]
+    assert mssd(R, behind, R, t, cloud(5)).isfinite().all()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("which", range(4))
 def test_a_pose_that_is_not_finite_is_a_miss(bad, which):
-    pose = [tensor.clone() for tensor in poses(3, 8)]
+    pose = poses(3, 8)
     pose[which][1] = bad
-    for errors in (
-        add(*pose, cloud(10)),
-        add_s(*pose, cloud(10)),
-        reprojection_error(*pose, cloud(10), K),
-    ):
-        assert errors[1] == math.inf
-        assert errors[[0, 2]].isfinite().all()
+    for error in ERRORS.values():
+        assert error(*pose, cloud(10)).isinf().tolist() == [False, True, False]
     single = rotation_error_deg(pose[0], pose[2]), translation_error(pose[1], pose[3])
     assert single[which % 2][1] == math.inf
 
 
 def test_no_poses_have_no_errors():
-    none = torch.empty(0, 3, 3), torch.empty(0, 3), torch.empty(0, 3, 3), torch.empty(0, 3)
-    K = torch.eye(3)
-    for errors in (
-        add(*none, cloud(5)),
-        add_s(*none, cloud(5)),
-        reprojection_error(*none, cloud(5), K),
-        rotation_error_deg(none[0], none[2]),
-        translation_error(none[1], none[3]),
-    ):
-        assert errors.shape == (0,)
+    none = [one[:0] for one in poses(1, 0)]
+    for error in ERRORS.values():
+        assert error(*none, cloud(5)).shape == (0,)
+    assert rotation_error_deg(none[0], none[2]).shape == (0,)
+    assert translation_error(none[1], none[3]).shape == (0,)
 
 
 @pytest.mark.parametrize(
     ("pose", "points", "message"),
     [
-        (tuple(x[0] for x in poses(1, 0)), cloud(3), "poses must be (N, 3, 3), (N, 3)"),
+        ([x[0] for x in poses(1, 0)], cloud(3), "poses must be (N, 3, 3), (N, 3)"),
         ((*poses(2, 0)[:3], poses(1, 0)[3]), cloud(3), "poses must be (N, 3, 3), (N, 3)"),
         (poses(1, 0), torch.empty(0, 3), "points must be (V, 3) with V >= 1"),
         (poses(1, 0), cloud(3)[0], "points must be (V, 3) with V >= 1"),
     ],
 )
 def test_wrong_shapes_are_refused(pose, points, message):
-    for error in (add, add_s):
+    for error in ERRORS.values():
         with pytest.raises(ValueError, match=re.escape(message)):
             error(*pose, points)
     with pytest.raises(ValueError, match=r"K must be \(3, 3\) or \(N, 3, 3\)"):
@@ -183,9 +238,7 @@ def test_wrong_shapes_are_refused(pose, points, message):
 
 
 def test_single_precision_inputs_are_computed_in_double():
-    pose = poses(3, 9)
-    rounded = [tensor.float() for tensor in pose]
-    result = add(*rounded, cloud(10).float())
+    rounded = [one.float() for one in (*poses(3, 9), cloud(10))]
+    result = add(*rounded)
     assert result.dtype == torch.float64
-    expected = add(*(t.double() for t in rounded), cloud(10).float().double())
-    assert torch.equal(result, expected)
+    assert torch.equal(result, add(*(one.double() for one in rounded)))

@@ -6,16 +6,13 @@ The ranks are this file run as a script: spawned workers could not import a test
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch.distributed as dist
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.sample import Instance
@@ -23,15 +20,8 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Part
 
-ROOT = Path(__file__).parents[2]
 NUM_IMAGES = 13
-
-
-@dataclass
-class Detection:
-    object: str
-    score: float
-    T_cam_obj: NDArray[np.float64]
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
 
 
 def metric() -> PoseMetrics:
@@ -87,15 +77,8 @@ def run_rank(rank: int, folder: Path) -> None:
 
 
 @pytest.mark.ddp
-def test_two_processes_give_the_numbers_of_one(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-W", "ignore", __file__]
-    ranks = [
-        subprocess.Popen(
-            [*command, str(rank), str(tmp_path)], env=environment, stderr=subprocess.PIPE, text=True
-        )
-        for rank in range(2)
-    ]
+def test_two_processes_give_the_numbers_of_one(start, tmp_path):
+    ranks = [start(__file__, str(rank), str(tmp_path)) for rank in range(2)]
     alone = metric()
     feed(alone, range(NUM_IMAGES))
     expected = json.loads(json.dumps(summary(alone)))

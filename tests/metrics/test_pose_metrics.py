@@ -6,7 +6,8 @@ import copy
 import json
 import math
 import pickle
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
+from dopepp.geometry.camera import make_transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import add, add_s, auc, mspd, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.pose import MEAN, PoseMetrics
@@ -24,12 +26,7 @@ from dopepp.parts.part import Mesh, Part
 
 Array = NDArray[np.float64]
 
-
-@dataclass
-class Detection:
-    object: str
-    score: float
-    T_cam_obj: Array
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
 
 
 def part(name: str, seed: int = 0) -> Part:
@@ -38,10 +35,7 @@ def part(name: str, seed: int = 0) -> Part:
 
 
 def pose(x: float = 0.0, rotvec: tuple[float, float, float] = (0, 0, 0)) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
-    T[:3, 3] = [x, 0, 0.6]
-    return T
+    return make_transform(Rotation.from_rotvec(rotvec).as_matrix(), np.array([x, 0, 0.6]))
 
 
 def truth(name: str, T: Array, visible: float = 1.0) -> Instance:
@@ -160,16 +154,12 @@ def test_an_instance_that_counts_is_matched_before_a_hidden_one():
 
 def test_objects_do_not_match_each_other():
     metric = PoseMetrics([part("a"), part("b")])
+    with pytest.raises(UserError, match="got a detection of 'c'; allowed: the scored parts a, b"):
+        metric.update([Detection("c", 1, pose())], [])
     metric.update([Detection("a", 0.9, pose())], [truth("b", pose()), truth("other", pose())])
     rows = metric.compute()
     assert (rows["a"].num_instances, rows["a"].false_positives) == (0, 1)
     assert (rows["b"].num_instances, rows["b"].miss_rate) == (1, 1)
-
-
-def test_a_detection_of_an_unknown_object_is_refused():
-    metric = PoseMetrics([part("a"), part("b")])
-    with pytest.raises(UserError, match="got a detection of 'c'; allowed: the scored parts a, b"):
-        metric.update([Detection("c", 1, pose())], [])
 
 
 @pytest.mark.parametrize("names", [[], ["a", "a"], ["a", "mean"]])
@@ -255,29 +245,33 @@ def test_mspd_needs_every_camera():
             metric.update([], [], camera, width)
 
 
-def test_average_precision_by_hand():
-    def run(found: list[tuple[float, float | None]], missed: int = 0) -> float | None:
-        """Give (score, error in metres, or None for a stray), a picture each."""
-        metric = PoseMetrics([part("box")])
-        for score, error in found:
-            instances = [] if error is None else [truth("box", pose())]
-            metric.update([Detection("box", score, pose(error or 0.0))], instances)
-        for _ in range(missed):
-            metric.update([], [truth("box", pose())])
-        return metric.compute()["box"].average_precision
+STRAY, MISSED = "stray", "missed"
 
-    assert run([(0.9, 0.0), (0.8, 0.0)]) == 1
-    # Half of the recall at precision 1; 51 of the 101 recalls are at most 0.5.
-    assert run([(0.9, 0.0)], missed=1) == pytest.approx(51 / 101)
-    # A pose off by more than 12 mm is wrong though matched, and so is a stray one before it.
-    assert run([(0.9, 0.013), (0.8, 0.0)]) == pytest.approx(51 / 101 * 0.5)
-    assert run([(0.9, None), (0.8, 0.0)]) == pytest.approx(0.5)
-    assert run([(0.8, 0.0), (0.7, None)]) == 1
-    assert run([(0.9, 0.0119)]) == 1
-    # Of equal scores the wrong one comes first, whatever the order of the images.
-    assert run([(0.5, 0.0), (0.5, None)]) == run([(0.5, None), (0.5, 0.0)]) == 0.5
-    assert run([(math.nan, 0.0), (0.1, None)]) == 0.5
-    assert run([], missed=2) == 0
+
+@pytest.mark.parametrize(
+    ("images", "expected"),
+    [
+        # Half of the recall at precision 1; 51 of the 101 recalls are at most 0.5.
+        ([(0.9, 0.0), (0.0, MISSED)], 51 / 101),
+        ([(0.0, MISSED), (0.0, MISSED)], 0),
+        # A pose off by more than 12 mm is wrong though matched, and so is a stray one before it.
+        ([(0.9, 0.013), (0.8, 0.0119)], 51 / 101 * 0.5),
+        ([(0.9, STRAY), (0.8, 0.0)], 0.5),
+        ([(0.8, 0.0), (0.7, STRAY)], 1),
+        # Of equal scores the wrong one comes first, whatever the order of the images.
+        ([(0.5, 0.0), (0.5, STRAY)], 0.5),
+        ([(0.5, STRAY), (0.5, 0.0)], 0.5),
+        ([(math.nan, 0.0), (0.1, STRAY)], 0.5),
+    ],
+)
+def test_average_precision_by_hand(images, expected):
+    """Of a score and an error in metres for each image."""
+    metric = PoseMetrics([part("box")])
+    for score, error in images:
+        shift = error if isinstance(error, float) else 0.0
+        found = [] if error is MISSED else [Detection("box", score, pose(shift))]
+        metric.update(found, [] if error is STRAY else [truth("box", pose())])
+    assert metric.compute()["box"].average_precision == pytest.approx(expected)
 
 
 def test_a_duplicate_lowers_average_precision_and_an_ignored_pose_does_not():

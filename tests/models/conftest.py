@@ -1,16 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-PACKAGE = "dopepp.models."
-SpecMaker = Callable[..., dict[str, Any]]
-
 
 @pytest.fixture(scope="session")
-def make_spec() -> SpecMaker:
+def make_spec():
     """A spec of named parts; ``backbone_``, ``attention_`` and ``head_`` prefixes set arguments."""
 
     def make(
@@ -21,13 +17,10 @@ def make_spec() -> SpecMaker:
         num_objects: int = 1,
         **arguments: Any,
     ) -> dict[str, Any]:
-        nodes = {
-            kind: {"_target_": f"{PACKAGE}{module}.{name}"}
-            for kind, module, name in (
-                ("backbone", "backbones", backbone),
-                ("attention", "attention", attention),
-                ("head", "heads", head),
-            )
+        nodes: dict[str, Any] = {
+            "backbone": {"_target_": f"dopepp.models.backbones.{backbone}"},
+            "attention": {"_target_": f"dopepp.models.attention.{attention}"},
+            "head": {"_target_": f"dopepp.models.heads.{head}"},
         }
         for key, value in arguments.items():
             kind, _, argument = key.partition("_")
@@ -38,6 +31,6 @@ def make_spec() -> SpecMaker:
 
 
 @pytest.fixture
-def small_spec(make_spec: SpecMaker) -> dict[str, Any]:
+def small_spec(make_spec):
     """DOPE++ at an eighth of its width: a network that is built and run in milliseconds."""
     return make_spec(backbone_width=0.125, backbone_batch_norm=True, head_width=0.125)

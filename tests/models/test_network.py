@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import pytest
@@ -8,6 +7,7 @@ from torch import nn
 from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale
 from dopepp.models.layers import find_activation
+from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
 
 
@@ -15,42 +15,33 @@ def num_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-@pytest.mark.parametrize(
-    ("backbone", "attention", "head"),
-    [*itertools.product(["VGG19", "DSC"], ["Identity", "SE", "CBAM"], ["Cascade", "MultiScale"])],
-)
+@pytest.mark.parametrize("backbone", ["VGG19", "DSC"])
+@pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
+@pytest.mark.parametrize("head", ["Cascade", "MultiScale"])
 @pytest.mark.parametrize("num_objects", [1, 2])
 def test_every_combination_gives_stages_of_the_right_shape(
     make_spec, backbone, attention, head, num_objects
 ):
-    spec = make_spec(
-        backbone,
-        attention,
-        head,
-        num_objects=num_objects,
-        backbone_width=0.125,
-        head_width=0.125,
-        head_stages=2,
-        head_batch_norm=True,
-    )
+    options = {"backbone_width": 0.125, "head_width": 0.125, "head_batch_norm": True}
+    spec = make_spec(backbone, attention, head, num_objects=num_objects, head_stages=2, **options)
     network = build_network(spec).eval()
-    for height, width in ((32, 32), (64, 96)):
-        images = torch.randint(0, 256, (2, 3, height, width), dtype=torch.uint8)
-        stages = network(images)
-        assert len(stages) == 2
-        for belief, field in stages:
-            assert belief.shape == (2, 9 * num_objects, height // 8, width // 8)
-            assert field.shape == (2, 16 * num_objects, height // 8, width // 8)
-            assert torch.isfinite(belief).all()
-            assert torch.isfinite(field).all()
+    images = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
+    stages = network(images)
+    assert len(stages) == 2
+    for belief, field in stages:
+        assert belief.shape == (2, 9 * num_objects, 4, 8)
+        assert field.shape == (2, 16 * num_objects, 4, 8)
+        assert torch.isfinite(belief).all()
+        assert torch.isfinite(field).all()
+    for one, same in zip(stages[0], network(images.float())[0], strict=True):
+        assert torch.equal(one, same)
 
 
 @pytest.mark.parametrize("stages", [1, 2])
 def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, stages):
     head = {"head_width": 0.125, "head_stages": stages, "head_batch_norm": True}
     network = build_network(make_spec(backbone_width=0.125, **head, head_maps="learned"))
-    images = torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8)
-    answers = network(images)
+    answers = network(torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8))
     assert len(answers) == 4 * stages  # a quarter, a half, full scale, fused
     for number, (belief, field) in enumerate(answers):
         assert belief.shape == (2, 9, 8, 12)
@@ -65,6 +56,7 @@ def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, s
     # The loss of the coarsest maps alone reaches no convolution of the fusion.
     answers[0][0].sum().backward()
     branch = network.head.belief_branches[0]
+    assert all(one.grad is None for one in network.head.field_branches.parameters())
     assert branch.down_quarter[-1].weight.grad is not None
     assert all(one.grad is None for one in branch.up_quarter.parameters())
 
@@ -78,14 +70,6 @@ def test_maps_of_nine_channels_cost_less_than_features(make_spec):
     assert counts[None] == 6_573_419
     with pytest.raises(UserError, match="maps='all'; allowed: plain, learned or null"):
         build_network(make_spec(head_maps="all"))
-
-
-def test_uint8_and_float_images_are_the_same_input(small_spec):
-    network = build_network(small_spec).eval()
-    images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
-    with torch.no_grad():
-        for a, b in zip(network(images)[0], network(images.float())[0], strict=True):
-            assert torch.equal(a, b)
 
 
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
@@ -168,14 +152,6 @@ def test_later_stages_read_activated_beliefs_and_the_field():
     torch.testing.assert_close(seen[0], expected)
 
 
-def test_belief_and_field_branches_share_no_parameter():
-    head = MultiScale(8, 1, width=0.0625)
-    belief, _ = head(torch.randn(1, 8, 8, 8))[0]
-    belief.sum().backward()
-    assert all(parameter.grad is None for parameter in head.field_branches.parameters())
-    assert all(parameter.grad is not None for parameter in head.belief_branches.parameters())
-
-
 def test_multiscale_has_the_paper_convolutions():
     # Per branch at width 128, biases included: 11 convs 3×3 down, then three convsets of 3 1×1 and
     # 2 3×3 (two of them begin at 256 channels), two more 1×1, and the output.
@@ -215,3 +191,52 @@ def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
     with torch.no_grad():
         network(torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8))
     assert 0.05 < features[0].std() < 20
+
+
+def macs_by_hooks(network: nn.Module, images: torch.Tensor) -> int:
+    """Count by running: every output value of a layer takes one filter's worth of products."""
+    total = 0
+
+    def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
+        nonlocal total
+        total += output.numel() * layer.weight[0].numel()
+
+    for layer in network.modules():
+        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+            layer.register_forward_hook(count)
+    with torch.no_grad():
+        network(images)
+    return total
+
+
+@pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
+@pytest.mark.parametrize("head", ["Cascade", "MultiScale"])
+def test_agrees_with_counting_by_hooks(make_spec, attention, head):
+    spec = make_spec(attention=attention, head=head, backbone_width=0.125, head_width=0.125)
+    network = build_network(spec).eval()
+    _, gmacs = network_cost(network, (96, 64))
+    assert gmacs * 1e9 == pytest.approx(macs_by_hooks(network, torch.zeros(1, 3, 64, 96)))
+
+
+def test_most_of_dopes_compute_is_in_its_stages(make_spec):
+    network = build_network(make_spec("VGG19", "Identity", "Cascade", "identity"))
+    num_parameters, gmacs = network_cost(network, (416, 416))
+    assert num_parameters == 50_267_350
+    lighter = build_network(make_spec("DSC", "Identity", "Cascade", "identity"))
+    _, backbone_swapped = network_cost(lighter, (416, 416))
+    # The design: 69 % in the stages. Six stages of parameters, each used once per 52×52 cell.
+    stages = sum(p.numel() for p in network.head.parameters() if p.ndim == 4) * 52 * 52 / 1e9
+    assert stages / gmacs == pytest.approx(0.69, abs=0.01)
+    assert backbone_swapped < gmacs
+
+
+def test_leaves_the_network_as_it_was(small_spec):
+    network = build_network(small_spec).train()
+    network.attention.eval()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    network_cost(network, (32, 32))
+    assert network.training
+    assert not network.attention.training
+    assert all(parameter.device.type == "cpu" for parameter in network.parameters())
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, before[name])

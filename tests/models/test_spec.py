@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import itertools
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,68 +13,39 @@ from dopepp.core.errors import UserError
 from dopepp.models import backbones
 from dopepp.models.network import PoseNetwork
 from dopepp.models.registry import Registry
-from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES, architecture, build_network
+from dopepp.models.spec import BACKBONES, LOSSES, architecture, build_network
 
 OPTIMIZERS = Registry("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
 DSC = "dopepp.models.backbones.DSC"
 
 
-def test_allow_lists_hold_the_public_classes():
-    assert BACKBONES.targets == tuple(
-        f"dopepp.models.backbones.{name}" for name in ("DSC", "VGG19", "VGG19Original")
-    )
-    assert ATTENTIONS.targets == tuple(
-        f"dopepp.models.attention.{name}" for name in ("CBAM", "Identity", "SE")
-    )
-    assert HEADS.targets == tuple(f"dopepp.models.heads.{n}" for n in ("Cascade", "MultiScale"))
-    assert {name.rpartition(".")[2] for name in LOSSES.targets} == {"MapMSE", "SpatialCrossEntropy"}
-
-
 def test_builds_a_network_from_plain_values(make_spec):
-    network = build_network(
-        make_spec("DSC", "SE", "Cascade", "identity", 3, backbone_width=0.25, head_width=0.125)
-    )
+    spec = make_spec("DSC", "SE", "Cascade", "identity", 3, backbone_width=0.25, head_width=0.125)
+    before = repr(spec)
+    network = build_network(spec)
+    assert repr(spec) == before
     assert isinstance(network, PoseNetwork)
     assert (network.num_objects, network.stride, network.activation) == (3, 8, "identity")
     assert network.attention.mlp[0].in_features == network.backbone.out_channels == 32
 
 
-def test_a_spec_is_left_as_it_was(small_spec):
-    before = repr(small_spec)
-    build_network(small_spec)
-    assert repr(small_spec) == before
-
-
+OTHERS = ("Path", "nn.Sequential", "conv_block", "Backbone")
 HOSTILE = [
-    *(
-        "os.system",
-        "dopepp.models.spec.os.system",
-        "dopepp.models.spec.backbones.DSC",
-        ".",
-        None,
-        7,
-    ),
-    *(f"dopepp.models.backbones.{name}" for name in ("Path", "nn.Sequential", "conv_block")),
-    *(nn.Identity, b"os.system"),
+    *("os.system", "dopepp.models.spec.os.system", "dopepp.models.spec.backbones.DSC", "."),
+    *(f"dopepp.models.backbones.{name}" for name in OTHERS),
+    *(None, 7, nn.Identity, b"os.system"),
 ]
 """More of them, in checkpoints: ``tests/security/test_hostile_checkpoints.py``."""
 
 
-@pytest.mark.parametrize("target", HOSTILE)
-def test_other_targets_are_refused(make_spec, target):
+@pytest.mark.parametrize(
+    ("part", "target"),
+    [*(("backbone", one) for one in HOSTILE), ("attention", "os.system"), ("head", "os.system")],
+)
+def test_other_targets_are_refused(make_spec, part, target):
     spec = make_spec()
-    spec["backbone"] = {"_target_": target}
-    with pytest.raises(
-        UserError, match=r"backbone _target_ .* allowed: dopepp.models.backbones.DSC"
-    ):
-        build_network(spec)
-
-
-@pytest.mark.parametrize("part", ["backbone", "attention", "head"])
-def test_every_part_stands_behind_a_registry(make_spec, part):
-    spec = make_spec()
-    spec[part] = {"_target_": "os.system", "command": "true"}
-    with pytest.raises(UserError, match=rf"got {part} _target_ 'os.system'"):
+    spec[part] = {"_target_": target, "command": "true"}
+    with pytest.raises(UserError, match=rf"got {part} _target_ .* allowed: dopepp\.models\."):
         build_network(spec)
 
 
@@ -111,7 +80,7 @@ class Tiny(backbones.Backbone):
 
 
 @pytest.fixture
-def tiny_module(monkeypatch: pytest.MonkeyPatch) -> str:
+def tiny_module(monkeypatch):
     """Make this file's Tiny importable the way a user's installed package is."""
     module = type(sys)("somebodys_package")
     monkeypatch.setattr(Tiny, "__module__", "somebodys_package")
@@ -152,9 +121,7 @@ def test_registering_anything_else_fails_at_once(tiny_module, name):
         ({"width": [{"a": {"_target_": DSC, "width": 1}}]}, "nested targets are not built"),
         ({"width": object()}, "a object in .*argument width"),
         ({"width": torch.ones(1)}, "a Tensor in"),
-        ({"width": 1e9}, "width=1000000000.0; allowed: a number"),
         ({"width": [1]}, r"width=\[1\]"),
-        ({"width": None}, "width=None"),
     ],
 )
 def test_arguments_are_named_and_plain(arguments, message):
@@ -189,18 +156,13 @@ def change(key: str, value: object) -> Callable[[dict[str, Any]], object]:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (
-            lambda spec: spec.pop("head"),
-            "a model spec with .* allowed: exactly backbone, attention",
-        ),
+        (lambda spec: spec.pop("head"), "a model spec with .* allowed: exactly backbone, atten"),
         (change("stride", 4), "'stride'.* allowed: exactly"),
         (change("activation", "softmax"), "activation 'softmax'; allowed: identity, exp"),
         (change("num_objects", 0), "num_objects=0; allowed: an integer from 1 to 64"),
         (change("num_objects", 10**9), "num_objects=1000000000"),
         (change("num_objects", True), "num_objects=True"),
-        (lambda spec: spec["head"].update(stages=100), "stages=100"),
         (lambda spec: spec["head"].update(width=1e6), "width=1000000.0"),
-        (lambda spec: spec["attention"].update(reduction=0), "reduction=0"),
     ],
 )
 def test_a_spec_is_checked_and_bounded(make_spec, edit, message):
@@ -262,17 +224,3 @@ def test_architecture_drops_the_pretrained_weights(make_spec):
     assert spec["backbone"]["weights_path"] == "/home/somebody/vgg19.pth"
     plain["head"]["width"] = 2
     assert "width" not in spec["head"]
-
-
-def test_the_documented_backbone_works(monkeypatch, make_spec):
-    """docs/adding-a-backbone.md, read and run."""
-    guide = Path(__file__).parents[2] / "docs" / "adding-a-backbone.md"
-    code = guide.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-    # The guide puts the class into backbones.py, so it sees that module's names and one import.
-    monkeypatch.setattr(backbones, "pairwise", itertools.pairwise, raising=False)
-    monkeypatch.setattr(backbones, "Strided", None, raising=False)
-    exec(code, vars(backbones))
-    registry = Registry.of_module("backbone", backbones.Backbone, backbones)
-    assert "dopepp.models.backbones.Strided" in registry.targets
-    backbone = registry.build({"_target_": "dopepp.models.backbones.Strided", "width": 0.5})
-    assert backbone(torch.zeros(1, 3, 64, 32)).shape == (1, backbone.out_channels, 8, 4)

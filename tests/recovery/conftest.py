@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -59,23 +59,23 @@ class Scene:
 
 
 @pytest.fixture(name="K")
-def camera() -> np.ndarray:
+def camera():
     return camera_matrix(500, 510, 207.5, 205.0)
 
 
 @pytest.fixture
-def box() -> np.ndarray:
+def box():
     return cuboid_keypoints(np.array([-0.04, -0.03, -0.05]), np.array([0.04, 0.03, 0.05]))
 
 
 @pytest.fixture
-def plate() -> np.ndarray:
+def plate():
     half = np.array([0.0525, 0.026, 0.0035])
     return cuboid_keypoints(-half, half)
 
 
 @pytest.fixture
-def pose() -> Callable[..., np.ndarray]:
+def pose():
     def draw(
         rng: np.random.Generator, x: float = 0.0, y: float = 0.0, z: float = 0.4
     ) -> np.ndarray:
@@ -88,7 +88,7 @@ def pose() -> Callable[..., np.ndarray]:
 
 
 @pytest.fixture
-def make_scene(K: np.ndarray) -> Callable[..., Scene]:
+def make_scene(K):
     def make(*cuboids: np.ndarray, camera: np.ndarray = K) -> Scene:
         return Scene(cuboids, camera)
 

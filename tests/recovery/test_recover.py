@@ -9,21 +9,14 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.pnp import solve_pnp
 from dopepp.maps import MapGeometry, encode
 from dopepp.maps.peaks import Peaks
-from dopepp.recovery import Detection, RecoveryOptions, explain, recover, recover_batch
+from dopepp.recovery import RecoveryOptions, explain, recover, recover_batch
 from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
 
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
 
 
-def same(one: Detection, other: Detection) -> None:
-    assert one.object == other.object
-    assert one.score == pytest.approx(other.score, abs=1e-6)
-    assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-5)
-    assert_allclose(one.peaks, other.peaks, atol=1e-3)
-
-
 @pytest.mark.parametrize("name", ["box", "plate", "origin elsewhere"])
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [1, 4])
 def test_all_instances_come_back(name, count, box, plate, make_scene, pose):
     elsewhere = cuboid_keypoints(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.25, 0.307]))
     cuboid = {"box": box, "plate": plate, "origin elsewhere": elsewhere}[name]
@@ -39,17 +32,6 @@ def test_all_instances_come_back(name, count, box, plate, make_scene, pose):
         assert max(scene.error(0, one.T_cam_obj) for one in found) < 0.1
         centres = [transform(one.T_cam_obj, cuboid[8])[:2] for one in found]
         assert len({tuple(np.round(centre / 0.09).astype(int)) for centre in centres}) == count
-
-
-def test_instances_side_by_side_keep_their_own_corners(make_scene, box, pose):
-    """Their outlines interlock, so only the vector field tells whose corner is whose."""
-    rng, right, total = np.random.default_rng(0), 0, 0
-    for _ in range(20):
-        scene = make_scene(box).place(0, pose(rng, -0.045)).place(0, pose(rng, 0.045))
-        found = recover(*scene.maps(), scene.cuboids, scene.K)
-        errors = [scene.error(0, one.T_cam_obj) for one in found]
-        right, total = right + sum(error < 0.1 for error in errors), total + 2
-    assert right >= 0.9 * total
 
 
 def test_two_objects_in_one_network(make_scene, box, plate, pose):
@@ -153,7 +135,10 @@ def test_a_batch_is_its_images_each_with_its_own_camera(make_scene, box, plate, 
         alone = recover(one_belief, one_field, scene.cuboids, scene.K)
         assert len(found) == len(alone) == 2
         for one, other in zip(found, alone, strict=True):
-            same(one, other)
+            assert one.object == other.object
+            assert one.score == pytest.approx(other.score, abs=1e-6)
+            assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-5)
+            assert_allclose(one.peaks, other.peaks, atol=1e-3)
             assert scene.error(int(one.object), one.T_cam_obj) < 0.1
 
 
@@ -187,13 +172,9 @@ def test_maps_and_names_must_fit_the_objects(belief, field, names, message, box,
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("sigma", 0.0),
-        ("peak_threshold", 0.0),
-        ("centroid_threshold", 2.0),
-        ("max_angle_deg", -1.0),
-        ("max_angle_deg", float("nan")),
-        ("max_peaks", 0),
-        ("min_score", 1.5),
+        *(("sigma", 0.0), ("peak_threshold", 0.0), ("centroid_threshold", 2.0)),
+        *(("max_angle_deg", bad) for bad in (-1.0, float("nan"))),
+        *(("max_peaks", 0), ("min_score", 1.5)),
     ],
 )
 def test_bad_option(option, value):

@@ -5,11 +5,8 @@ import signal
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 from dopepp.training.processes import Watch
-
-ROOT = Path(__file__).parents[2]
 
 
 def sleeper(code: str = "import time; time.sleep(60)") -> subprocess.Popen[bytes]:
@@ -36,7 +33,7 @@ def test_a_death_is_told_with_its_cause():
             process.wait()
 
 
-def test_what_hangs_is_ended_from_outside():
+def test_what_hangs_is_ended_from_outside(command):
     """As in a collective on GPUs, where no exception reaches the main thread."""
     script = """
         import subprocess, sys, time
@@ -46,11 +43,9 @@ def test_what_hangs_is_ended_from_outside():
         processes.Watch([child], None).start()
         time.sleep(120)
     """
-    command = [sys.executable, "-c", textwrap.dedent(script)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
-    assert ended.returncode == 1
-    assert ended.stderr.endswith("was killed by signal 9: the run ends\n")
+    ended = command("-c", textwrap.dedent(script), timeout=100)
+    assert ended.code == 1
+    assert ended.last_line.endswith("was killed by signal 9: the run ends")
 
 
 def test_a_stopped_watch_lets_processes_end():

@@ -65,14 +65,8 @@ def random_poses(count: int, seed: int) -> np.ndarray:
 
 def face_on(angles_deg: Sequence[float]) -> np.ndarray:
     """Poses in the reference orientation, turned in the image plane."""
-    return np.stack(
-        [
-            make_transform(
-                Rotation.from_euler("z", one, degrees=True).as_matrix() @ FACING, (0, 0, 0.3)
-            )
-            for one in angles_deg
-        ]
-    )
+    turns = Rotation.from_euler("z", np.array(angles_deg)[:, None], degrees=True).as_matrix()
+    return np.stack([make_transform(turn @ FACING, (0, 0, 0.3)) for turn in turns])
 
 
 @pytest.mark.parametrize("part", [PLATE, CAN, CONE], ids=lambda part: part.name)

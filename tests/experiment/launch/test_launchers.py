@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,25 +13,15 @@ from dopepp.experiment.launch import remote
 from dopepp.experiment.launch.jobs import on_joblib, on_slurm
 from dopepp.experiment.runs import record
 
-ROOT = Path(__file__).parents[3]
 RATES = ("1e-4", "1e-3", "1e-2")
 SWEPT = f"optimizer.lr={','.join(RATES)}"
 
 
 @pytest.fixture
-def sweep(fast_training, tmp_path):
+def sweep(command, fast_training, tmp_path):
     """Run a multirun of jobs that take no time as a process; END_<job>=how ends one early."""
-
-    def run(*arguments: str, **ends: str) -> tuple[int, str, str]:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **ends}
-        places = ["~hydra.callbacks.compare", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-        done = subprocess.run(
-            [sys.executable, str(fast_training), "-m", *places, *arguments],
-            env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=280,
-        )  # fmt: skip
-        return done.returncode, done.stdout, done.stderr
-
-    return run
+    places = ("~hydra.callbacks.compare", f"hydra.sweep.dir={tmp_path / 'sweep'}")
+    return lambda *arguments, **ends: command(fast_training, "-m", *places, *arguments, env=ends)
 
 
 def reason(folder: Path, number: int) -> str:
@@ -184,3 +173,47 @@ def test_what_children_print_is_in_the_file_too(tmp_path, capfd):
     lines = (tmp_path / "job" / "job.log").read_text().splitlines()
     assert sorted(lines) == ["as an error", "by a child", "by this process"]
     assert capfd.readouterr().out == "after it\n"
+
+
+@pytest.fixture
+def slurm_job(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SLURM_JOB_ID", "12")
+
+
+def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_path, monkeypatch):
+    remote.remember_run(["seed=1"], tmp_path / "a")
+    remote.remember_run(["seed=2"], tmp_path / "b")
+    assert remote.begun_run(["seed=1"]) is None  # the first time: no restart
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert remote.begun_run(["seed=1"]) == tmp_path / "a"
+    assert remote.begun_run(["seed=2"]) == tmp_path / "b"
+    assert remote.begun_run(["seed=3"]) is None
+    monkeypatch.setenv("SLURM_JOB_ID", "13")
+    assert remote.begun_run(["seed=1"]) is None
+
+
+@pytest.mark.parametrize(
+    ("variables", "named"),
+    [
+        ({}, "12"),
+        ({"SLURM_ARRAY_JOB_ID": "10", "SLURM_ARRAY_TASK_ID": "3"}, "10_3"),  # as scontrol does
+        ({"SLURM_JOB_ID": ""}, None),
+        ({"SLURM_JOB_ID": "1; rm"}, None),
+        ({"SLURM_JOB_ID": "--help"}, None),
+    ],
+)
+def test_a_job_is_named(variables, named, slurm_job, monkeypatch):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert remote.job_id() == named
+
+
+def test_a_refused_or_missing_scontrol_is_told(slurm_job, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert remote.requeue().startswith("SLURM did not requeue job 12: ")
+    script = tmp_path / "scontrol"
+    script.write_text("#!/bin/sh\necho Access denied >&2\nexit 1\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.defpath}")
+    assert remote.requeue() == "SLURM did not requeue job 12: Access denied"

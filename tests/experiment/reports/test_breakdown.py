@@ -1,6 +1,7 @@
 """Rates per bin: quantities in closed form, bins and rates by brute force."""
 
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,7 @@ from dopepp.experiment.reports.protocols import (
     record_breakdown,
 )
 from dopepp.experiment.reports.tables import ADD_01D, ADD_5CM, read_csv, reported_rates, select
-from dopepp.geometry.camera import camera_matrix, project_keypoints
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Part
@@ -32,12 +33,7 @@ K = camera_matrix(600, 610, 320, 240)
 RATES = (ADD_5CM, ADD_01D)
 Array = NDArray[np.float64]
 
-
-@dataclass
-class Detection:
-    object: str
-    score: float
-    T_cam_obj: Array
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
 
 
 def part(name: str, scale: float = 1.0) -> Part:
@@ -47,15 +43,9 @@ def part(name: str, scale: float = 1.0) -> Part:
 
 
 def poses(num: int, seed: int = 0) -> list[Array]:
-    rng, result = np.random.default_rng(seed), []
-    for rotation in Rotation.random(num, rng=seed):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = (
-            rotation.as_matrix(),
-            [*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 2)],
-        )
-        result.append(T)
-    return result
+    centres = np.random.default_rng(seed).uniform([-0.1, -0.1, 0.3], [0.1, 0.1, 2], (num, 3))
+    rotations = Rotation.random(num, rng=seed).as_matrix()
+    return [make_transform(*pair) for pair in zip(rotations, centres, strict=True)]
 
 
 def fed(

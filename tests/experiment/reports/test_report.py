@@ -2,7 +2,6 @@ import json
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,14 +53,6 @@ def test_a_report_of_an_earlier_version_is_read():
         del stored[key]
     back = Report.from_record(stored)
     assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
-
-
-def test_the_config_is_written_as_it_was(tmp_path):
-    config = {"b": {"x": [1, 2.5, None]}, "a": "größer"}
-    record.write_config(tmp_path, config)
-    path = tmp_path / record.CONFIG_FILE
-    assert yaml.safe_load(path.read_text()) == config
-    assert list(yaml.safe_load(path.read_text())) == ["b", "a"]
 
 
 def test_json_that_nobody_else_could_read_is_not_written(tmp_path):

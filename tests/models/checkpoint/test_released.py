@@ -16,7 +16,7 @@ from dopepp.parts import load_part
 
 
 @pytest.fixture
-def trained(small_spec: dict[str, Any]) -> Checkpoint:
+def trained(small_spec):
     return Checkpoint(
         spec=small_spec,
         state_dict=build_network(small_spec).state_dict(),

@@ -5,7 +5,6 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from dopepp.parts.mesh.polygons import FoldedPolygonError, fans
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -13,6 +12,7 @@ from trimesh.exchange.off import export_off
 
 from dopepp.core.errors import UserError
 from dopepp.parts import read_mesh
+from dopepp.parts.mesh.obj import FoldedPolygonError, fans
 from dopepp.parts.mesh.ply import read_ply
 
 BOX = trimesh.creation.box((10.0, 20.0, 30.0))

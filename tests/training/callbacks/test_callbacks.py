@@ -1,13 +1,16 @@
-"""The callbacks on one fit whose validation maps are the true ones, most of them displaced."""
+"""The callbacks on one fit whose validation maps are the true ones, most of them displaced; then
+what they draw and what they say of time."""
 
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
 
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
@@ -15,9 +18,10 @@ from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.reports.tables import read_csv
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
-from dopepp.training.callbacks.pictures import AUCCurves, Overlays
+from dopepp.training.callbacks import throughput
+from dopepp.training.callbacks.pictures import AUCCurves, Overlays, heat_picture
 from dopepp.training.callbacks.pose_metrics import LOGGED, PoseMetricsCallback, batch_instances
-from dopepp.training.callbacks.throughput import Throughput
+from dopepp.training.callbacks.throughput import Operators, Throughput, make_profiler, profile_rows
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 
@@ -121,3 +125,64 @@ def test_no_counted_instance_still_gives_a_number(validate, make_system, make_no
     assert np.isnan(recorder.logged["val/auc_10cm"])
     assert np.isnan(recorder.logged["val/selection"])
     assert "val/median_rotation_deg" not in recorder.logged
+
+
+def test_a_belief_lies_over_the_pixels_its_cell_covers():
+    image = np.full((90, 150, 3), 90, np.uint8)  # the maps cover its padding, too
+    belief = np.zeros((12, 20), np.float32)
+    belief[4, 11] = 1
+    picture = heat_picture(image, belief).astype(int)
+    assert picture.shape == image.shape
+    hot = np.argwhere(np.abs(picture - 54).max(axis=2) > 100)  # 54 = the dimmed grey
+    np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
+    assert (picture[:24] == 54).all()
+
+
+def test_beliefs_beyond_their_range_are_clipped():
+    image = np.full((96, 160, 3), 90, np.uint8)
+    one, seven = (heat_picture(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
+    np.testing.assert_array_equal(one, seven)
+
+
+def test_time_is_left_for_the_whole_run(monkeypatch):
+    monkeypatch.setattr(TQDMProgressBar, "on_train_start", lambda *_: None)
+    monkeypatch.setattr(TQDMProgressBar, "get_metrics", lambda *_: {"train/loss": 1.0})
+    now = [100.0]
+    monkeypatch.setattr(throughput.time, "monotonic", lambda: now[0])
+    trainer: Any = SimpleNamespace(global_step=50, estimated_stepping_batches=250)
+    bar: Any = throughput.RunProgress()
+    bar.on_train_start(trainer, None)
+    assert "left" not in bar.get_metrics(trainer, None)
+    # Twenty steps in a minute, of a run resumed at the 50th: 180 are left.
+    trainer.global_step, now[0] = 70, 160.0
+    assert bar.get_metrics(trainer, None) == {"left": "0:09:00", "train/loss": 1.0}
+    trainer.global_step = 251  # resumed for less
+    assert bar.get_metrics(trainer, None)["left"] == "0:00:00"
+
+
+def test_the_simple_profiler_lists_what_took_longest(tmp_path):
+    profiler: Any = make_profiler("simple", tmp_path)
+    profiler.recorded_durations = {"step": [0.25, 0.75], "save": [0.125], "rest": [0.0]}
+    assert profile_rows(profiler, limit=2) == [
+        {"what": "step", "calls": "2", "s": "1.000", "ms/call": "500.00"},
+        {"what": "save", "calls": "1", "s": "0.125", "ms/call": "125.00"},
+    ]
+    profiler.describe()
+    (report,) = (tmp_path / "profile").iterdir()
+    assert "step" in report.read_text()
+
+
+def test_the_operators_of_training_and_validation(tmp_path):
+    profiler = Operators(tmp_path / "profile")
+    assert profile_rows(profiler) == []
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    for _ in range(2):
+        recording = torch.profiler.profile(activities=activities, on_trace_ready=profiler._collect)
+        with recording, torch.profiler.record_function("[pl][profile]hook"):
+            torch.ones(8, 8) @ torch.ones(8, 8)
+    rows = {row["what"]: row for row in profile_rows(profiler, limit=100)}
+    assert rows["aten::mm"]["calls"] == "2"
+    assert not any("hook" in name for name in rows)
+    assert "2 calls  aten::mm" in profiler.summary()
+    traces = sorted(path.name for path in (tmp_path / "profile").iterdir())
+    assert traces == ["trace_0.json", "trace_1.json"]

@@ -10,31 +10,6 @@ from dopepp.core.files import partial_path
 from dopepp.training.checkpointing.files import AtomicCheckpointIO, SavingFailedError, sweep
 
 
-class Unwritable:
-    def __reduce__(self) -> str:
-        raise RuntimeError("cannot be saved")
-
-
-@pytest.mark.parametrize("when", ["while writing", "at the rename"])
-def test_a_failing_write_keeps_the_old_file(when, tmp_path, monkeypatch):
-    path = tmp_path / "deep" / "last.ckpt"
-    io = AtomicCheckpointIO()
-    io.save_checkpoint({"epoch": 1}, path)
-    content: dict[str, Any] = {"epoch": 2}
-    if when == "while writing":
-        content["bad"] = Unwritable()
-    else:
-
-        def refuse(*_: object) -> None:
-            raise RuntimeError("cannot be renamed")
-
-        monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(RuntimeError, match="cannot be"):
-        io.save_checkpoint(content, path)
-    assert io.load_checkpoint(path) == {"epoch": 1}
-    assert list(path.parent.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("weights_only", [None, False, True])
 def test_loading_runs_no_code_whoever_asks(weights_only, tmp_path):
     path, trace = tmp_path / "hostile.ckpt", tmp_path / "trace"
@@ -56,6 +31,8 @@ def full_disk(*_: object) -> None:
 def test_what_cannot_be_written_is_written_later_in_order(tmp_path, caplog):
     refuse = [True]
     io = AtomicCheckpointIO(prepare=lambda: full_disk() if refuse[0] else None)
+    with pytest.raises(Exception, match="pickle"):  # which nothing would change
+        AtomicCheckpointIO().save_checkpoint({"step": lambda: 0}, tmp_path / "best.ckpt")
     weights = torch.zeros(2)
     io.save_checkpoint({"step": 1, "weights": weights}, tmp_path / "best.ckpt")
     weights += 1  # training goes on
@@ -106,19 +83,16 @@ def test_a_moved_run_finds_its_own_files(tmp_path):
     assert moved["best_model_path"] == str(new / "best.ckpt")
     assert (moved["kth_best_model_path"], moved["last_model_path"]) == ("", str(new / "passwd"))
     assert list(moved["best_k_models"]) == [str(new / "best.ckpt")]
-    assert (moved["monitor"], loaded["callbacks"]["other"], loaded["epoch"]) == (
-        "val/x",
-        {"a": 1},
-        3,
-    )
+    assert moved["monitor"] == "val/x"
+    assert (loaded["callbacks"]["other"], loaded["epoch"]) == ({"a": 1}, 3)
 
 
 def test_the_previous_file_is_kept(tmp_path):
     io, options = AtomicCheckpointIO(), {"previous": tmp_path / "previous.ckpt"}
     for step in range(3):
         io.save_checkpoint({"step": step}, tmp_path / "last.ckpt", storage_options=options)
-    assert io.load_checkpoint(tmp_path / "last.ckpt") == {"step": 2}
-    assert io.load_checkpoint(tmp_path / "previous.ckpt") == {"step": 1}
+    for name, step in (("last", 2), ("previous", 1)):
+        assert io.load_checkpoint(tmp_path / f"{name}.ckpt") == {"step": step}
 
 
 def test_half_written_files_of_processes_that_are_gone_are_swept_away(tmp_path):

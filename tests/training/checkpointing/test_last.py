@@ -1,6 +1,5 @@
 """A run cut at any hook and resumed ends as if it had not been; "cut" is here an exception."""
 
-import logging
 import random
 import shutil
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
@@ -60,18 +60,6 @@ class Cut(Callback):
             raise CutError
 
 
-def cosine(optimizer: torch.optim.Optimizer, num_steps: int) -> Any:
-    return torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_steps)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quiet():
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("lightning.pytorch", "lightning.fabric"):
-            patch.setattr(logging.getLogger(name), "level", logging.WARNING)
-        yield
-
-
 @pytest.fixture(scope="module")
 def runs(make_system, make_noise, make_trainer):
     """Train in a folder, from its newest checkpoint if there is one."""
@@ -80,7 +68,7 @@ def runs(make_system, make_noise, make_trainer):
         folder: Path, cut: Cut, last: LastCheckpoint | None = None,
         more: Sequence[Callback] = (), **options: Any,
     ) -> PoseSystem:  # fmt: skip
-        system = make_system(system_class=Noisy, make_scheduler=cosine)
+        system = make_system(system_class=Noisy, make_scheduler=CosineAnnealingLR)
         for seed in (random.seed, np.random.seed, torch.manual_seed):
             seed(4)
         best = ModelCheckpoint(filename="best", monitor="val/loss", enable_version_counter=False)

@@ -4,35 +4,29 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build import system as hardware
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, choose_precision, estimate_training_s
 from dopepp.experiment.config.run import TrainerConfig
 
 
-@pytest.mark.parametrize("accelerator", ["cpu", "cuda", "mps"])
-def test_what_is_asked_for_is_taken(accelerator):
-    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
-
-
 @pytest.mark.parametrize(
-    ("flags", "expected"),
-    [({"sse2", "avx512_bf16"}, "bf16-mixed"), ({"sse2", "avx2"}, "32-true"), (set(), "32-true")],
+    ("accelerator", "flags", "gpu_is_fast", "expected"),
+    [
+        ("cpu", {"sse2", "avx512_bf16"}, False, "bf16-mixed"),
+        ("cpu", {"sse2", "avx2"}, True, "32-true"),
+        ("cpu", set(), True, "32-true"),
+        ("cuda", set(), True, "bf16-mixed"),
+        ("cuda", {"avx512_bf16"}, False, "32-true"),
+        ("mps", {"avx512_bf16"}, True, "32-true"),
+    ],
 )
-def test_a_cpu_takes_bf16_only_where_it_computes_in_it(flags, expected, monkeypatch):
+def test_bf16_is_taken_only_where_it_is_computed_in(
+    accelerator, flags, gpu_is_fast, expected, monkeypatch
+):
     monkeypatch.setattr(hardware, "_cpu_flags", lambda: flags)
-    precision, reason = choose_precision("auto", "cpu")
-    assert precision == expected
-    assert "bf16" in reason
-
-
-@pytest.mark.parametrize(
-    ("accelerator", "fast", "expected"),
-    [("cuda", True, "bf16-mixed"), ("cuda", False, "32-true"), ("mps", True, "32-true")],
-)
-def test_a_gpu_is_asked_and_others_are_not_guessed_at(accelerator, fast, expected, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: fast)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
     assert choose_precision("auto", accelerator)[0] == expected
+    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
 
 
 def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):
