@@ -227,10 +227,7 @@ class Bounded(io.RawIOBase):
 def archive_members(archive: Path, most_bytes: int) -> Iterator[Iterator[Member]]:
     """Open an archive, and turn every way in which it can be damaged into one error.
 
-    A tar file ends after ``most_bytes`` at the latest when it is unpacked.
-
-    Raises:
-        UserError: The archive is damaged, of another format, or longer.
+    A tar file that is longer than ``most_bytes`` when it is unpacked counts as damaged.
     """
     try:
         with archive.open("rb") as stream:

@@ -62,30 +62,14 @@ class Batch:
         return self._map(lambda tensor: tensor.pin_memory())
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Batch:
-        values: dict[str, Any] = {
-            entry.name: function(value) if isinstance(value, Tensor) else value
-            for entry in fields(self)
-            for value in [getattr(self, entry.name)]
-        }
+        values: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+        values |= {name: function(value) for name, value in tensors.items()}
         return Batch(**values)
 
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
-    """Stack samples of one size.
-
-    Args:
-        samples: At least one sample; all of the same image size.
-        object_index: Position of every object, by name.
-
-    Raises:
-        ValueError: The sizes differ, or an instance's object is not in ``object_index``.
-    """
-    sizes = {sample.size for sample in samples}
-    if len(sizes) != 1:
-        raise ValueError(f"a batch needs images of one size, got {sorted(sizes)}")
-    unknown = {i.label for s in samples for i in s.instances} - set(object_index)
-    if unknown:
-        raise ValueError(f"objects {sorted(unknown)} are not among {list(object_index)}")
+    """Stack samples of one size; ``object_index`` has the position of every object, by name."""
     images = torch.from_numpy(np.stack([sample.image for sample in samples]))
     return Batch(
         images=images.permute(0, 3, 1, 2),
@@ -101,22 +85,17 @@ def _stack_instances(
 ) -> dict[str, Tensor]:
     # One slot even when nothing is visible anywhere: an empty axis is a special case for everybody.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
-    T_cam_obj = np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1))
-    keypoints = np.full((*shape, 9, 2), np.nan, np.float32)
+    stated = {
+        "T_cam_obj": np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1)),
+        "keypoints": np.full((*shape, 9, 2), np.nan, np.float32),
+        "visible_fraction": np.zeros(shape, np.float32),
+        "masked_fraction": np.zeros(shape, np.float32),
+    }
     index = np.full(shape, PADDING, np.int64)
-    visible, masked = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for row, sample in enumerate(samples):
         for column, instance in enumerate(sample.instances):
-            T_cam_obj[row, column] = instance.T_cam_obj
-            keypoints[row, column] = instance.keypoints
             index[row, column] = object_index[instance.label]
-            visible[row, column] = instance.visible_fraction
-            masked[row, column] = instance.masked_fraction
-    arrays = {
-        "T_cam_obj": T_cam_obj,
-        "keypoints": keypoints,
-        "object_index": index,
-        "visible_fraction": visible,
-        "masked_fraction": masked,
-    }
+            for name, array in stated.items():
+                array[row, column] = getattr(instance, name)
+    arrays = {"object_index": index, **stated}
     return {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -8,7 +8,6 @@ against the images. To add a layout, write ``check_NAME(report)`` in ``check.py`
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -16,40 +15,25 @@ from typing import Final
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.check import check_bop, scene_folders
 from dopepp.data.formats.ndds.check import check_ndds
-from dopepp.data.formats.ndds.files import OBJECT_SETTINGS
+from dopepp.data.formats.ndds.files import OBJECT_SETTINGS, find_items
 from dopepp.data.formats.problems import CheckReport
 from dopepp.data.formats.webdataset.check import check_webdataset, shard_paths
 from dopepp.data.formats.ycb_video.check import check_ycb
-
-
-def _is_ndds(root: Path) -> bool:
-    """Tell by the settings file or by an annotation beside an image of its name."""
-    for folder, _, names in os.walk(root):
-        present = set(names)
-        if OBJECT_SETTINGS in present:
-            return True
-        for name in names:
-            stem = name.removesuffix(".json")
-            if stem != name and any(stem + suffix in present for suffix in (".png", ".jpg")):
-                return Path(folder, name).is_file()
-    return False
-
 
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
     "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
     "BOP-WebDataset": (lambda root: any(shard_paths(root)), check_webdataset),
     "BOP": (lambda root: any(scene_folders(root)), check_bop),
-    "NDDS": (_is_ndds, check_ndds),
+    "NDDS": (
+        lambda root: any(root.rglob(OBJECT_SETTINGS)) or bool(find_items(root)[0]),
+        check_ndds,
+    ),
 }
 """How each layout is told, in this order, and checked."""
 
 
 def check_dataset(root: Path) -> CheckReport:
-    """Check a data set of any known layout; what is found is reported, never raised.
-
-    Raises:
-        UserError: The folder is missing or holds no known layout.
-    """
+    """Check a data set; a UserError tells only that the folder is missing or of no known layout."""
     root = Path(root)
     known = (
         "a YCB-Video folder (data/, image_sets/), a BOP data set, split or scene (scene_gt.json), "

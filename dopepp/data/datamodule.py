@@ -5,35 +5,27 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from lightning.pytorch import LightningDataModule
 
 from dopepp.core.errors import UserError
 from dopepp.data.loader import EpochSampler, PoseLoader, SampleDataset
-from dopepp.data.rng import Purpose, item_rng
-from dopepp.data.sample import DescribedSource, Sample
+from dopepp.data.sample import (
+    DescribedSource,
+    Purpose,
+    Sample,
+    SourceInfo,
+    item_rng,
+    letterbox_sample,
+    pad_sample,
+    resize_sample,
+)
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
-from dopepp.data.transforms.resize import letterbox_sample, pad_sample, resize_sample
 from dopepp.drawing.pictures import Size
 from dopepp.virtual.backgrounds import Backgrounds
-
-
-@dataclass(frozen=True)
-class SourceRow:
-    """A line of the start-up print.
-
-    Attributes:
-        num_instances: Instances per object; empty where counting is not cheap.
-    """
-
-    split: str
-    source: str
-    num_images: int
-    num_per_epoch: int
-    num_instances: dict[str, int]
 
 
 class PoseDataModule(LightningDataModule):
@@ -46,10 +38,6 @@ class PoseDataModule(LightningDataModule):
         val: Validation data (model selection, thresholds); its epoch is always 0.
         test: Test data; its epoch is always 0.
         backgrounds: Other pictures that masking may need; required with ``masking``.
-
-    Raises:
-        UserError: The training data are less than one batch.
-        ValueError: ``masking`` without ``backgrounds``.
     """
 
     def __init__(
@@ -130,19 +118,10 @@ class PoseDataModule(LightningDataModule):
                 "take the object out, or add a source that shows it (e.g. renders)",
             )
 
-    def summary(self) -> list[SourceRow]:
-        """Return the sources of every split, for the start-up print."""
-        return [
-            SourceRow(
-                split,
-                info.name,
-                info.num_images,
-                info.num_images if info.num_per_epoch is None else info.num_per_epoch,
-                dict(info.num_instances),
-            )
-            for split, source in self._splits().items()
-            for info in source.describe()
-        ]
+    def summary(self) -> list[tuple[str, SourceInfo]]:
+        """Return (split, source) for the start-up print."""
+        splits = self._splits().items()
+        return [(split, info) for split, source in splits for info in source.describe()]
 
     def fingerprint(self) -> str:
         """Return a SHA-256 over everything that decides the images, without the images."""

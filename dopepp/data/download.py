@@ -39,8 +39,6 @@ class DownloadSource:
     """An archive on the network.
 
     Attributes:
-        num_bytes: Its exact size.
-        sha256: Its checksum, hex.
         photos: The folder in it that serves as ``virtual.backgrounds``.
         licence: What its user must know before using it.
     """
@@ -72,14 +70,10 @@ SOURCES: Final = {
 
 
 def download(name: str, folder: Path | str, progress: Progress | None = None) -> Path:
-    """Download and unpack a data set into ``folder/NAME``; one that is there is left as it is.
+    """Download and unpack a data set into ``folder/NAME``, if it is not there; return its photos.
 
-    Returns:
-        The folder of its photos.
-
-    Raises:
-        UserError: The name is unknown, the network or the disk fails, or the file is not the one
-            that is meant. What was received before a failure stays, and the next call goes on.
+    A :class:`UserError`: the name is unknown, the network or the disk fails, or the file is not the
+    one that is meant. What was received before a failure stays, and the next call goes on.
     """
     source = SOURCES.get(name)
     if source is None:
@@ -108,9 +102,6 @@ def fetch(
         num_bytes: The file's exact size; not a byte more is received.
         sha256: Its checksum, hex.
         progress: Told after every piece.
-
-    Raises:
-        UserError: The network, the server or the disk fails, or size or checksum differ.
     """
     partial = path.with_name(f"{path.name}.partial")
     try:

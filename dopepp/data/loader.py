@@ -18,18 +18,14 @@ from torch.utils.data.distributed import DistributedSampler
 
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch, collate
-from dopepp.data.rng import Purpose, item_rng
-from dopepp.data.sample import Sample
+from dopepp.data.sample import Purpose, Sample, item_rng
 
 Item = Callable[[int, int], Sample]
 """Makes item ``index`` of ``epoch``: ``item(epoch, index)``."""
 
 
 class SampleDataset(Dataset[Sample | UserError]):
-    """Items by (epoch, index); a user's mistake is an item too, see :class:`PoseLoader`.
-
-    ``item`` makes one, a pure function of (epoch, index).
-    """
+    """Items by (epoch, index); a user's mistake is an item too, see :class:`PoseLoader`."""
 
     def __init__(self, item: Item, num_items: int) -> None:
         self._item, self._num_items = item, num_items
@@ -86,11 +82,8 @@ class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
     An exception from a worker arrives re-made from its text, with the worker's stack in it; a user
-    is owed the one line. So it travels as a value and is raised here.
-
-    Args:
-        sampler: Hands out (epoch, index).
-        object_names: The objects in the network's order.
+    is owed the one line. So it travels as a value and is raised here. ``object_names`` are in the
+    network's order.
     """
 
     def __init__(

@@ -32,9 +32,6 @@ def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
 
     The choice None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
     them on the mesh; anything else is a file that has them for every part, by name.
-
-    Raises:
-        UserError: A part has no mesh to look at, or the file is damaged or lacks a part.
     """
     if choice is None:
         return list(parts)
@@ -43,16 +40,22 @@ def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
     if choice == AUTO:
         return [with_found_symmetries(part) for part in parts]
     infos = _read_infos(choice)
-    return [_with_info(part, infos, choice) for part in parts]
+    for part in parts:
+        if part.name not in infos:
+            raise UserError(
+                f"data.symmetries={choice}, which has no {part.name}", ", ".join(infos),
+                f'add an entry with "name": "{part.name}"',
+            )  # fmt: skip
+    return [
+        replace(part, **{field: getattr(infos[part.name], field) for field in _SYMMETRY_FIELDS})
+        for part in parts
+    ]
 
 
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
     """Return a part with the symmetries of its mesh, and say in the log what they are.
 
     ``tolerance`` is the largest distance of a moved surface point from the surface, in diameters.
-
-    Raises:
-        UserError: The part has no mesh, or the tolerance is out of range.
     """
     if part.mesh is None:
         raise UserError(
@@ -74,11 +77,7 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 
 
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
-    """Return the ``models_info.json`` entry of a mesh file or built-in part, as JSON.
-
-    Raises:
-        UserError: The file cannot be used, or the tolerance is out of range.
-    """
+    """Return the ``models_info.json`` entry of a mesh file or built-in part, as JSON."""
     entry = model_info(with_found_symmetries(load_part(path, unit), tolerance))
     entry |= {field: entry.get(field, []) for field in _SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)
@@ -97,17 +96,3 @@ def _read_infos(choice: str) -> dict[str, ModelInfo]:
     if isinstance(records, dict) and "diameter" in records:
         records = {"1": records}  # one entry alone
     return {info.name: info for info in parse_models(path, records).values()}
-
-
-def _with_info(part: Part, infos: dict[str, ModelInfo], path: str) -> Part:
-    if part.name not in infos:
-        raise UserError(
-            f"data.symmetries={path}, which has no {part.name}", ", ".join(infos),
-            f'add an entry with "name": "{part.name}"',
-        )  # fmt: skip
-    info = infos[part.name]
-    return replace(
-        part,
-        symmetries_discrete=info.symmetries_discrete,
-        symmetries_continuous=info.symmetries_continuous,
-    )

@@ -1,21 +1,24 @@
 """What every reader returns: one image with its camera and the posed objects on it.
 
 To add a source, write a class with the :class:`DescribedSource` methods and one YAML file in
-``conf/data``.
+``conf/data``. What it draws at random it draws from :func:`item_rng`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator
+from numpy.typing import NDArray
 
-from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape, Size
+from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform
 
 
 @dataclass
@@ -46,7 +49,6 @@ class Sample:
 
     Attributes:
         K: Camera matrix in pixels of this image, float64.
-        instances: The objects of interest on it, possibly none.
         depth: Metres along z, float32, 0 where unknown; None where the source has none.
         source: Name of the source, e.g. ``ycb_video/data``.
         key: The item within its source, e.g. ``0050/000003``.
@@ -82,7 +84,6 @@ class SourceInfo:
     """What a source holds, for the start-up print and the data fingerprint.
 
     Attributes:
-        num_images: Images it holds (for renders: distinct items of an epoch).
         identity: Everything that decides the items (file list, seed, preset, part hashes, …), as
             plain values that JSON can write.
         num_instances: Instances of each object, empty where counting them is not cheap.
@@ -138,3 +139,82 @@ def hull_areas(
     corners = [[0, 0], [width, 0], [width, height], [0, height]]
     inside, _ = cv2.intersectConvexConvex(hull, np.array(corners, np.float32) - 0.5)
     return float(inside), float(cv2.contourArea(hull))
+
+
+class Purpose(IntEnum):
+    """What a generator is for; the numbers are part of the data and must not change."""
+
+    SHUFFLE = 101
+    MIX = 102
+    CYCLE = 103
+    AUGMENT = 104
+    BACKGROUND = 105
+    SHADING = 106
+
+
+def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:
+    """Return the generator of one item (all arguments non-negative), which nobody shares.
+
+    It depends on nothing else, so workers, ranks and resuming a run never change an item.
+    """
+    # Last, because a generator ignores trailing zeros: [seed, epoch, index], from which the
+    # factory draws its scenes, is [seed, epoch, index, 0].
+    return np.random.default_rng([seed, epoch, index, int(purpose)])
+
+
+def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """Resize by exact nearest: target pixel j takes the source pixel that holds its centre.
+
+    The centre of target pixel j lies at (j + ½) / s − ½, inside source pixel ⌊(j + ½) / s⌋; integer
+    arithmetic keeps the rule exact (``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off).
+    """
+    rows = (2 * np.arange(height) + 1) * image.shape[0] // (2 * height)
+    columns = (2 * np.arange(width) + 1) * image.shape[1] // (2 * width)
+    return np.asarray(image[rows[:, None], columns])
+
+
+def resize_sample(sample: Sample, input_size: Size) -> Sample:
+    """Scale a sample by one factor so that it just fits into ``input_size``, without padding.
+
+    Image, K, keypoints, masks and depth all follow the one rule of
+    :class:`~dopepp.geometry.camera.Letterbox`.
+    """
+    box = Letterbox.fit(sample.size, input_size)
+    if (box.width, box.height) == sample.size:
+        return sample
+
+    def resized(pixels: NDArray[Any] | None) -> NDArray[Any] | None:
+        return None if pixels is None else nearest(pixels, box.width, box.height)
+
+    return replace(
+        sample,
+        image=box.image(sample.image),
+        K=box.camera(sample.K),
+        depth=resized(sample.depth),
+        instances=[
+            replace(one, keypoints=box.points(one.keypoints), mask=resized(one.mask))
+            for one in sample.instances
+        ],
+    )
+
+
+def pad_sample(sample: Sample, input_size: Size) -> Sample:
+    """Pad with zeros on the right and at the bottom; K and keypoints stay as they are."""
+    width, height = sample.size
+    if (width, height) == tuple(input_size):
+        return sample
+
+    def pad(array: NDArray[Any]) -> NDArray[Any]:
+        beyond = [(0, input_size[1] - height), (0, input_size[0] - width)]
+        return np.pad(array, beyond + [(0, 0)] * (array.ndim - 2))
+
+    instances = [
+        replace(one, mask=None if one.mask is None else pad(one.mask)) for one in sample.instances
+    ]
+    depth = None if sample.depth is None else pad(sample.depth)
+    return replace(sample, image=pad(sample.image), depth=depth, instances=instances)
+
+
+def letterbox_sample(sample: Sample, input_size: Size) -> Sample:
+    """Resize and pad a sample to exactly ``input_size`` (width, height)."""
+    return pad_sample(resize_sample(sample, input_size), input_size)

@@ -26,8 +26,7 @@ from torch import nn
 
 from dopepp.core.files import write_png, write_whole
 from dopepp.data.batch import collate
-from dopepp.data.sample import Sample
-from dopepp.data.transforms.resize import pad_sample, resize_sample
+from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry

@@ -12,14 +12,16 @@ is to be rendered, a :class:`Writer` and one line in ``WRITERS`` of :mod:`dopepp
 from __future__ import annotations
 
 import fcntl
+import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
+from dopepp.core.json import MAX_BYTES, read_json
 from dopepp.data.sample import Sample
 
 T = TypeVar("T")
@@ -65,10 +67,7 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
     """Return which of ``num_items`` items a share given in fractions is.
 
     Both bounds are rounded alike, so shares that meet in a fraction neither overlap nor leave out.
-
-    Raises:
-        ValueError: The fractions are not ascending in [0, 1].
-        UserError: No item falls into the share.
+    A UserError: no item falls into the share.
     """
     first, last = part_of
     if not 0 <= first < last <= 1:
@@ -80,6 +79,20 @@ def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
             "a folder with more images", "give every split a folder of its own",
         )  # fmt: skip
     return chosen
+
+
+def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
+    """Read a JSON file that a writer adds to; empty where there is none yet."""
+    content = read_json(path, max_bytes) if path.exists() else {}
+    if not isinstance(content, dict):
+        raise UserError(f"{path}, no JSON object", "what this writer wrote", "restore or remove it")
+    return content
+
+
+def by_line(content: Mapping[str, object]) -> bytes:
+    """Return a JSON object with a line for each key."""
+    lines = [f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items()]
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def stage(path: Path, content: bytes) -> None:
@@ -103,26 +116,19 @@ def finalizing(staging: Path) -> Iterator[None]:
     remove staged items would otherwise lose what one of them had not seen.
     """
     path = staging / _LOCK
-    with _locked(path):
-        yield
-        if not any(entry.name != _LOCK for entry in staging.iterdir()):
-            path.unlink()
-            try:
-                staging.rmdir()
-            except OSError:  # another process has staged an item in this moment
-                return
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
     while True:
         descriptor = retry(lambda: _open(path))
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             # Whoever held it before may have removed the file: then the next one makes another.
-            if _is_same(descriptor, path):
-                yield
-                return
+            if not _is_same(descriptor, path):
+                continue
+            yield
+            if not any(entry.name != _LOCK for entry in staging.iterdir()):
+                path.unlink()
+                with suppress(OSError):  # another process has staged an item in this moment
+                    staging.rmdir()
+            return
         finally:
             os.close(descriptor)
 

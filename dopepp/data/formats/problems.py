@@ -1,9 +1,9 @@
 """Where the problems of a data set's files go, and what every reader of them reads.
 
-A reader is handed a :class:`Problems`: it reports what is wrong with a field and goes on with a
-neutral value (NaN, None, an empty list). A source hands it :data:`STRICT`, which raises the first
-problem; a check hands it a :class:`CheckReport`, which keeps them all. So both parse alike, and
-what a check passes, a source reads. To add a layout, see :mod:`dopepp.data.check`.
+A reader is handed a :class:`Problems`: at each :class:`Place` it reports what is wrong and goes on
+with a neutral value (NaN, None, an empty list). A source hands it :data:`STRICT`, which raises the
+first problem; a check hands it a :class:`CheckReport`, which keeps them all. So both parse alike,
+and what a check passes, a source reads. To add a layout, see :mod:`dopepp.data.check`.
 """
 
 from __future__ import annotations
@@ -47,14 +47,7 @@ class Problems(Protocol):
     """Takes what a reader finds wrong."""
 
     def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
-        """Take a problem.
-
-        Args:
-            path: The file; a tar's member as ``TAR/MEMBER``.
-            where: What in it, e.g. ``3[0].cam_R_m2c`` or ``size``.
-            got: What was found.
-            allowed: What is allowed; empty where ``got`` says it.
-        """
+        """Take a problem at a :class:`Place`; ``allowed`` is empty where ``got`` says it."""
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
         """Take a problem that a reader below has raised."""
@@ -156,42 +149,93 @@ class CheckReport:
         return [*(f"note: {note}" for note in self.notes), *shown, summary]
 
 
-def attempt(problems: Problems, path: Path | str, where: str, read: Callable[[], T]) -> T | None:
-    """Return what a reader returns; what it raises is a problem, and None the answer."""
-    try:
-        return read()
-    except UserError as error:
-        problems.take(path, where, error)
+@dataclass(frozen=True)
+class Place:
+    """A file or something in it, and who takes what is wrong there.
+
+    Attributes:
+        path: The file; a tar's member as ``TAR/MEMBER``.
+        where: What in it, e.g. ``3[0].cam_R_m2c`` or ``size``.
+    """
+
+    problems: Problems
+    path: Path | str
+    where: str = ""
+
+    def __getitem__(self, key: str | int) -> Place:
+        """Return the place of an object's field, or of a list's entry."""
+        step = f"[{key}]" if isinstance(key, int) else f".{key}"
+        return Place(self.problems, self.path, self.where + step)
+
+    def report(self, got: str, allowed: str = "") -> None:
+        """Report a problem."""
+        self.problems.report(self.path, self.where, got, allowed)
+
+    def attempt(self, read: Callable[[], T]) -> T | None:
+        """Return what a reader returns; what it raises is a problem, and None the answer."""
+        is_missing = isinstance(self.path, Path) and not self.path.is_file()
+        try:
+            return read()
+        except UserError as error:
+            self.problems.take(self.path, "file" if is_missing else self.where, error)
+            return None
+
+    def load(
+        self, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
+    ) -> dict[str, Any] | None:
+        """Read a JSON file whose top level is an object, None where that is impossible.
+
+        A number that is not finite, or a key twice, is a problem that does not hide the rest.
+        """
+        path = Path(self.path)
+        found = self["JSON"].attempt(lambda: [read_json(path, max_bytes)])
+        if found is None:
+            readable = path.is_file() and path.stat().st_size <= max_bytes
+            content = _leniently(path.read_bytes()) if readable else None
+            return content if isinstance(content, dict) else None
+        if isinstance(found[0], dict):
+            return found[0]
+        self["top level"].report(f"{found[0]!r:.60}", allowed)
         return None
 
+    def decode(self, content: bytes) -> Any:
+        """Parse JSON as :meth:`load` does, whatever it holds."""
+        found = self["JSON"].attempt(lambda: [parse_json(content, str(self.path))])
+        return _leniently(content) if found is None else found[0]
 
-def attempt_file(problems: Problems, path: Path, where: str, read: Callable[[], T]) -> T | None:
-    """Attempt to read a file; one that is missing is a problem of the ``file``."""
-    return attempt(problems, path, where if path.is_file() else "file", read)
+    def numbers(self, value: object, *shape: int) -> Float[np.ndarray, "..."]:
+        """Return a field's numbers in a shape.
 
+        ``value`` is a number, or (nested) lists of as many as ``shape`` has, None where it is
+        missing. Anything else, or what is not finite, becomes NaNs.
+        """
+        try:
+            array = np.array(value)
+            fits = array.size == np.prod(shape) and array.dtype.kind in "iuf"
+        except (ValueError, OverflowError):
+            fits = False
+        if fits and (np.abs(array.astype(np.float64)) <= FARTHEST).all():
+            return array.astype(np.float64).reshape(shape)
+        got = "missing" if value is None else f"{value!r:.60}"
+        if fits and not np.isfinite(array).all():
+            got = f"not finite (NaN or infinite): {got}"
+        noun = "number" if shape == (1,) else "numbers"
+        self.report(got, f"{'×'.join(map(str, shape))} finite {noun} up to {FARTHEST:.0e}")
+        return np.full(shape, np.nan)
 
-def load_object(
-    problems: Problems, path: Path, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
-) -> dict[str, Any] | None:
-    """Read a JSON file whose top level is an object, None where that is impossible.
+    def scalar(self, value: object) -> float:
+        """Return a field's number, NaN where it holds anything else."""
+        return float(self.numbers(value, 1)[0])
 
-    A number that is not finite, or a key twice, is a problem that does not hide the rest.
-    """
-    found = attempt_file(problems, path, "JSON", lambda: [read_json(path, max_bytes)])
-    if found is None:
-        readable = path.is_file() and path.stat().st_size <= max_bytes
-        content = _leniently(path.read_bytes()) if readable else None
-        return content if isinstance(content, dict) else None
-    if isinstance(found[0], dict):
-        return found[0]
-    problems.report(path, "top level", f"{found[0]!r:.60}", allowed)
-    return None
-
-
-def decode_json(problems: Problems, path: Path | str, content: bytes) -> Any:
-    """Parse JSON as :func:`load_object` does, whatever it holds."""
-    found = attempt(problems, path, "JSON", lambda: [parse_json(content, str(path))])
-    return _leniently(content) if found is None else found[0]
+    def entries(self, value: object) -> list[Any]:
+        """Return a list's entries; empty ones in place of those that are no JSON objects."""
+        if not isinstance(value, list):
+            self.report("missing" if value is None else f"{value!r:.60}", "a list")
+            return []
+        for number, entry in enumerate(value):
+            if not isinstance(entry, dict):
+                self[number].report(f"{entry!r:.60}", "a JSON object")
+        return [entry if isinstance(entry, dict) else {} for entry in value]
 
 
 def _leniently(content: bytes) -> Any:
@@ -201,60 +245,18 @@ def _leniently(content: bytes) -> Any:
         return None
 
 
-def numbers(
-    problems: Problems, path: Path | str, where: str, value: object, *shape: int
-) -> Float[np.ndarray, "..."]:
-    """Return a field's numbers in a shape.
-
-    ``value`` is a number, or (nested) lists of as many as ``shape`` has, None where it is missing.
-    Anything else, or what is not finite, becomes NaNs.
-    """
-    try:
-        array = np.array(value)
-        fits = array.size == np.prod(shape) and array.dtype.kind in "iuf"
-    except (ValueError, OverflowError):
-        fits = False
-    if fits and (np.abs(array.astype(np.float64)) <= FARTHEST).all():
-        return array.astype(np.float64).reshape(shape)
-    got = "missing" if value is None else f"{value!r:.60}"
-    if fits and not np.isfinite(array).all():
-        got = f"not finite (NaN or infinite): {got}"
-    noun = "number" if shape == (1,) else "numbers"
-    allowed = f"{'×'.join(map(str, shape))} finite {noun} up to {FARTHEST:.0e}"
-    problems.report(path, where, got, allowed)
-    return np.full(shape, np.nan)
-
-
-def scalar(problems: Problems, path: Path | str, where: str, value: object) -> float:
-    """Return a field's number, NaN where it holds anything else."""
-    return float(numbers(problems, path, where, value, 1)[0])
-
-
-def entries(problems: Problems, path: Path | str, where: str, value: object) -> list[Any]:
-    """Return a list's entries; empty ones in place of those that are no JSON objects."""
-    if not isinstance(value, list):
-        problems.report(path, where, "missing" if value is None else f"{value!r:.60}", "a list")
-        return []
-    for place, entry in enumerate(value):
-        if not isinstance(entry, dict):
-            problems.report(path, f"{where}[{place}]", f"{entry!r:.60}", "a JSON object")
-    return [entry if isinstance(entry, dict) else {} for entry in value]
-
-
 def mapping(value: object) -> Mapping[str, Any]:
     """Return a JSON object, an empty one for anything else."""
     return value if isinstance(value, dict) else {}
 
 
-def picture(
-    problems: Problems, path: Path | str, content: bytes | None = None
-) -> Image.Image | None:
+def picture(place: Place, content: bytes | None = None) -> Image.Image | None:
     """Decode a BOP image, None where it is missing, damaged, too large or of another format.
 
     ``content`` are its bytes, where they do not lie on the disk by themselves.
     """
     if content is None:
-        content = attempt_file(problems, Path(path), "image", lambda: read_content(Path(path)))
+        content = place["image"].attempt(lambda: read_content(Path(place.path)))
     if content is None:
         return None
     try:
@@ -262,20 +264,18 @@ def picture(
     except ValueError as error:
         got = f"unreadable or truncated, {len(content):,} bytes ({error})"
         allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
-        problems.report(path, "image", got, allowed)
+        place["image"].report(got, allowed)
         return None
 
 
-def picture_shape(
-    problems: Problems, path: Path | str, content: bytes | None = None
-) -> tuple[int, int] | None:
+def picture_shape(place: Place, content: bytes | None = None) -> tuple[int, int] | None:
     """Return a picture's (height, width) after reading all of it.
 
     A truncated file still states its size, so that other images can be held against it; None where
     it does not.
     """
-    picture(problems, path, content)
-    file = Path(path) if content is None else io.BytesIO(content)
+    picture(place, content)
+    file = Path(place.path) if content is None else io.BytesIO(content)
     try:
         with Image.open(file, formats=FORMATS) as stated:
             width, height = stated.size
@@ -287,31 +287,28 @@ def picture_shape(
 def read_map(path: Path, shape: Shape) -> NDArray[Any]:
     """Read a frame's map of numbers (depth, labels), of the colour image's (height, width).
 
-    Raises:
-        UserError: It is missing, damaged, has several channels or another size.
+    A UserError: it is missing, damaged, has several channels or another size.
     """
-    image = check_map(STRICT, path, shape)
+    image = check_map(Place(STRICT, path), shape)
     assert image is not None
     return image
 
 
-def check_map(
-    problems: Problems, path: Path, shape: Shape | None, colour: bool = False
-) -> NDArray[Any] | None:
+def check_map(place: Place, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
     """Read a map of YCB-Video, NDDS or FAT, None where that is impossible.
 
     ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
     map of several channels, whose meaning no file states, gives None.
     """
-    image = attempt_file(problems, path, "image", lambda: read_image(path))
+    image = place["image"].attempt(lambda: read_image(Path(place.path)))
     if image is not None and image.ndim > 2 and colour:
-        one_channel(problems, path, image[..., 0], shape)
+        one_channel(place, image[..., 0], shape)
         return None
-    return one_channel(problems, path, image, shape)
+    return one_channel(place, image, shape)
 
 
 def one_channel(
-    problems: Problems, path: Path | str, image: NDArray[Any] | None, shape: tuple[int, ...] | None
+    place: Place, image: NDArray[Any] | None, shape: tuple[int, ...] | None
 ) -> NDArray[Any] | None:
     """Return a map of numbers (depth, mask, labels), None where it cannot be the image's.
 
@@ -320,10 +317,10 @@ def one_channel(
     if image is None:
         return None
     if image.ndim != 2:
-        problems.report(path, "channels", f"an image of {image.shape[2]}", "one channel")
+        place["channels"].report(f"an image of {image.shape[2]}", "one channel")
         return None
     if shape is not None and image.shape != tuple(shape[:2]):
         got = f"{image.shape[1]}×{image.shape[0]} pixels"
-        problems.report(path, "size", got, f"{shape[1]}×{shape[0]}, the colour image's size")
+        place["size"].report(got, f"{shape[1]}×{shape[0]}, the colour image's size")
         return None
     return image

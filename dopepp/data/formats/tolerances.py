@@ -8,8 +8,7 @@ is 0.1 to 300 diameters away from an object, which no mix-up of mm and m leaves 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -30,8 +29,7 @@ PIXEL_ASPECT: Final = (0.5, 2.0)
 DIAMETERS_MM: Final = (5.0, 5000.0)
 
 
-@dataclass(frozen=True)
-class Box:
+class Box(NamedTuple):
     """An axis-aligned box in the image, pixel centres, ends included."""
 
     left: float
@@ -66,21 +64,12 @@ class Box:
 
     def distance(self, other: Box) -> float:
         """Return the largest distance of two boxes' sides, pixels."""
-        sides = zip(
-            (self.left, self.top, self.right, self.bottom),
-            (other.left, other.top, other.right, other.bottom),
-            strict=True,
-        )
-        return max(abs(a - b) for a, b in sides)
+        return max(abs(a - b) for a, b in zip(self, other, strict=True))
 
-    def holds(self, other: Box, slack: float) -> bool:
-        """Tell whether another box is inside this one, ``slack`` pixels beyond it allowed."""
-        return (
-            self.left - slack <= other.left
-            and self.top - slack <= other.top
-            and other.right <= self.right + slack
-            and other.bottom <= self.bottom + slack
-        )
+    def beyond(self, other: Box) -> float:
+        """Return how far another box reaches out of this one, pixels; below 0 inside of it."""
+        left, top = self.left - other.left, self.top - other.top
+        return max(left, top, other.right - self.right, other.bottom - self.bottom)
 
     def is_inside(self, shape: Shape) -> bool:
         """Tell whether all of it is in an image of (height, width)."""
@@ -150,12 +139,7 @@ def box_problem(
         return None
     width, height = predicted.right - predicted.left, predicted.bottom - predicted.top
     tolerance = max(BOX_TOLERANCE_PX, BOX_TOLERANCE_SHARE * max(width, height))
-    beyond = max(
-        predicted.left - seen.left,
-        predicted.top - seen.top,
-        seen.right - predicted.right,
-        seen.bottom - predicted.bottom,
-    )
+    beyond = predicted.beyond(seen)
     if beyond > tolerance:
         return (
             f"seen at {seen}, {beyond:.0f} px outside the reprojected box {predicted} "

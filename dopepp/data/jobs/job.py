@@ -1,6 +1,7 @@
-"""What a render job makes: a factory and a layout, from what a user writes, and their record.
+"""What a render job makes, from what a user writes; its record, and the folder it claims.
 
-The record holds, as plain values, everything that decides the job's bytes.
+The record holds, as plain values, everything that decides the job's bytes. It is written into the
+folder first; whoever comes later with another one is refused, by the fields that differ.
 
 To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :data:`WRITERS`.
 """
@@ -8,8 +9,10 @@ To add a layout, write a :class:`~dopepp.data.formats.Writer` and one line in :d
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +22,9 @@ import numpy as np
 import yaml
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
+from dopepp.core.interrupts import NO_SPACE, stopped
+from dopepp.core.json import read_json
 from dopepp.data.formats import Writer
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ASSUMED_UNIT
@@ -75,7 +81,7 @@ def make_job(
     renderer: str = "raster",
     layout: str = "bop",
 ) -> Job:
-    """Make a job from what a user writes.
+    """Make a job from what a user writes; a UserError tells what of it cannot be used.
 
     Args:
         parts: Built-in names, mesh files, or ``NAME=FILE`` where the file's name will not do.
@@ -88,9 +94,6 @@ def make_job(
         negatives: Parts among the distractors, written as ``parts``.
         renderer: Name of a renderer.
         layout: Key of :data:`WRITERS`.
-
-    Raises:
-        UserError: Any of it cannot be used.
     """
     _find_writer(layout)
     scenes = customised_preset(preset, _nested(changes))
@@ -189,3 +192,88 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return [_plain(item) for item in value]
     return value
+
+
+RECORD_FILE: Final = "_dopepp_render.json"
+"""The underscore is NDDS's mark of a settings file: without it, readers of that layout would take
+the record for an image's annotation."""
+
+_MAX_RECORD_BYTES: Final = 4_000_000
+"""Some 10,000 parts."""
+
+_MAX_DIFFERENCES: Final = 3
+"""As many as one line can hold."""
+
+
+def is_begun(root: Path) -> bool:
+    """Tell whether a job has claimed the folder."""
+    return (root / RECORD_FILE).is_file()
+
+
+def begin(root: Path, record: Mapping[str, Any]) -> None:
+    """Claim a folder for a job, or find that it is this job's already, and clean it.
+
+    A UserError: it cannot be written, or holds another job or something else; a StoppedError: there
+    is no space left.
+    """
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        _claim(root, json.loads(json.dumps(record)))
+        _remove_abandoned(root)
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise stopped(error, root) from error
+        raise UserError(
+            f"folder {root}: {error.strerror}", "a folder that can be written", "choose another"
+        ) from error
+
+
+def _claim(root: Path, record: Mapping[str, Any]) -> None:
+    path = root / RECORD_FILE
+    # Listed before the record is looked for: what another shard has made came after its record.
+    names = sorted(entry.name for entry in root.iterdir())
+    if not path.exists():
+        foreign = [name for name in names if not name.endswith(PARTIAL_SUFFIX)]
+        if foreign:
+            raise UserError(
+                f"folder {root}, which holds {foreign[0]!r} and no {RECORD_FILE}",
+                "an empty folder, or one that a render job began",
+                "choose another folder",
+            )
+        write_whole(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+    # Also after writing: two jobs may have begun in the same moment.
+    differences = list(_differences(read_json(path, _MAX_RECORD_BYTES), record, ""))
+    if differences:
+        raise UserError(
+            f"{path} of another job: {', '.join(differences[:_MAX_DIFFERENCES])}",
+            "the settings that the folder was begun with",
+            "repeat those settings with that version of dopepp, or choose another folder",
+        )
+
+
+def _differences(there: object, now: object, where: str) -> Iterator[str]:
+    """Yield every field that differs, with both values."""
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in now | there:
+            field = f"{where}.{key}" if where else str(key)
+            yield from _differences(there.get(key), now.get(key), field)
+    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for number, pair in enumerate(zip(there, now, strict=True)):
+            yield from _differences(*pair, f"{where}[{number}]")
+    elif there != now:
+        texts = (json.dumps(value) for value in (there, now))
+        before, after = (text if len(text) <= 60 else f"{text[:57]}..." for text in texts)
+        yield f"{where or 'content'} is {before} there and {after} now"
+
+
+def _remove_abandoned(root: Path) -> None:
+    """Remove the partial files that killed processes left, but none of a running shard."""
+    clock = partial_path(root / "clock")
+    clock.touch()
+    now = clock.stat().st_mtime
+    clock.unlink()
+    for folder, _, names in os.walk(root):
+        for name in names:
+            path = Path(folder, name)
+            if name.endswith(PARTIAL_SUFFIX) and is_abandoned(path, now):
+                path.unlink(missing_ok=True)

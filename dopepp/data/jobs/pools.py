@@ -67,10 +67,8 @@ class Pool(ABC):
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
         """Do tasks, in any order, and yield their outcomes as they come.
 
-        ``tasks`` are read only as far as workers are free.
-
-        Raises:
-            StoppedError: A worker has died, or the cluster cannot go on.
+        ``tasks`` are read only as far as workers are free. A StoppedError: a worker has died, or
+        the cluster cannot go on.
         """
         for _, future in completed(self.submit, tasks, self.room):
             yield future.result()
@@ -196,14 +194,8 @@ class ClusterPool(Pool):
     Every machine must see the data set's folder under the same path and have the same dopepp. Ray
     repeats the tasks of a machine that is lost.
 
-    Args:
-        address: The cluster's address; None starts one on this machine that ends with the job.
-
-    Attributes:
-        num_tasks: Tasks done so far, by the node's id.
-
-    Raises:
-        UserError: Ray is not installed, or there is no cluster at the address.
+    Without an ``address`` one is started on this machine, which ends with the job. ``num_tasks``
+    counts the tasks done so far, by the node's id.
     """
 
     images_per_task = 8

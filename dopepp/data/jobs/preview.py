@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
 from dopepp.data.jobs.job import Job
-from dopepp.data.sample import Instance, Sample
+from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import COLOURS, Tile, contact_sheet, depth_panel, draw_axes, mask_panel
-from dopepp.geometry.camera import CameraMatrix, project, resize_points, transform
+from dopepp.geometry.camera import project, resize_points, transform
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
@@ -37,9 +36,6 @@ def write_preview(job: Job, out: Path) -> Path:
 
     ``out`` is a PNG file, or the data set's folder: the sheet then lies beside it. Returns its
     path.
-
-    Raises:
-        UserError: The preset cannot show the part, or the sheet cannot be written.
     """
     out = out.resolve()
     path = out if out.suffix.lower() == ".png" else out.parent / f"{out.name}.preview.png"
@@ -100,12 +96,8 @@ def _posed(rendered: Rendered, sample: Sample) -> Picture:
     for instance, number in zip(sample.instances, rendered.scene.targets, strict=True):
         part = objects[number].part
         assert part is not None
-        ends = _axes(instance, sample.K, _AXIS_LENGTH * part.diameter)
+        # The object's origin and the ends of its axes.
+        points = _AXIS_LENGTH * part.diameter * np.vstack([np.zeros(3), np.eye(3)])
+        ends = project(transform(instance.T_cam_obj, points), sample.K)
         draw_axes(drawn, resize_points(ends, factor, factor))
     return drawn
-
-
-def _axes(instance: Instance, K: CameraMatrix, length: float) -> Float[np.ndarray, "4 2"]:
-    """Return where the object's origin and the ends of its axes (metres long) are seen."""
-    points = transform(instance.T_cam_obj, np.vstack([np.zeros(3), length * np.eye(3)]))
-    return np.asarray(project(points, K))

@@ -11,24 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rich import progress as shown
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.progress import Task as ShownTask
 from rich.text import Text
 
 from dopepp.core.errors import UserError
 from dopepp.core.futures import available_cores
 from dopepp.core.interrupts import stopped
-from dopepp.data.jobs.folder import begin, is_begun
-from dopepp.data.jobs.job import Job
+from dopepp.data.jobs.job import Job, begin, is_begun
 from dopepp.data.jobs.pools import ClusterPool, Pool, ProcessPool
 from dopepp.data.jobs.work import Chunk, Outcome, Shard, Task, plan
 from dopepp.data.sources.rendered import MAX_ITEMS
@@ -98,12 +88,7 @@ class RenderReport:
 
 
 def run(job: Job, request: RenderRequest) -> RenderReport:
-    """Render what is missing and show the progress on stderr.
-
-    Raises:
-        UserError: The request cannot be met.
-        StoppedError: The disk is full or a worker died.
-    """
+    """Render what is missing and show the progress on stderr."""
     if request.num is None:
         raise UserError("no -n", "the number of images, or --preview", "add -n 1000")
     shard, open_pool = Shard.parse(request.shard), _engine(request)
@@ -139,13 +124,8 @@ def render_dataset(
     """Bring a folder to ``num_items`` images, or to one shard of them.
 
     What is there is kept: whatever stopped an earlier run, this one goes on. Several shards may
-    share the folder at the same time; whoever completes a chunk finalizes it.
-
-    ``open_pool`` makes the processes that do the work.
-
-    Raises:
-        UserError: The count, the folder or the preset cannot be right.
-        StoppedError: The disk is full or a worker died.
+    share the folder at the same time; whoever completes a chunk finalizes it. A StoppedError: the
+    disk is full or a worker died.
     """
     if not 1 <= num_items <= MAX_ITEMS:
         raise UserError(f"-n {num_items}", f"1 to {MAX_ITEMS:,} images", "change -n")
@@ -217,17 +197,11 @@ class ProgressDisplay:
     """An :data:`OnProgress`, while it is entered: a bar, or without a terminal lines in the log."""
 
     def __init__(self, console: Console) -> None:
-        self._bar = Progress(
-            TextColumn("rendering"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            _RateColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._bar = shown.Progress(
+            "rendering", shown.BarColumn(), shown.MofNCompleteColumn(), _RateColumn(),
+            shown.TimeElapsedColumn(), "left", shown.TimeRemainingColumn(),
+            console=console, disable=not console.is_terminal,
+        )  # fmt: skip
         self._first: int | None = None
         self._start = self._last = 0.0
 
@@ -255,9 +229,9 @@ class ProgressDisplay:
             )
 
 
-class _RateColumn(ProgressColumn):
+class _RateColumn(shown.ProgressColumn):
     """Images per second, of the last half minute; nothing while it is unknown."""
 
-    def render(self, task: ShownTask) -> Text:
+    def render(self, task: shown.Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text(f"{speed:.1f}/s" if speed else "", style="progress.data.speed")

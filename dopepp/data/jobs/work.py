@@ -18,8 +18,7 @@ import cv2
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import Writer
-from dopepp.data.jobs.folder import RECORD_FILE, is_begun
-from dopepp.data.jobs.job import Job
+from dopepp.data.jobs.job import RECORD_FILE, Job, is_begun
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.virtual.factory import Factory
 
@@ -124,9 +123,12 @@ class Worker:
         """Do a task; an error comes back as a part of the outcome."""
         try:
             factory, writer = self._open()
-            if task.finalizes:
-                return _finalize(writer, task)
-            return _render(factory, writer, task)
+            if not task.finalizes:
+                return _render(factory, writer, task)
+            written = writer.written(task.chunk)
+            if written.issuperset(task.indices):  # else images of it are still to come
+                writer.finalize(task.chunk, sorted(written))
+            return Outcome(task)
         except (UserError, OSError) as error:
             return Outcome(task, error=error)
         except Exception:  # a defect: not every exception survives pickling, its text does
@@ -158,11 +160,3 @@ def _render(factory: Factory, writer: Writer, task: Task) -> Outcome:
         render_s += middle - start
         write_s += time.process_time() - middle
     return Outcome(task, render_s, write_s)
-
-
-def _finalize(writer: Writer, task: Task) -> Outcome:
-    """Finalize a chunk with all it holds, unless images of it are still to come."""
-    written = writer.written(task.chunk)
-    if written.issuperset(task.indices):
-        writer.finalize(task.chunk, sorted(written))
-    return Outcome(task)

@@ -7,15 +7,15 @@ frames of a data set, e.g. YCB-Video's ``data_syn``, count as virtual.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from jaxtyping import Int
 
 from dopepp.core.errors import UserError
-from dopepp.data.rng import Purpose, item_rng
-from dopepp.data.sample import DescribedSource, Sample, SourceInfo
+from dopepp.data.sample import DescribedSource, Purpose, Sample, SourceInfo, item_rng
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +23,8 @@ REAL: Final = 0
 VIRTUAL: Final = 1
 SYNTHETIC: Final = 2
 _ROLES: Final = ("real", "virtual", "synthetic")
+
+Order = Int[np.ndarray, " items"]
 
 
 def _shares(
@@ -33,15 +35,6 @@ def _shares(
     real_share = (real_fraction if virtual or synthetic else 1.0) if real else 0.0
     synthetic_part = (synthetic_fraction if virtual else 1.0) if synthetic else 0.0
     return [real_share, (1 - real_share) * (1 - synthetic_part), (1 - real_share) * synthetic_part]
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Which source each item of an epoch comes from, and its rank among that source's items."""
-
-    epoch: int
-    roles: Int[np.ndarray, " items"]
-    ranks: Int[np.ndarray, " items"]
 
 
 class HybridSource:
@@ -56,9 +49,6 @@ class HybridSource:
         real: Real camera frames; without them the real share is 0.
         real_fraction: Share of ``real``, in [0, 1].
         synthetic_fraction: Share of ``synthetic`` in what is not real, in [0, 1].
-
-    Raises:
-        UserError: No source at all, a fraction outside [0, 1], or no item in an epoch.
     """
 
     def __init__(
@@ -72,16 +62,6 @@ class HybridSource:
         synthetic_fraction: float = 0.0,
         name: str = "hybrid",
     ) -> None:
-        for option, value in (
-            ("real_fraction", real_fraction),
-            ("synthetic_fraction", synthetic_fraction),
-        ):
-            if not 0.0 <= value <= 1.0:
-                raise UserError(f"data.{option}={value}", "a share in [0, 1]", "correct the option")
-        if samples_per_epoch < 1:
-            raise UserError(
-                f"data.samples_per_epoch={samples_per_epoch}", "at least 1", "correct the option"
-            )
         self._sources = (real, virtual, synthetic)
         present = tuple(source is not None for source in self._sources)
         if not any(present):
@@ -95,8 +75,9 @@ class HybridSource:
             num_synthetic = samples_per_epoch - num_real
         self.counts = (num_real, samples_per_epoch - num_real - num_synthetic, num_synthetic)
         self.name, self._seed, self._length = name, seed, samples_per_epoch
-        self._plan: _Plan | None = None
-        self._orders: dict[tuple[int, int], Int[np.ndarray, " items"]] = {}
+        self._plan = lru_cache(1)(self._make_plan)
+        # An epoch may straddle two cycles of a source; older ones are not needed again.
+        self._order = lru_cache(2 * len(_ROLES))(self._make_order)
 
     def __len__(self) -> int:
         return self._length
@@ -110,34 +91,25 @@ class HybridSource:
 
     def locate(self, index: int, epoch: int) -> tuple[int, int, int]:
         """Return (role, the source's epoch, the source's index) of an item."""
-        plan = self._epoch_plan(epoch)
-        role = int(plan.roles[index])
-        position = epoch * self.counts[role] + int(plan.ranks[index])
+        roles, ranks = self._plan(epoch)
+        role = int(roles[index])
+        position = epoch * self.counts[role] + int(ranks[index])
         source = self._sources[role]
         assert source is not None
         cycle, place = divmod(position, len(source))
         return role, cycle, int(self._order(role, cycle, len(source))[place])
 
-    def _epoch_plan(self, epoch: int) -> _Plan:
-        if self._plan is None or self._plan.epoch != epoch:
-            roles = np.repeat(np.arange(len(_ROLES)), self.counts)
-            roles = item_rng(self._seed, Purpose.MIX, epoch).permutation(roles)
-            ranks = np.empty_like(roles)
-            for role, count in enumerate(self.counts):
-                ranks[roles == role] = np.arange(count)
-            self._plan = _Plan(epoch, roles, ranks)
-        return self._plan
+    def _make_plan(self, epoch: int) -> tuple[Order, Order]:
+        """Return each item's source and its rank among that source's items."""
+        roles = np.repeat(np.arange(len(_ROLES)), self.counts)
+        roles = item_rng(self._seed, Purpose.MIX, epoch).permutation(roles)
+        ranks = np.empty_like(roles)
+        for role, count in enumerate(self.counts):
+            ranks[roles == role] = np.arange(count)
+        return roles, ranks
 
-    def _order(self, role: int, cycle: int, length: int) -> Int[np.ndarray, " items"]:
-        key = (role, cycle)
-        if key not in self._orders:
-            # An epoch may straddle two cycles of a source; older ones are not needed again.
-            self._orders = {
-                k: v for k, v in self._orders.items() if k[0] != role or k[1] == cycle - 1
-            }
-            rng = item_rng(self._seed, Purpose.CYCLE, cycle, role)
-            self._orders[key] = rng.permutation(length)
-        return self._orders[key]
+    def _make_order(self, role: int, cycle: int, length: int) -> Order:
+        return item_rng(self._seed, Purpose.CYCLE, cycle, role).permutation(length)
 
     def contains(self, label: str) -> bool:
         """Tell whether any source that has a share holds this object."""

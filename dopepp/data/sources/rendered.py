@@ -1,17 +1,29 @@
-"""Virtual images as a source: every item is rendered when it is asked for.
+"""Virtual images as a source: rendered when they are asked for, or once and then kept.
 
 Training, validation and test are three disjoint index ranges of one factory, so no image is ever in
-two of them. Only training images change with the epoch.
+two of them. Only training images change with the epoch; those that are kept are of epoch 0, and
+masking and augmentation, which come after, still differ from epoch to epoch.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from typing import Final, Literal
+import mmap
+import os
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
+from jaxtyping import Shaped
 
-from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_whole
+from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo, resize_sample
+from dopepp.drawing.pictures import Shape, Size
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
@@ -29,9 +41,6 @@ class RenderedSource:
         split: Which of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
         scale: How many times as large the parts appear: the camera of the same scenes, moved (see
             :mod:`dopepp.virtual.arrange.random_scene`).
-
-    Raises:
-        ValueError: ``num_items`` is not in 1 … 10⁹, or ``scale`` is not positive and finite.
     """
 
     def __init__(
@@ -42,8 +51,6 @@ class RenderedSource:
         name: str = "virtual",
         scale: float = 1.0,
     ) -> None:
-        if not 1 <= num_items <= MAX_ITEMS:
-            raise ValueError(f"num_items must be in 1 … {MAX_ITEMS}, got {num_items}")
         if not 0 < scale < math.inf:
             raise ValueError(f"scale must be positive and finite, got {scale}")
         self.factory, self.split, self.name, self.scale = factory, split, name, scale
@@ -97,3 +104,212 @@ def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
         for number in scene.targets
     ]
     return Sample(rendered.image, scene.K, instances, rendered.depth, source, key)
+
+
+_TEXT_LENGTH: Final = 64
+_MAX_INSTANCES: Final = 16
+"""Masks are kept as one uint8 map: 0 for the background, i + 1 for instance i."""
+
+_FILLED: Final = 1 << 32
+"""Added to a slot's CRC-32, which may be 0, so that only an empty slot has the checksum 0."""
+
+
+def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
+    """Return zeros that forked processes share; they take memory only where they are written."""
+    return np.frombuffer(mmap.mmap(-1, dtype.itemsize * num_items), dtype)
+
+
+def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
+    """Map a file that is there, or else a new one of zeros, into memory."""
+    # All of its disk space is taken now: a disk that is full now is an error that can be told, and
+    # one that becomes full under a map with holes kills the process.
+    size = dtype.itemsize * num_items
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_file() or path.stat().st_size != size:
+            partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+            try:
+                with partial.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+        with path.open("r+b") as file:
+            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
+    except OSError as error:
+        raise UserError(
+            f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}",
+            "a folder with as much free space",
+            "set data.cache_dir to another disk, or data.cache=none",
+        ) from error
+
+
+class CachedSource:
+    """A source that keeps another one's items of epoch 0, resized to the network's input size.
+
+    It is one array with a slot for every item, in memory or in a file. Loader workers are forked
+    and share it: what one of them renders, all can read. A file outlasts the run: later runs, and
+    runs at the same time, read what is in it and fill what is not.
+
+    Whoever asks for an item first renders it and fills its slot: the content, then the content's
+    checksum. A slot counts as filled where its checksum is right, so one that was left half written
+    (a kill, a power cut) is filled again. No lock is needed: an item is a pure function of its
+    index, so two processes that fill one slot at once write the same bytes.
+
+    Args:
+        input_size: (width, height) the images are shrunk to fit in, so no more than that is kept;
+            None keeps size and depth, which training does not need.
+        folder: Where to keep them across runs; None keeps them in memory, for this run. Each cache
+            has a subfolder, named by a hash of everything that decides the items.
+        identity: What decides them beside the source's own description, e.g. the version of the
+            code that renders them: items of another version are never read.
+
+    Raises:
+        UserError: The cache would take more than half of the machine's memory, or there is no room
+            in the folder.
+    """
+
+    def __init__(
+        self,
+        source: DescribedSource,
+        input_size: Size | None,
+        folder: Path | None = None,
+        identity: str = "",
+    ) -> None:
+        self._source, self._input_size, self.name = source, input_size, source.name
+        first = self._resized(0)
+        self._source_name = first.source
+        self._shape, self._has_depth = first.image.shape[:2], first.depth is not None
+        slot = _slot(self._shape, self._has_depth)
+        self.num_bytes = slot.itemsize * len(source)
+        self.folder = None
+        if folder is None:
+            _check_memory(self.num_bytes, len(source), source.name)
+            self._slots = _in_memory(slot, len(source))
+            self._checksums = _in_memory(np.dtype("u8"), len(source))
+        else:
+            described = [[info.name, info.num_images, info.identity] for info in source.describe()]
+            record = {"items": described, "identity": identity, "slot": str(slot.descr)}
+            text = json.dumps(record, sort_keys=True, indent=1)
+            self.folder = folder / hashlib.sha256(text.encode()).hexdigest()[:24]
+            self._slots = _in_file(self.folder / "slots.bin", slot, len(source))
+            self._checksums = _in_file(self.folder / "checksums.bin", np.dtype("u8"), len(source))
+            write_whole(self.folder / "identity.json", text.encode())
+        self._store(0, first)
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return a copy of item ``index``; the epoch is ignored."""
+        checksum = self._checksums[index]
+        if not checksum or checksum != self._checksum(index):
+            self._store(index, self._resized(index))
+        return self._load(index)
+
+    def contains(self, label: str) -> bool:
+        """Tell what the kept source tells."""
+        return self._source.contains(label)
+
+    def describe(self) -> list[SourceInfo]:
+        """Return what the kept source describes, marked as cached: its epochs are all the same."""
+        return [
+            replace(info, identity={**info.identity, "cached": True})
+            for info in self._source.describe()
+        ]
+
+    def _resized(self, index: int) -> Sample:
+        sample = self._source.sample(index, 0)
+        if self._input_size is None:
+            return sample
+        return replace(resize_sample(sample, self._input_size), depth=None)
+
+    def _checksum(self, index: int) -> int:
+        return zlib.crc32(self._slots[index : index + 1].view("u1").data) | _FILLED
+
+    def _store(self, index: int, sample: Sample) -> None:
+        self._check(sample)
+        slot = self._slots[index]
+        slot["image"], slot["K"], slot["key"] = sample.image, sample.K, sample.key
+        labels = np.zeros(sample.image.shape[:2], np.uint8)
+        for number, instance in enumerate(sample.instances):
+            record = slot["instances"][number]
+            for name in ("T_cam_obj", "keypoints", "visible_fraction", "label"):
+                record[name] = getattr(instance, name)
+            record["has_mask"] = instance.mask is not None
+            if instance.mask is not None:
+                labels[instance.mask] = number + 1
+        slot["labels"], slot["num_instances"] = labels, len(sample.instances)
+        if sample.depth is not None:
+            slot["depth"] = sample.depth
+        self._checksums[index] = self._checksum(index)
+
+    def _check(self, sample: Sample) -> None:
+        """Refuse what a slot would cut off or mix up without a word."""
+        if len(sample.instances) > _MAX_INSTANCES:
+            raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
+        if (sample.image.shape[:2], sample.source, sample.depth is not None) != (
+            self._shape, self._source_name, self._has_depth,
+        ):  # fmt: skip
+            raise ValueError(
+                f"a {sample.size} image of {sample.source}; a cache keeps one size and one source, "
+                "and depth of all or none"
+            )
+        texts = [sample.key, *(instance.label for instance in sample.instances)]
+        if max(map(len, texts)) > _TEXT_LENGTH:
+            raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")
+
+    def _load(self, index: int) -> Sample:
+        slot = self._slots[index]
+        instances = [
+            Instance(
+                label=str(record["label"]),
+                T_cam_obj=record["T_cam_obj"].copy(),
+                keypoints=record["keypoints"].copy(),
+                visible_fraction=float(record["visible_fraction"]),
+                mask=slot["labels"] == number + 1 if record["has_mask"] else None,
+            )
+            for number, record in enumerate(slot["instances"][: slot["num_instances"]])
+        ]
+        return Sample(
+            slot["image"].copy(),
+            slot["K"].copy(),
+            instances,
+            slot["depth"].copy() if self._has_depth else None,
+            source=self._source_name,
+            key=str(slot["key"]),
+        )
+
+
+def _slot(shape: Shape, has_depth: bool) -> np.dtype[Any]:
+    """Return the layout of one kept sample."""
+    instance = np.dtype(
+        [
+            ("T_cam_obj", "f8", (4, 4)),
+            ("keypoints", "f8", (9, 2)),
+            ("visible_fraction", "f8"),
+            ("has_mask", "?"),
+            ("label", f"U{_TEXT_LENGTH}"),
+        ]
+    )
+    return np.dtype(
+        [
+            ("image", "u1", (*shape, 3)),
+            ("labels", "u1", shape),
+            ("K", "f8", (3, 3)),
+            ("key", f"U{_TEXT_LENGTH}"),
+            ("num_instances", "i4"),
+            ("instances", instance, (_MAX_INSTANCES,)),
+            *([("depth", "f4", shape)] if has_depth else []),
+        ]
+    )
+
+
+def _check_memory(num_bytes: int, num_items: int, source: str) -> None:
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if num_bytes > available / 2:
+        raise UserError(
+            f"data.cache=memory for {num_items} images of {source}: {num_bytes / 1e9:.1f} GB",
+            f"at most half of this machine's {available / 1e9:.1f} GB",
+            "set data.cache=none or disk, a smaller input size or fewer samples per epoch",
+        )

@@ -25,6 +25,12 @@ _YIQ = np.array([_LUMA, [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
 _RGB = np.linalg.inv(_YIQ)
 
 
+def _fits(name: str, value: float | Range) -> bool:
+    """Tell whether a range ascends from 0, or a probability or the largest change can be one."""
+    low, high = (0, value) if isinstance(value, (int, float)) else value
+    return 0 <= low <= high and (high <= 1 or not name.endswith("_probability"))
+
+
 class Photometric:
     """Random photometric changes, each drawn from the item's own generator.
 
@@ -35,10 +41,6 @@ class Photometric:
         colour_gain: Largest relative change of each colour channel (white balance).
         blur_sigma: Range of its sigma, pixels.
         noise_sigma: Range of its standard deviation, grey levels.
-
-    Raises:
-        ValueError: A range is negative or its ends are exchanged, or a probability is outside
-            [0, 1].
     """
 
     def __init__(
@@ -55,24 +57,14 @@ class Photometric:
         jpeg_probability: float = 0.1,
         jpeg_quality: Range = (40, 95),
     ) -> None:
-        ranges = {
-            "blur_sigma": blur_sigma,
-            "noise_sigma": noise_sigma,
-            "jpeg_quality": jpeg_quality,
-        }
-        changes = {"brightness": brightness, "contrast": contrast, "saturation": saturation}
-        changes |= {"hue": hue, "colour_gain": colour_gain}
-        chances = {"blur": blur_probability, "noise": noise_probability, "jpeg": jpeg_probability}
-        bad = [f"{k}={v}" for k, v in ranges.items() if not 0 <= v[0] <= v[1]]
-        bad += [f"{k}={v}" for k, v in changes.items() if v < 0]
-        bad += [f"{k}_probability={v}" for k, v in chances.items() if not 0 <= v <= 1]
-        if bad:
-            raise ValueError(f"not an allowed range or probability: {', '.join(bad)}")
         self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
         self.hue, self.colour_gain = hue, colour_gain
         self.blur_probability, self.blur_sigma = blur_probability, blur_sigma
         self.noise_probability, self.noise_sigma = noise_probability, noise_sigma
         self.jpeg_probability, self.jpeg_quality = jpeg_probability, jpeg_quality
+        bad = [f"{name}={value}" for name, value in vars(self).items() if not _fits(name, value)]
+        if bad:
+            raise ValueError(f"not an allowed range or probability: {', '.join(bad)}")
 
     def __call__(self, image: Picture, rng: Generator) -> Picture:
         """Return a changed copy of an RGB image."""

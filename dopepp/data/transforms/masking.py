@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from numpy.random import Generator
 
 from dopepp.data.sample import Instance, Sample, silhouette
-from dopepp.drawing.pictures import Mask, Picture, Shape, Size
+from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.virtual.backgrounds import Backgrounds
 
 MIN_PATCH_PX: Final = 2
@@ -132,11 +132,15 @@ def has_contrast(crop: Picture, min_contrast: float) -> bool:
     return float(crop.reshape(-1, 3).std(axis=0).max()) >= min_contrast
 
 
-def covered_instance(instance: Instance, seen: Mask, covered: Mask) -> Instance:
-    """Return an instance without the covered pixels; keypoints and pose stay as they are.
+def covered_instances(
+    instances: Sequence[Instance], silhouettes: Sequence[Mask], covered: Mask
+) -> list[Instance]:
+    """Return an image's instances without its covered pixels; keypoints and poses stay."""
+    pairs = zip(instances, silhouettes, strict=True)
+    return [_covered(instance, seen, covered) for instance, seen in pairs]
 
-    ``seen`` is its silhouette before, ``covered`` are all covered pixels of the image.
-    """
+
+def _covered(instance: Instance, seen: Mask, covered: Mask) -> Instance:
     before = int(np.count_nonzero(seen))
     if before == 0:
         return instance
@@ -159,9 +163,6 @@ class RandomMask:
             this many grey levels.
         max_draws: Crops drawn from each picture until one is not solid; an instance for which even
             the other picture gives none stays uncovered, with ``masked_fraction`` 0.
-
-    Raises:
-        ValueError: A share or the probability is outside [0, 1].
     """
 
     def __init__(
@@ -201,10 +202,7 @@ class RandomMask:
             if crop is not None:
                 rows, columns = map(_middle, patch, crop.shape)
                 image[rows, columns], covered[rows, columns] = crop, True
-        instances = [
-            covered_instance(instance, seen, covered)
-            for instance, seen in zip(sample.instances, silhouettes, strict=True)
-        ]
+        instances = covered_instances(sample.instances, silhouettes, covered)
         return replace(sample, image=image, instances=instances)
 
     def _patch(self, seen: Mask, rng: Generator) -> tuple[slice, slice] | None:
@@ -229,8 +227,12 @@ class RandomMask:
         crop = crops.largest(size, rng)
         if crop is not None:
             return crop
+        height, width = crops.image.shape[:2]
         for _ in range(self.max_draws):
-            crop = _crop_of_other(other, crops.image.shape[:2], size, rng)
+            picture = other.draw(rng, width, height)
+            row = int(rng.integers(0, height - size[0] + 1))
+            column = int(rng.integers(0, width - size[1] + 1))
+            crop = picture[row : row + size[0], column : column + size[1]]
             if has_contrast(crop, self.min_contrast):
                 return crop
         return None
@@ -244,11 +246,3 @@ def _middle(patch: slice, length: int) -> slice:
     """Return the middle of a patch's rows or columns."""
     start = patch.start + (_length(patch) - length) // 2
     return slice(start, start + length)
-
-
-def _crop_of_other(other: Backgrounds, shape: Shape, size: Size, rng: Generator) -> Picture:
-    """Crop (height, width) from another picture of the image's (height, width)."""
-    picture = other.draw(rng, shape[1], shape[0])
-    row = int(rng.integers(0, shape[0] - size[0] + 1))
-    column = int(rng.integers(0, shape[1] - size[1] + 1))
-    return np.asarray(picture[row : row + size[0], column : column + size[1]])

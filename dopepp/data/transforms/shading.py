@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy.random import Generator
 
-from dopepp.data.rng import Purpose, item_rng
-from dopepp.data.sample import Instance, Sample, silhouette
-from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instance
+from dopepp.data.sample import Instance, Purpose, Sample, item_rng, silhouette
+from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instances
 from dopepp.drawing.pictures import Mask, Picture
 
 TOLERANCE: Final = 0.02
@@ -58,9 +57,6 @@ def shade(sample: Sample, shares: Sequence[float], seed: int, index: int) -> lis
 
     ``shares`` are of the visible pixels of each instance, each in [0, 1]: an image depends on its
     own share alone, not on the others asked for. ``index`` is its place in the test set.
-
-    Raises:
-        ValueError: A share is outside [0, 1].
     """
     if not all(0 <= share <= 1 for share in shares):
         raise ValueError(f"shares must be in [0, 1], got {list(shares)}")
@@ -93,10 +89,7 @@ def _shaded(
         laid = cover.laid(share)
         image[cover.box][laid] = cover.pixels[laid]
         covered[cover.box] |= laid
-    instances = [
-        covered_instance(instance, seen, covered)
-        for instance, seen in zip(sample.instances, silhouettes, strict=True)
-    ]
+    instances = covered_instances(sample.instances, silhouettes, covered)
     depth = None if sample.depth is None else np.where(covered, np.float32(0), sample.depth)
     return Shaded(
         share,

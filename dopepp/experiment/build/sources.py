@@ -24,9 +24,8 @@ from dopepp.data.formats.ycb_video.frame import read_classes, read_image_set
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
-from dopepp.data.sources.cache import CachedSource
 from dopepp.data.sources.hybrid import HybridSource
-from dopepp.data.sources.rendered import RenderedSource, Split
+from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
 from dopepp.experiment.config.data import Cache, DataConfig
 from dopepp.geometry.camera import Letterbox

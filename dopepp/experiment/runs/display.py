@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from rich.tree import Tree
 
-from dopepp.data.datamodule import SourceRow
+from dopepp.data.sample import SourceInfo
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import header_of
 from dopepp.experiment.tuning import Tuning
@@ -39,13 +39,14 @@ def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
             tree.add(f"{key}: {value!r}", style="default")
 
 
-def show_sources(rows: Sequence[SourceRow]) -> None:
-    """Print where the images come from and how many each source gives."""
+def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
+    """Print where the images of each split come from and how many each source gives."""
     table = Table("split", "source", "images", "per epoch", "instances", title="data")
-    for row in rows:
-        instances = ", ".join(f"{name} {count:,}" for name, count in row.num_instances.items())
-        counts = (f"{row.num_images:,}", f"{row.num_per_epoch:,}")
-        table.add_row(row.split, row.source, *counts, instances or "in every render")
+    for split, info in sources:
+        instances = ", ".join(f"{name} {count:,}" for name, count in info.num_instances.items())
+        per_epoch = info.num_images if info.num_per_epoch is None else info.num_per_epoch
+        counts = (f"{info.num_images:,}", f"{per_epoch:,}")
+        table.add_row(split, info.name, *counts, instances or "in every render")
     console.print(table)
 
 

@@ -24,8 +24,8 @@ def test_written_sets_are_clean(tmp_path, parts, samples, writer_class, write_se
 def test_data_sets_are_read_written_and_checked_without_torch(tmp_path):
     modules = (
         "check", "formats.bop.source", "formats.bop.writer", "formats.ndds.source",
-        "formats.ndds.writer", "formats.ycb_video.source", "sources.hybrid", "sources.cache",
-        "sources.rendered", "transforms.masking", "transforms.augment",
+        "formats.ndds.writer", "formats.ycb_video.source", "sources.hybrid", "sources.rendered",
+        "transforms.masking", "transforms.augment",
     )  # fmt: skip
     code = (
         f"import sys, {', '.join(f'dopepp.data.{name}' for name in modules)}\n"

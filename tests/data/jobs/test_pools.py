@@ -10,8 +10,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.core.interrupts import StoppedError
-from dopepp.data.jobs.folder import begin
-from dopepp.data.jobs.job import WRITERS
+from dopepp.data.jobs.job import WRITERS, begin
 from dopepp.data.jobs.pools import ClusterPool, ProcessPool
 from dopepp.data.jobs.render_dataset import render_dataset
 from dopepp.data.jobs.work import Shard, Task

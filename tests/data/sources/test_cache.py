@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.data.sample import Sample
-from dopepp.data.sources.cache import CachedSource
-from dopepp.data.transforms.resize import resize_sample
+from dopepp.data.sample import Sample, resize_sample
+from dopepp.data.sources import rendered
+from dopepp.data.sources.rendered import CachedSource
 
 
 def assert_same(first: Sample, second: Sample) -> None:
@@ -85,13 +85,12 @@ def test_forked_processes_fill_one_cache(fake_source):
     assert source.calls == [(0, 0)]  # this process rendered the first item only
 
 
-def test_too_large_and_too_many_instances(fake_source):
+def test_too_large_and_too_many_instances(fake_source, monkeypatch):
     with pytest.raises(UserError, match=r"data\.cache=memory.*set data\.cache=none"):
         CachedSource(fake_source(num_items=10**9), (64, 64))
-    with pytest.raises(ValueError, match="max_instances=0"):
-        CachedSource(fake_source(), (64, 64), max_instances=0)
-    with pytest.raises(ValueError, match="max_instances=256"):
-        CachedSource(fake_source(), (64, 64), max_instances=256)
+    monkeypatch.setattr(rendered, "_MAX_INSTANCES", 0)
+    with pytest.raises(ValueError, match="1 instances; at most 0"):
+        CachedSource(fake_source(), (64, 64))
 
 
 def test_what_does_not_fit_a_slot_is_refused(fake_source):

@@ -60,8 +60,6 @@ def test_bounds_description_and_objects(factory):
     source = RenderedSource(factory, 3)
     with pytest.raises(IndexError, match="item 3 of 3"):
         source.sample(3)
-    with pytest.raises(ValueError, match="num_items"):
-        RenderedSource(factory, 0)
     assert source.contains(servoholder().name)
     assert not source.contains(pivconnector().name)
     (info,) = source.describe()

@@ -23,7 +23,10 @@ from dopepp.metrics.row import shown_columns
 def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
     """(split, source) to (images, images per epoch)."""
     module = build_datamodule(data, build_parts(data), seed=0)
-    return {(r.split, r.source): (r.num_images, r.num_per_epoch) for r in module.summary()}
+    return {
+        (split, info.name): (info.num_images, info.num_per_epoch or info.num_images)
+        for split, info in module.summary()
+    }
 
 
 def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):

@@ -12,17 +12,10 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.data.formats import STAGING, staged_items
-from dopepp.data.formats.bop.check_image import Models, Silhouettes, check_image, load_models
+from dopepp.data.formats.bop import records as bop
+from dopepp.data.formats.bop.check_image import Models, ReadMask, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
-from dopepp.data.formats.bop.scene import (
-    DEPTH_SUFFIXES,
-    IMAGE_FOLDERS,
-    IMAGE_SUFFIXES,
-    image_files,
-    is_number,
-    read_records,
-)
-from dopepp.data.formats.problems import CheckReport, picture_shape
+from dopepp.data.formats.problems import CheckReport, Place, picture_shape
 from dopepp.drawing.pictures import Mask, Shape
 
 _SCENE_FILES: Final = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
@@ -62,16 +55,14 @@ class _Scene:
         self._camera_path, self._truth_path, self._info_path = (
             folder / name for name in _SCENE_FILES
         )
-        self._pictures = self._files(IMAGE_FOLDERS, IMAGE_SUFFIXES)
-        self._depths = self._files(("depth",), DEPTH_SUFFIXES)
+        self._pictures = self._files(bop.IMAGE_FOLDERS, bop.IMAGE_SUFFIXES)
+        self._depths = self._files(("depth",), bop.DEPTH_SUFFIXES)
         self._masks = {name: self._mask_files(name) for name in _MASKS}
-        self._records = read_records(folder, report)
+        self._records = bop.read_records(folder, report)
 
     def check(self) -> None:
         self._tell_missing_truth()
-        cameras, truths, infos = (
-            self._records.cameras, self._records.truths, self._records.infos,
-        )  # fmt: skip
+        cameras, truths, infos = self._records
         images = sorted(cameras.keys() | self._pictures.keys() | truths.keys())
         for image in images:
             # A file that cannot be read is one defect, not one for every image.
@@ -98,29 +89,28 @@ class _Scene:
     def _check_image(self, image: int) -> None:
         report, folder, records = self._report, self._folder, self._records
         picture_path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
-        shape = picture_shape(report, picture_path)
+        shape = picture_shape(Place(report, picture_path))
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
-            one_channel_of(report, path, shape, modes=DEPTH_MODES)
+            one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)
         truths = records.truths.get(image, [])
 
-        def place(what: str, number: int) -> tuple[Path, str]:
-            field = f"{image}" if what == "camera" else f"{image}[{number}]"
-            return folder / f"scene_{what}.json", field
+        def places(what: str, number: int) -> Place:
+            place = Place(report, folder / f"scene_{what}.json")[f"{image}"]
+            return place if what == "camera" else place[number]
 
         check_image(
-            report,
-            place,
+            places,
             records.cameras.get(image),
             truths,
             records.infos.get(image, [None] * len(truths)),
             shape,
             bool(self._depths),
             self._models,
-            self._silhouettes(image, len(truths), shape),
+            self._read_mask(image, len(truths), shape),
         )
 
-    def _silhouettes(self, image: int, count: int, shape: Shape | None) -> Silhouettes:
+    def _read_mask(self, image: int, count: int, shape: Shape | None) -> ReadMask:
         """Read an image's masks one by one; those of objects that are not there are defects."""
         files = {name: found.get(image, {}) for name, found in self._masks.items()}
         for found in files.values():
@@ -132,18 +122,18 @@ class _Scene:
             if not self._masks[name]:
                 return None
             path = files[name].get(number, self._folder / name / f"{image:06d}_{number:06d}.png")
-            mask = one_channel_of(self._report, path, shape)
+            mask = one_channel_of(Place(self._report, path), shape)
             return None if mask is None else mask != 0
 
-        return Silhouettes(lambda n: read("mask", n), lambda n: read("mask_visib", n))
+        return read
 
     def _files(self, folders: tuple[str, ...], suffixes: tuple[str, ...]) -> dict[int, Path]:
         """Find numbered images; others beside them are defects."""
-        found = image_files(self._folder, folders, suffixes, self._report)
+        found = bop.image_files(self._folder, folders, suffixes, self._report)
         for folder in {path.parent for path in found.values()}:
             for path in sorted(folder.iterdir()):
                 hidden = path.name.startswith(".")
-                if path.suffix.lower() in suffixes and not hidden and not is_number(path.stem):
+                if path.suffix.lower() in suffixes and not hidden and not bop.is_number(path.stem):
                     self._report.report(path, "file", "no image's number")
         return found
 

@@ -6,14 +6,13 @@ Masks in BOP-WebDataset are run lengths down the columns, as COCO's uncompressed
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dopepp.data.formats.problems import STRICT, Problems, mapping, one_channel, picture
+from dopepp.data.formats.problems import STRICT, Place, mapping, one_channel, picture
 from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
@@ -28,13 +27,13 @@ _MAX_UNITS: Final = 65_535
 def decode_rgb(content: bytes, where: str) -> Picture:
     """Read a colour or grey image as RGB; an alpha channel is dropped.
 
-    Raises:
-        UserError: It is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
+    A UserError: it is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
     """
-    image = picture(STRICT, where, content)
+    place = Place(STRICT, where)
+    image = picture(place, content)
     assert image is not None
     if image.mode not in ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr"):
-        STRICT.report(where, "image", f"pixels of type {image.mode}", "colour or grey of 8 bits")
+        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
     return np.array(image.convert("RGB"))
 
 
@@ -42,50 +41,43 @@ def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -
     """Read a depth image as metres, float32, 0 where unknown.
 
     ``depth_scale`` is millimetres a unit, NaN where it is not stated; ``shape`` the colour image's.
-
-    Raises:
-        UserError: As :func:`decode_rgb`, or it is of another size, has no whole numbers, or no
-            scale.
+    A UserError: as :func:`decode_rgb`, or another size, no whole numbers, or no scale.
     """
-    units = one_channel_of(STRICT, where, shape, content, DEPTH_MODES)
+    place = Place(STRICT, where)
+    units = one_channel_of(place, shape, content, DEPTH_MODES)
     assert units is not None
     if np.isnan(depth_scale):
         allowed = "depth_scale (mm a unit) beside the image's cam_K"
-        STRICT.report(where, "image", "no depth_scale", allowed)
+        place["image"].report("no depth_scale", allowed)
     return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
 
 
 def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
     """Read a mask of an image of ``shape`` (height, width); every pixel but 0 is the object's.
 
-    Raises:
-        UserError: As :func:`decode_rgb`, or it is of another size or has several channels.
+    A UserError: as :func:`decode_rgb`, or it is of another size or has several channels.
     """
-    mask = one_channel_of(STRICT, where, shape, content)
+    mask = one_channel_of(Place(STRICT, where), shape, content)
     assert mask is not None
     return np.asarray(mask != 0)
 
 
 def one_channel_of(
-    problems: Problems,
-    path: Path | str,
-    shape: Shape | None,
-    content: bytes | None = None,
-    modes: tuple[str, ...] = (),
+    place: Place, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
     """Read a depth image or a mask as it is, None where that is impossible.
 
     ``content`` are its bytes, where they do not lie on the disk by themselves; ``modes`` Pillow's
     names of the pixels it may have, none for any with one channel.
     """
-    image = picture(problems, path, content)
+    image = picture(place, content)
     if image is None:
         return None
     if len(image.getbands()) > 1 or (modes and image.mode not in modes):
         allowed = "one channel of 16-bit whole numbers" if modes else "one channel"
-        problems.report(path, "channels", f"pixels of type {image.mode}", allowed)
+        place["channels"].report(f"pixels of type {image.mode}", allowed)
         return None
-    return one_channel(problems, path, np.asarray(image), shape)
+    return one_channel(place, np.asarray(image), shape)
 
 
 def encode_png(pixels: NDArray[Any]) -> bytes:
@@ -118,14 +110,11 @@ def encode_runs(mask: Mask) -> dict[str, list[int]]:
     return {"counts": [0, *runs] if pixels.size and pixels[0] else runs, "size": list(mask.shape)}
 
 
-def decode_runs(
-    record: object, shape: Shape, path: Path | str, where: str = "", problems: Problems = STRICT
-) -> Mask | None:
+def decode_runs(record: object, shape: Shape, place: Place) -> Mask | None:
     """Read a mask of an image of ``shape`` (height, width), None where that is impossible.
 
-    It must have that size, so a file cannot ask for more memory, and its runs must fill it.
-
-    ``record`` is a plain JSON value that anybody may have written.
+    ``record`` is a JSON value that anybody may have written: it must have that size, so a file
+    cannot ask for more memory, and its runs must fill it.
     """
     fields = mapping(record)
     counts, size = fields.get("counts"), fields.get("size")
@@ -139,5 +128,5 @@ def decode_runs(
     else:
         pixels = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
         return np.asarray(pixels.reshape(shape, order="F"))
-    problems.report(path, where, got, allowed)
+    place.report(got, allowed)
     return None

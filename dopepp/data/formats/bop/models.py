@@ -10,7 +10,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,18 +22,8 @@ from numpy.typing import NDArray
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.formats.bop.images import encode_png
-from dopepp.data.formats.bop.records import MM
-from dopepp.data.formats.bop.scene import is_number
-from dopepp.data.formats.problems import (
-    STRICT,
-    Problems,
-    attempt,
-    entries,
-    load_object,
-    mapping,
-    numbers,
-    scalar,
-)
+from dopepp.data.formats.bop.records import MM, is_number
+from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
@@ -72,9 +62,6 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
     """Make parts from a BOP data set's models, with their symmetries.
 
     ``objects`` are names in the order wanted; None takes all, by number.
-
-    Raises:
-        UserError: There are no models, an object is unknown, or a file is damaged.
     """
     infos = read_models(Path(root))
     if not infos:
@@ -97,9 +84,6 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     """Return which part each BOP object number stands for.
 
     Without models in ``root``, parts must be called ``obj_000001`` as BOP's files are.
-
-    Raises:
-        UserError: A part is none of the data set's objects.
     """
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}
@@ -132,15 +116,9 @@ def _part(info: ModelInfo) -> Part:
 
 
 def read_models(root: Path) -> dict[int, ModelInfo]:
-    """Return the objects of ``models_info.json`` by number; none where there is no such file.
-
-    Raises:
-        UserError: The file is damaged, or two objects share a name.
-    """
+    """Return the objects of ``models_info.json`` by number; none where there is no such file."""
     path = info_path(root)
-    if path is None:
-        return {}
-    return parse_models(path, load_object(STRICT, path, _ALLOWED))
+    return {} if path is None else parse_models(path, Place(STRICT, path).load(_ALLOWED))
 
 
 def info_path(root: Path) -> Path | None:
@@ -151,56 +129,52 @@ def info_path(root: Path) -> Path | None:
 
 def parse_models(path: Path, records: object, problems: Problems = STRICT) -> dict[int, ModelInfo]:
     """Return the objects of what a ``models_info.json`` holds, by number."""
+    place = Place(problems, path)
     if not isinstance(records, dict):
-        problems.report(path, "top level", f"{records!r:.60}", _ALLOWED)
+        place["top level"].report(f"{records!r:.60}", _ALLOWED)
     infos: dict[int, ModelInfo] = {}
     names: set[str] = set()
     for key, record in mapping(records).items():
         if not is_number(key) or int(key) in infos:
-            problems.report(path, f"{key!r:.40}", "no object's number, or one twice", _ALLOWED)
+            place[f"{key!r:.40}"].report("no object's number, or one twice", _ALLOWED)
             continue
-        info = _info(path, key, record, problems)
+        info = _info(place[key], path.parent / f"obj_{int(key):06d}.ply", record)
         if info.name in names:
-            problems.report(path, f"{key}.name", f"{info.name!r:.60} twice", "each name once")
+            place[key]["name"].report(f"{info.name!r:.60} twice", "each name once")
         names.add(info.name)
         infos[int(key)] = info
     return dict(sorted(infos.items()))
 
 
-def _info(path: Path, key: str, record: object, problems: Problems) -> ModelInfo:
+def _info(place: Place, model: Path, record: object) -> ModelInfo:
     if not isinstance(record, dict):
-        problems.report(path, key, f"{record!r:.60}", "an object with diameter and symmetries")
+        place.report(f"{record!r:.60}", "an object with diameter and symmetries")
     fields = mapping(record)
-    model = f"obj_{int(key):06d}"
     diameter = math.nan
     if "diameter" in fields:
-        diameter = scalar(problems, path, f"{key}.diameter", fields["diameter"]) / MM
+        diameter = place["diameter"].scalar(fields["diameter"]) / MM
         if diameter <= 0:
-            got = f"{fields['diameter']!r:.40}"
-            problems.report(path, f"{key}.diameter", got, "millimetres above 0")
+            place["diameter"].report(f"{fields['diameter']!r:.40}", "millimetres above 0")
             diameter = math.nan
-    name = attempt(problems, path, f"{key}.name", lambda: check_name(fields.get("name", model)))
+    name = place["name"].attempt(lambda: check_name(fields.get("name", model.stem)))
     return ModelInfo(
-        name or model,
-        path.parent / f"{model}.ply",
+        name or model.stem,
+        model,
         diameter,
-        _discrete(problems, path, f"{key}.symmetries_discrete", fields),
-        _continuous(problems, path, f"{key}.symmetries_continuous", fields),
+        _discrete(place["symmetries_discrete"], fields.get("symmetries_discrete")),
+        _continuous(place["symmetries_continuous"], fields.get("symmetries_continuous")),
     )
 
 
-def _discrete(
-    problems: Problems, path: Path, where: str, fields: Mapping[str, object]
-) -> Float[np.ndarray, "symmetries 4 4"] | None:
+def _discrete(place: Place, value: object) -> Float[np.ndarray, "symmetries 4 4"] | None:
     transforms = []
-    for place, row in enumerate(_rows(problems, path, where, fields.get("symmetries_discrete"))):
-        matrix = numbers(problems, path, f"{where}[{place}]", row, 4, 4)
+    for number, row in enumerate(_rows(place, value)):
+        matrix = place[number].numbers(row, 4, 4)
         problem = rotation_problem(matrix[:3, :3])
         if problem is not None or (matrix[3] != [0, 0, 0, 1]).any():
             got = problem or f"a last row of {matrix[3].tolist()}"
             if np.isfinite(matrix).all():
-                allowed = "rigid transforms [R t; 0 0 0 1], row by row"
-                problems.report(path, f"{where}[{place}]", got, allowed)
+                place[number].report(got, "rigid transforms [R t; 0 0 0 1], row by row")
             continue
         matrix[:3, 3] /= MM
         if not np.allclose(matrix, np.eye(4), atol=1e-9):
@@ -209,44 +183,41 @@ def _discrete(
 
 
 def _continuous(
-    problems: Problems, path: Path, where: str, fields: Mapping[str, object]
+    place: Place, value: object
 ) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
     pairs = []
-    rows = _rows(problems, path, where, fields.get("symmetries_continuous"))
-    for place, row in enumerate(entries(problems, path, where, rows)):
-        start = f"{where}[{place}]"
+    for number, row in enumerate(place.entries(_rows(place, value))):
         axis, offset = (
-            numbers(problems, path, f"{start}.{name}", row.get(name), 3)
-            for name in ("axis", "offset")
+            place[number][name].numbers(row.get(name), 3) for name in ("axis", "offset")
         )
         if not axis.any():
-            problems.report(path, f"{start}.axis", "zero", "an axis other than 0")
+            place[number]["axis"].report("zero", "an axis other than 0")
         pairs.append((tuple(axis.tolist()), tuple((offset / MM).tolist())))
     return tuple(pairs)
 
 
-def _rows(problems: Problems, path: Path, where: str, value: object) -> list[Any]:
+def _rows(place: Place, value: object) -> list[Any]:
     if value is None:
         return []
     if isinstance(value, list) and len(value) <= MAX_SYMMETRIES:
         return value
-    problems.report(path, where, f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
+    place.report(f"{value!r:.60}", f"a list of at most {MAX_SYMMETRIES}")
     return []
 
 
 def write_models(root: Path, parts: Sequence[Part]) -> None:
     """Write the parts as objects 1, 2, …; ``models_info.json`` last, as the sign that all is there.
 
-    Raises:
-        UserError: A part has no mesh, or the folder holds models of other parts.
+    A UserError: a part has no mesh, or the folder holds models of other parts.
     """
-    meshes = [part.mesh for part in parts]
+    meshes = []
     for part in parts:
         if part.mesh is None:
             raise UserError(
                 f"part {part.name} without a mesh", "parts that were read from a mesh file",
                 "give the part's mesh file",
             )  # fmt: skip
+        meshes.append(part.mesh)
     folder = root / MODEL_FOLDERS[0]
     entries = {str(number): model_info(part) for number, part in enumerate(parts, start=1)}
     content = (json.dumps(entries, indent=2, ensure_ascii=False) + "\n").encode()
@@ -259,11 +230,10 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
             )  # fmt: skip
         return
     for number, mesh in enumerate(meshes, start=1):
-        assert mesh is not None
-        texture = f"obj_{number:06d}.png" if mesh.texture is not None else None
-        write_whole(folder / f"obj_{number:06d}.ply", ply_bytes(mesh, texture))
-        if texture is not None and mesh.texture is not None:
-            write_whole(folder / texture, encode_png(mesh.texture))
+        model, texture = folder / f"obj_{number:06d}.ply", folder / f"obj_{number:06d}.png"
+        write_whole(model, ply_bytes(mesh, None if mesh.texture is None else texture.name))
+        if mesh.texture is not None:
+            write_whole(texture, encode_png(mesh.texture))
     write_whole(path, content)
 
 

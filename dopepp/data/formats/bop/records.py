@@ -6,21 +6,32 @@ with one goes to the :class:`~dopepp.data.formats.problems.Problems` and leaves 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dopepp.data.formats.problems import FARTHEST, STRICT, Problems, mapping, numbers
+from dopepp.data.formats.problems import FARTHEST, STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.data.sample import Instance, hull_areas
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
+
+MAX_SCENE_BYTES: Final = 128_000_000
+"""Of one JSON file: 40,000 images with ten objects each."""
+
+IMAGE_FOLDERS: Final = ("rgb", "gray")
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
 MM: Final = 1000.0
 """Millimetres per metre."""
@@ -32,8 +43,8 @@ ESTIMATED: Final = (
 
 Record = Mapping[str, Any]
 
-Place = Callable[[str, int], tuple[Path | str, str]]
-"""From ``camera``, ``gt`` or ``gt_info`` and a record's number to (file, start of the field)."""
+Places = Callable[[str, int], Place]
+"""From ``camera``, ``gt`` or ``gt_info`` and a record's number to where it stands."""
 
 
 @dataclass(frozen=True)
@@ -52,41 +63,32 @@ class BopPoses:
 
 
 def read_cameras(
-    records: Sequence[object], place: Place, problems: Problems = STRICT
+    records: Sequence[object], places: Places
 ) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, " images"]]:
     """Return every image's K in pixels and its ``depth_scale`` (mm a unit; NaN where not stated).
 
     A record that is no camera, and a scale that is not above 0, is a problem.
     """
-    K = _column(records, "cam_K", 9, place, "camera", problems).reshape(-1, 3, 3)
+    place = partial(places, "camera")
+    K = _column(records, "cam_K", 9, place).reshape(-1, 3, 3)
     stated = [n for n, record in enumerate(records) if "depth_scale" in mapping(record)]
-    scales = np.full(len(records), math.nan)
-    scales[stated] = _column(
-        [records[n] for n in stated], "depth_scale", 1,
-        lambda what, n: place(what, stated[n]), "camera", problems,
-    )[:, 0]  # fmt: skip
-    for number in np.flatnonzero(scales <= 0):
-        path, start = place("camera", int(number))
-        problems.report(path, f"{start}.depth_scale", f"{scales[number]:g}", "millimetres above 0")
+    scales = _stated_column(records, stated, "depth_scale", place)
+    for number in np.flatnonzero(scales <= 0).tolist():
+        place(number)["depth_scale"].report(f"{scales[number]:g}", "millimetres above 0")
     return K, scales
 
 
 def pair_infos(
-    truths: Sequence[Record], infos: Sequence[Record], path: Path | str, where: str,
-    problems: Problems = STRICT,
-) -> list[Record | None]:  # fmt: skip
+    truths: Sequence[Record], infos: Sequence[Record], place: Place
+) -> list[Record | None]:
     """Return one ``gt_info`` record for each of an image's objects, None where there is none."""
     if len(infos) != len(truths):
-        allowed = f"{len(truths)}, as many as have a pose"
-        problems.report(path, where, f"{len(infos)} objects", allowed)
+        place.report(f"{len(infos)} objects", f"{len(truths)}, as many as have a pose")
     return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
 
 
 def read_poses(
-    truths: Sequence[Record],
-    infos: Sequence[Record | None],
-    place: Place,
-    problems: Problems = STRICT,
+    truths: Sequence[Record], infos: Sequence[Record | None], places: Places
 ) -> BopPoses:
     """Return the objects of ``gt`` and ``gt_info`` records.
 
@@ -96,32 +98,24 @@ def read_poses(
     ``truths`` have ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``; ``infos``, one
     for each of them or None, have ``visib_fract``.
     """
-
-    def report(number: int, field: str, got: str, allowed: str, what: str = "gt") -> None:
-        path, start = place(what, number)
-        problems.report(path, f"{start}.{field}", got, allowed)
-
-    rotations = _column(truths, "cam_R_m2c", 9, place, "gt", problems).reshape(-1, 3, 3)
+    place, info_place = partial(places, "gt"), partial(places, "gt_info")
+    rotations = _column(truths, "cam_R_m2c", 9, place).reshape(-1, 3, 3)
     poses = np.tile(np.eye(4), (len(truths), 1, 1))
     poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = _column(truths, "cam_t_m2c", 3, place, "gt", problems) / MM
-    ids = _column(truths, "obj_id", 1, place, "gt", problems)[:, 0]
+    poses[:, :3, 3] = _column(truths, "cam_t_m2c", 3, place) / MM
+    ids = _column(truths, "obj_id", 1, place)[:, 0]
     for number in np.flatnonzero(~_are_rotations(rotations)).tolist():
         if problem := rotation_problem(rotations[number]):
-            report(number, "cam_R_m2c", problem, "a rotation matrix, row by row")
+            place(number)["cam_R_m2c"].report(problem, "a rotation matrix, row by row")
         poses[number, :3, :3] = math.nan
     for number in np.flatnonzero((ids % 1 != 0) | (ids < 0)).tolist():
         if math.isfinite(ids[number]):
-            report(number, "obj_id", f"{ids[number]:g}", "an object's number")
+            place(number)["obj_id"].report(f"{ids[number]:g}", "an object's number")
         ids[number] = -1
     stated = [n for n, info in enumerate(infos) if info is not None]
-    fractions = np.full(len(truths), math.nan)
-    fractions[stated] = _column(
-        [infos[n] for n in stated], "visib_fract", 1,
-        lambda what, n: place(what, stated[n]), "gt_info", problems,
-    )[:, 0]  # fmt: skip
+    fractions = _stated_column(infos, stated, "visib_fract", info_place)
     for number in np.flatnonzero((fractions < 0) | (fractions > 1)).tolist():
-        report(number, "visib_fract", f"{fractions[number]:g}", "0 – 1", "gt_info")
+        info_place(number)["visib_fract"].report(f"{fractions[number]:g}", "0 – 1")
         fractions[number] = math.nan
     return BopPoses(ids.astype(np.int64), poses, fractions)
 
@@ -148,8 +142,18 @@ def make_instance(
     return Instance(part.name, T_cam_obj, keypoints, visible_fraction, mask)
 
 
+def _stated_column(
+    records: Sequence[object], stated: list[int], field: str, place: Callable[[int], Place]
+) -> Float[np.ndarray, " records"]:
+    """Return a number of the records that state it, NaN of the others."""
+    values = np.full(len(records), math.nan)
+    some = [records[n] for n in stated]
+    values[stated] = _column(some, field, 1, lambda n: place(stated[n]))[:, 0]
+    return values
+
+
 def _column(
-    records: Sequence[object], field: str, count: int, place: Place, what: str, problems: Problems
+    records: Sequence[object], field: str, count: int, place: Callable[[int], Place]
 ) -> Float[np.ndarray, "records count"]:
     """Return a field of all records; one by one only to find those that are wrong."""
     # Nested lists of the right size, ``[[…], […], […]]`` for a matrix, are taken as other tools do.
@@ -164,12 +168,8 @@ def _column(
         table = table.astype(np.float64)
         if (np.abs(table) <= FARTHEST).all():
             return table
-    rows = []
-    for number, record in enumerate(records):
-        path, start = place(what, number)
-        value = mapping(record).get(field)
-        rows.append(numbers(problems, path, f"{start}.{field}", value, count))
-    return np.array(rows)
+    rows = [mapping(record).get(field) for record in records]
+    return np.array([place(n)[field].numbers(value, count) for n, value in enumerate(rows)])
 
 
 def _are_rotations(matrices: Float[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n"]:
@@ -177,3 +177,153 @@ def _are_rotations(matrices: Float[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, " n
     with np.errstate(invalid="ignore"):  # of NaN
         error = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         return np.asarray((error <= 1e-3) & (np.linalg.det(matrices) > 0))
+
+
+class SceneRecords(NamedTuple):
+    """What a scene's JSON files hold, by image.
+
+    ``truths`` has one record per object, ``infos`` one for each of them, None where it is missing.
+    """
+
+    cameras: Mapping[int, object]
+    truths: Mapping[int, list[Record]]
+    infos: Mapping[int, list[Record | None]]
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A scene's images, in the order of their numbers.
+
+    Attributes:
+        files: File of every image, relative to the folder; empty where it is not on disk.
+        depth_scales: Millimetres a unit of its depth image; NaN where not stated.
+        first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
+        gt_ids: Each object's place in its image's list, which names its masks.
+        num_behind: Objects of interest behind the camera, left out like the others.
+    """
+
+    folder: Path
+    image_ids: Int[np.ndarray, " images"]
+    files: list[str]
+    K: Float[np.ndarray, "images 3 3"]
+    depth_scales: Float[np.ndarray, " images"]
+    first: Int[np.ndarray, " bounds"]
+    gt_ids: Int[np.ndarray, " objects"]
+    poses: BopPoses
+    num_other: int
+    num_behind: int
+
+    def objects(self, image: int) -> range:
+        """Return which objects are on an image."""
+        return range(int(self.first[image]), int(self.first[image + 1]))
+
+
+def scene_folders(split_dir: Path) -> list[Path]:
+    """Return a split's scenes by number: the folders that are called by one."""
+    numbered = [path for path in split_dir.iterdir() if is_number(path.name) and path.is_dir()]
+    return sorted(numbered, key=lambda path: (int(path.name), path.name))
+
+
+def read_scene(folder: Path, wanted: set[int]) -> SceneFolder:
+    """Read a scene's annotation: ``scene_camera.json`` and, if there, its ground truth's files.
+
+    Objects that are not ``wanted`` are left out. Some data sets keep their ground truth private.
+    """
+    cameras, truths, infos = read_records(folder)
+    images = sorted(cameras)
+    if without := truths.keys() - cameras.keys():
+        _log.warning(
+            "%s: %d images have ground truth and no camera, and are left out; first: %d",
+            folder, len(without), min(without),
+        )  # fmt: skip
+    owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
+
+    def places(what: str, number: int) -> Place:
+        place = Place(STRICT, folder / f"scene_{what}.json")
+        if what == "camera":
+            return place[f"{images[number]}"]
+        row, n = owners[number]
+        return place[f"{images[row]}"][n]
+
+    K, scales = read_cameras([cameras[i] for i in images], places)
+    poses = read_poses(
+        [truths[images[row]][n] for row, n in owners],
+        [infos[images[row]][n] if infos else None for row, n in owners],
+        places,
+    )
+    table = np.array(owners, np.int64).reshape(-1, 2)
+    is_wanted = np.isin(poses.obj_ids, sorted(wanted))
+    is_behind = poses.T_cam_obj[:, 2, 3] <= 0
+    keep = is_wanted & ~is_behind
+    files = image_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
+    return SceneFolder(
+        folder,
+        np.array(images, np.int64),
+        [files[i].relative_to(folder).as_posix() if i in files else "" for i in images],
+        K,
+        scales,
+        np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
+        table[keep, 1],
+        BopPoses(poses.obj_ids[keep], poses.T_cam_obj[keep], poses.visible_fractions[keep]),
+        int((~is_wanted).sum()),
+        int((is_wanted & is_behind).sum()),
+    )
+
+
+def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
+    """Read a scene's JSON files; the two with ground truth may be missing."""
+    camera, gt, gt_info = (
+        Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
+    )
+    cameras, truths, infos = _by_image(camera), _objects(gt), _objects(gt_info)
+    paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - truths.keys()}
+    for image, objects in truths.items() if infos else ():
+        place = gt_info[f"{image}"]
+        if image in infos:
+            paired[image] = pair_infos(objects, infos[image], place)
+        else:
+            place.report("missing", f"{len(objects)} objects")
+            paired[image] = [None] * len(objects)
+    return SceneRecords(cameras, truths, paired)
+
+
+def _objects(place: Place) -> dict[int, list[Any]]:
+    """Return each image's list of records; nothing where there is no such file."""
+    by_image = _by_image(place) if Path(place.path).exists() else {}
+    return {image: place[f"{image}"].entries(rows) for image, rows in by_image.items()}
+
+
+def _by_image(place: Place) -> dict[int, Any]:
+    allowed = 'images by number: {"0": …, "1": …}'
+    by_image: dict[int, Any] = {}
+    for key, record in (place.load(allowed, MAX_SCENE_BYTES) or {}).items():
+        if not is_number(key):
+            place[f"{key!r:.40}"].report("no image's number", allowed)
+        elif int(key) in by_image:
+            place[f"{key!r:.40}"].report(f"image {int(key)} twice", "each once")
+        else:
+            by_image[int(key)] = record
+    return by_image
+
+
+def image_files(
+    scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], problems: Problems = STRICT
+) -> dict[int, Path]:
+    """Return the images of the first of some folders that is there, by number, all unread."""
+    folder = next((scene / name for name in folders if (scene / name).is_dir()), None)
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder is not None else ():
+        if not is_number(path.stem) or path.suffix.lower() not in suffixes:
+            continue
+        number = int(path.stem)
+        if number in found:
+            got = f"image {number} twice, also as {found[number].name}"
+            problems.report(path, "file", got, "one file an image")
+        else:
+            found[number] = path
+    return found
+
+
+def is_number(text: str) -> bool:
+    """Tell whether a key or a name is an image's, an object's or a scene's number."""
+    return text.isascii() and text.isdecimal() and len(text) < 10

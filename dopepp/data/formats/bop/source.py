@@ -17,10 +17,9 @@ from jaxtyping import Int
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
 from dopepp.data.formats import share
+from dopepp.data.formats.bop import records as bop
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import parts_by_id
-from dopepp.data.formats.bop.records import ESTIMATED, make_instance
-from dopepp.data.formats.bop.scene import DEPTH_SUFFIXES, SceneFolder, read_scene, scene_folders
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import DepthMap, Mask, Shape, read_content
 from dopepp.geometry.camera import CameraMatrix, check_camera
@@ -30,11 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 def read_targets(path: Path) -> set[tuple[int, int]]:
-    """Return (scene, image) of every target of a file like ``test_targets_bop19.json``.
-
-    Raises:
-        UserError: The file is missing or damaged, or a target lacks a number.
-    """
+    """Return (scene, image) of every target of a file like ``test_targets_bop19.json``."""
     records = read_json(path)
     if not isinstance(records, list) or not records:
         raise UserError(f"{path}", "a list of targets", "download the file again")
@@ -66,9 +61,6 @@ class BopSource:
         targets: File in ``root`` that selects images, e.g. ``test_targets_bop19.json``.
         part_of: Consecutive share of the images to take, as (first, last) fractions: disjoint
             shares of one folder serve training, validation and test.
-
-    Raises:
-        UserError: The folder or a file in it is wrong, or no image is left.
     """
 
     def __init__(
@@ -83,16 +75,23 @@ class BopSource:
         self.root, self.split, self.name = Path(root), split, f"bop/{split}"
         self._parts = parts_by_id(self.root, parts)
         self._read_depth = read_depth
-        folders = scene_folders(_split_dir(self.root, split))
+        folders = bop.scene_folders(_split_dir(self.root, split))
         if not folders:
             raise UserError(
                 f"{self.root / split}, which has no scene", "folders 000000, 000001, …",
                 "unpack the data set's images into it",
             )  # fmt: skip
-        self._scenes = [read_scene(folder, set(self._parts)) for folder in folders]
+        self._scenes = [bop.read_scene(folder, set(self._parts)) for folder in folders]
         items = self._present(None if targets is None else read_targets(self.root / targets))
         self._items = items[share(len(items), part_of, self.name)]
-        self._report_left_out()
+        other = sum(scene.num_other for scene in self._scenes)
+        behind = sum(scene.num_behind for scene in self._scenes)
+        self._left_out = {"other_objects": other, "behind_the_camera": behind}
+        if other or behind:
+            _log.info(
+                "%s: left out %s objects that are none of the parts and %s behind the camera",
+                self.name, f"{other:,}", f"{behind:,}",
+            )  # fmt: skip
 
     def _present(self, targets: set[tuple[int, int]] | None) -> Int[np.ndarray, "items 2"]:
         """Return (scene, row) of the images that are selected and on disk, in order."""
@@ -116,15 +115,6 @@ class BopSource:
             )  # fmt: skip
         return np.array(present, np.int64)
 
-    def _report_left_out(self) -> None:
-        other = sum(scene.num_other for scene in self._scenes)
-        behind = sum(scene.num_behind for scene in self._scenes)
-        if other or behind:
-            _log.info(
-                "%s: left out %s objects that are none of the parts and %s behind the camera",
-                self.name, f"{other:,}", f"{behind:,}",
-            )  # fmt: skip
-
     def __len__(self) -> int:
         return len(self._items)
 
@@ -143,7 +133,7 @@ class BopSource:
         return Sample(image, K, instances, depth, self.name, key)
 
     def _instance(
-        self, scene: SceneFolder, k: int, stem: str, K: CameraMatrix, shape: Shape
+        self, scene: bop.SceneFolder, k: int, stem: str, K: CameraMatrix, shape: Shape
     ) -> Instance:
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
         mask: Mask | None = None
@@ -152,13 +142,13 @@ class BopSource:
         poses = scene.poses
         part = self._parts[int(poses.obj_ids[k])]
         fraction = float(poses.visible_fractions[k])
-        return make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
+        return bop.make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
-    def _depth(self, scene: SceneFolder, row: int, stem: str, shape: Shape) -> DepthMap | None:
+    def _depth(self, scene: bop.SceneFolder, row: int, stem: str, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
         if not (scene.folder / "depth").is_dir():
             return None
-        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in DEPTH_SUFFIXES]
+        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in bop.DEPTH_SUFFIXES]
         path = next((path for path in paths if path.exists()), paths[0])
         scale = float(scene.depth_scales[row])
         return decode_depth(read_content(path), str(path), scale, shape)
@@ -182,11 +172,8 @@ class BopSource:
         identity: dict[str, object] = {
             "annotation": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "left_out": {
-                "other_objects": sum(scene.num_other for scene in self._scenes),
-                "behind_the_camera": sum(scene.num_behind for scene in self._scenes),
-            },
-            "visible_fractions": "scene_gt_info.json" if not unknown else ESTIMATED,
+            "left_out": self._left_out,
+            "visible_fractions": "scene_gt_info.json" if not unknown else bop.ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity, self._count_instances())]
 

@@ -23,11 +23,10 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
-from dopepp.data.formats import STAGING, finalizing, stage, staged_items
+from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.images import depth_units, encode_png
 from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS, write_models
-from dopepp.data.formats.bop.records import MM
-from dopepp.data.formats.bop.scene import MAX_SCENE_BYTES
+from dopepp.data.formats.bop.records import MAX_SCENE_BYTES, MM
 from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask
@@ -53,10 +52,7 @@ NO_BOX = [-1, -1, -1, -1]
 
 
 class BopFolder:
-    """What the writers of BOP's layouts share: a folder with models beside a split of images.
-
-    ``parts`` are numbered from 1 in their order.
-    """
+    """A folder with models, numbered from 1 in the parts' order, beside a split of images."""
 
     chunk_size = IMAGES_A_SCENE
 
@@ -64,11 +60,7 @@ class BopFolder:
         self.root, self.split, self._parts = Path(root), split, tuple(parts)
 
     def prepare(self) -> None:
-        """Write the models, unless the split holds images that were made without them.
-
-        Raises:
-            UserError: The folder holds something else, or a part has no mesh.
-        """
+        """Write the models; a UserError where the split holds images made without them."""
         info = self.root / MODEL_FOLDERS[0] / INFO_FILE
         if (self.root / self.split).exists() and not info.exists():
             raise UserError(
@@ -80,8 +72,7 @@ class BopFolder:
 
     @cached_property
     def _surfaces(self) -> dict[str, tuple[Part, Surface]]:
-        meshes = {part.name: (part, part.mesh) for part in self._parts}
-        return {n: (part, make_surface(mesh)) for n, (part, mesh) in meshes.items() if mesh}
+        return {part.name: (part, make_surface(part.mesh)) for part in self._parts if part.mesh}
 
     def labels(self, sample: Sample) -> Labels:
         """Annotate a sample, see :func:`make_labels`."""
@@ -112,7 +103,8 @@ class BopWriter(BopFolder):
         """Return the indices of the scene's complete images."""
         scene = self._scene(chunk)
         images = {int(path.stem) for path in _staged(scene)}
-        images |= {int(image) for image in _read_scene(scene / "scene_camera.json")}
+        cameras = read_object(scene / "scene_camera.json", MAX_SCENE_BYTES)
+        images |= {int(image) for image in cameras}
         return {chunk * self.chunk_size + image for image in images}
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
@@ -123,12 +115,15 @@ class BopWriter(BopFolder):
             staged = [path for path in _staged(scene) if int(path.stem) in wanted]
             items: dict[int, Any] = {int(path.stem): read_json(path) for path in staged}
             for name, field in SCENE_FILES.items():
-                merged = {int(key): value for key, value in _read_scene(scene / name).items()}
-                merged |= {image: item[field] for image, item in items.items()}
+                merged = read_object(scene / name, MAX_SCENE_BYTES)
+                merged |= {f"{image}": item[field] for image, item in items.items()}
+                # In order: the bytes do not depend on who wrote what first.
+                merged = dict(sorted(merged.items(), key=lambda entry: int(entry[0])))
                 if items:
-                    write_whole(scene / name, _by_image(merged))
+                    write_whole(scene / name, by_line(merged))
             if items:
-                self._write_camera(chunk, min(merged), merged[min(merged)])
+                image, camera = next(iter(merged.items()))
+                self._write_camera(chunk, int(image), camera)
             for path in staged:
                 path.unlink()
 
@@ -150,21 +145,6 @@ class BopWriter(BopFolder):
 
 def _staged(scene: Path) -> list[Path]:
     return staged_items(scene / STAGING, ".json")
-
-
-def _read_scene(path: Path) -> Mapping[str, Any]:
-    if not path.exists():
-        return {}
-    records = read_json(path, MAX_SCENE_BYTES)
-    if not isinstance(records, dict):
-        raise UserError(f"{path}, no object of images", "what this writer wrote", "restore it")
-    return records
-
-
-def _by_image(records: Mapping[int, object]) -> bytes:
-    """Return one line an image, in order: the bytes do not depend on who wrote what first."""
-    lines = [f'  "{image}": {json.dumps(record)}' for image, record in sorted(records.items())]
-    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 @dataclass(frozen=True)
@@ -193,17 +173,11 @@ def make_labels(
     coordinates (a single pixel has width 0), −1 for an object of which no pixel is visible; the
     silhouette counts beyond the image's border.
 
-    ``object_ids`` are BOP's numbers by label, ``parts`` parts and surfaces by label.
-
-    Raises:
-        ValueError: The sample has no depth, an instance has no mask, or a label is unknown.
+    ``object_ids`` are BOP's numbers by label, ``parts`` parts and surfaces by label. The sample has
+    depth, and each instance a mask, as every rendered one.
     """
-    unknown = sorted({item.label for item in sample.instances} - object_ids.keys())
-    if unknown:
-        raise ValueError(f"instances of {unknown}, parts {sorted(object_ids)}")
-    if sample.depth is None:
-        raise ValueError(f"a sample without depth: {sample.key}")
-    visible = [_mask(item) for item in sample.instances]
+    visible = [item.mask for item in sample.instances if item.mask is not None]
+    assert sample.depth is not None
     covered = np.zeros(sample.depth.shape, bool)
     for mask in visible:
         covered |= mask
@@ -225,12 +199,6 @@ def make_labels(
         [whole.mask for whole in wholes],
         visible,
     )
-
-
-def _mask(instance: Instance) -> Mask:
-    if instance.mask is None:
-        raise ValueError(f"an instance of {instance.label} without a mask")
-    return instance.mask
 
 
 def _truth(instance: Instance, object_id: int) -> Record:

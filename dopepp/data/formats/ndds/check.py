@@ -13,27 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dopepp.data.formats.ndds import files
 from dopepp.data.formats.ndds.check_object import Majority, ObjectCheck
-from dopepp.data.formats.ndds.fields import (
-    Objects,
-    has_own_ids,
-    objects_of,
-    parse_object,
-    read_record,
-)
-from dopepp.data.formats.ndds.files import (
-    CAMERA_SETTINGS,
-    IMAGE_SUFFIXES,
-    OBJECT_SETTINGS,
-    Masks,
-    Settings,
-    companion,
-    find_items,
-    image_of,
-)
-from dopepp.data.formats.problems import CheckReport, check_map, entries, mapping, picture_shape
+from dopepp.data.formats.ndds.files import IMAGE_SUFFIXES, Objects, Settings
+from dopepp.data.formats.problems import CheckReport, Place, check_map, mapping, picture_shape
 from dopepp.data.formats.tolerances import camera_problem
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix
@@ -45,7 +29,7 @@ _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
 
 def check_ndds(report: CheckReport) -> None:
     """Check every annotation, every image and the settings."""
-    items, lonely = find_items(report.root)
+    items, lonely = files.find_items(report.root)
     _check_unannotated(report, items + lonely)
     for path in lonely:
         report.report(path, "image", f"missing: neither {' nor '.join(IMAGE_SUFFIXES)} beside it")
@@ -59,27 +43,27 @@ def check_ndds(report: CheckReport) -> None:
     }
     majority = Majority(report)
     for path in sorted(items + lonely):
-        _Item(report, path, settings, majority).check(expected.get(path.parent, []))
+        _check_item(report, path, settings, majority, expected.get(path.parent, []))
         report.count_image()
     majority.conclude()
 
 
 def _check_settings(report: CheckReport, settings: Settings, folder: Path) -> None:
     """Check a folder's settings files; what reads from them reports once what is damaged."""
-    path = folder / OBJECT_SETTINGS
-    content = settings.read(path) or {}
+    content = settings.read(folder / files.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
-    objects = entries(report, path, "exported_objects", content.get("exported_objects", []))
+    place = Place(report, folder / files.OBJECT_SETTINGS, "exported_objects")
+    objects = place.entries(content.get("exported_objects", []))
     if isinstance(listed, list) and objects:
         names = {str(entry.get("class")) for entry in objects}
         for name in sorted(set(map(str, listed)) - names):
-            report.report(path, "exported_objects", f"no entry for class {name!r:.60}")
-    path = folder / CAMERA_SETTINGS
-    cameras = settings.read(path)
+            place.report(f"no entry for class {name!r:.60}")
+    cameras = settings.read(folder / files.CAMERA_SETTINGS)
     if cameras is not None:
-        listed = entries(report, path, "camera_settings", cameras.get("camera_settings"))
+        place = Place(report, folder / files.CAMERA_SETTINGS, "camera_settings")
+        listed = place.entries(cameras.get("camera_settings"))
         for camera_name in _twice(str(camera.get("name")) for camera in listed):
-            report.report(path, "camera_settings.name", f"{camera_name!r:.60} twice")
+            place["name"].report(f"{camera_name!r:.60} twice")
 
 
 def _twice(values: Iterable[Hashable]) -> list[Hashable]:
@@ -105,69 +89,62 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
                 report.report(path, "annotation", f"missing: no {stem}.json beside it")
 
 
-class _Item:
-    """One annotation with its images."""
-
-    def __init__(
-        self, report: CheckReport, path: Path, settings: Settings, majority: Majority
-    ) -> None:
-        self._report, self._path = report, path
-        self._settings, self._majority = settings, majority
-
-    def check(self, maps: list[str]) -> None:
-        """Check everything; ``maps`` are the suffixes of images that must be there."""
-        report, path = self._report, self._path
-        image = image_of(path)
-        shape = None if image is None else picture_shape(report, image)
-        images = {
-            suffix: check_map(report, companion(path, suffix), shape, colour=True)
-            for suffix in maps
-        }
-        labels = images.get(".seg.png")
-        record = read_record(path, report)
-        if record is None:
-            return
-        K = self._camera(record, shape)
-        objects = objects_of(record, path, report)
-        self._check_ids(objects, labels, has_own_ids(record))
-        masks = Masks(objects, has_own_ids(record), path, self._settings, lambda: labels)
-        for field, item, label in objects:
-            self._check_class(field, label)
-            one = parse_object(item, field, path, report)
-            mask = masks.of(one.segmentation_id, label)
-            sides = self._settings.dimensions(path, label)
-            ObjectCheck(report, path, one, item, self._majority).check(K, shape, mask, sides)
-
-    def _camera(self, record: Mapping[str, Any], shape: Shape | None) -> CameraMatrix | None:
-        data = mapping(record.get("camera_data"))
-        width, height = data.get("width"), data.get("height")
-        if shape is not None and None not in (width, height) and (height, width) != shape:
-            got = f"{width}×{height}; the image has {shape[1]}×{shape[0]}"
-            self._report.report(self._path, "camera_data.size", got)
-        K = self._settings.camera(record, self._path, self._report)
-        if not np.isfinite(K).all():
-            return None
-        problem = None if shape is None else camera_problem(K, shape)
-        if problem is not None:
-            self._report.report(self._path, "camera_data.intrinsics", problem)
-        return K if problem is None else None
-
-    def _check_ids(self, objects: Objects, labels: NDArray[Any] | None, own: bool) -> None:
-        """Report ids that two objects share, and labels (``own``: by object) of none."""
-        for name in ("instance_id", "segmentation_id"):
-            ids = [item.get(name) for _, item, _ in objects]
-            known = [value for value in ids if type(value) is int and value > 0]  # −1, 0: none
-            for value in _twice(known):
-                self._report.report(self._path, f"objects.{name}", f"{value} twice")
-        if labels is not None and own:
-            strangers = sorted(set(np.unique(labels).tolist()) - set(known) - {0})
-            if strangers:
-                path = companion(self._path, ".seg.png")
-                got = f"{strangers[:10]}: no object's segmentation_id"
-                self._report.report(path, "values", got)
-
-    def _check_class(self, field: str, label: str) -> None:
-        known = self._settings.classes(self._path)
+def _check_item(
+    report: CheckReport, path: Path, settings: Settings, majority: Majority, maps: list[str]
+) -> None:
+    """Check an annotation and its images; ``maps`` are the suffixes of those that must be there."""
+    image = files.image_of(path)
+    shape = None if image is None else picture_shape(Place(report, image))
+    images = {
+        suffix: check_map(Place(report, files.companion(path, suffix)), shape, colour=True)
+        for suffix in maps
+    }
+    labels = images.get(".seg.png")
+    record = files.read_record(path, report)
+    if record is None:
+        return
+    K = _check_camera(report, path, settings, record, shape)
+    objects = files.objects_of(record, path, report)
+    ids = _check_ids(Place(report, path, "objects"), objects)
+    own_ids = files.has_own_ids(record)
+    if labels is not None and own_ids:
+        strangers = sorted(set(np.unique(labels).tolist()) - ids - {0})
+        if strangers:
+            got = f"{strangers[:10]}: no object's segmentation_id"
+            report.report(files.companion(path, ".seg.png"), "values", got)
+    values, known = files.label_values(objects, own_ids, path, settings), settings.classes(path)
+    for place, item, label in objects:
         if known is not None and label and label not in known:
             got = f"unknown object {label!r:.60}; known: {', '.join(sorted(known)[:10])}"
-            self._report.report(self._path, f"{field}.class", got)
+            place["class"].report(got)
+        value = values[place.where]
+        mask = None if labels is None or value is None else labels == value
+        one, sides = files.parse_object(item, place), settings.dimensions(path, label)
+        ObjectCheck(one, item, majority).check(K, shape, mask, sides)
+
+
+def _check_camera(
+    report: CheckReport, path: Path, settings: Settings, record: Mapping[str, Any],
+    shape: Shape | None,
+) -> CameraMatrix | None:  # fmt: skip
+    place, data = Place(report, path, "camera_data"), mapping(record.get("camera_data"))
+    width, height = data.get("width"), data.get("height")
+    if shape is not None and None not in (width, height) and (height, width) != shape:
+        place["size"].report(f"{width}×{height}; the image has {shape[1]}×{shape[0]}")
+    K = settings.camera(record, path, report)
+    if not np.isfinite(K).all():
+        return None
+    problem = None if shape is None else camera_problem(K, shape)
+    if problem is not None:
+        place["intrinsics"].report(problem)
+    return K if problem is None else None
+
+
+def _check_ids(place: Place, objects: Objects) -> set[int]:
+    """Report ids that two objects share; return what labels there may be."""
+    for name in ("instance_id", "segmentation_id"):
+        ids = [item.get(name) for _, item, _ in objects]
+        known = [value for value in ids if type(value) is int and value > 0]  # −1, 0: none
+        for value in _twice(known):
+            place[name].report(f"{value} twice")
+    return set(known)

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.data.formats.ndds.fields import NddsObject
-from dopepp.data.formats.problems import CheckReport, mapping, numbers
+from dopepp.data.formats.ndds.conventions import OPENGL
+from dopepp.data.formats.ndds.files import NddsObject
+from dopepp.data.formats.problems import CheckReport, Place, mapping
 from dopepp.data.formats.tolerances import Box, box_problem, translation_problem
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, project
@@ -57,8 +57,6 @@ _EDGES: Final = np.array(
 )
 """Corner pairs of the edges along x, y and z, from the negative to the positive end."""
 
-_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
-
 _DOCUMENTED: Final = {
     "quaternion_xyzw": "x, y, z, w",
     "bounding_box": "row, column",
@@ -76,14 +74,14 @@ class Majority:
     def __init__(self, report: CheckReport) -> None:
         self._report = report
         self._votes: dict[str, Counter[str]] = {}
-        self._places: dict[tuple[str, str], list[tuple[Path, str]]] = {}
+        self._places: dict[tuple[str, str], list[Place]] = {}
 
-    def vote(self, subject: str, way: str, path: Path, where: str) -> None:
+    def vote(self, subject: str, way: str, place: Place) -> None:
         """Count which way one object does it."""
         self._votes.setdefault(subject, Counter())[way] += 1
         places = self._places.setdefault((subject, way), [])
         if len(places) < _MAX_MINORITY:
-            places.append((path, where))
+            places.append(place)
 
     def conclude(self) -> None:
         """Note each way that is not NDDS's own, and report the objects that have another."""
@@ -92,28 +90,20 @@ class Majority:
             if common != _DOCUMENTED[subject]:
                 self._report.note(f"{subject}: {common} ({number:,} objects)")
             for way, _ in rest:
-                for path, where in self._places[subject, way]:
-                    self._report.report(path, where, f"{way}; {number:,} objects have {common}")
+                for place in self._places[subject, way]:
+                    place.report(f"{way}; {number:,} objects have {common}")
 
 
 class ObjectCheck:
     """One object; lengths are in the file's unit, whatever it is."""
 
-    def __init__(
-        self,
-        report: CheckReport,
-        path: Path,
-        one: NddsObject,
-        item: Mapping[str, Any],
-        majority: Majority,
-    ) -> None:
-        self._report, self._path, self._item, self._majority = report, path, item, majority
-        self._field, self._visibility = one.field, one.visibility
+    def __init__(self, one: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
+        self._place, self._item, self._majority = one.place, item, majority
+        self._visibility = one.visibility
         self._location, self._quaternion = _known(one.location), _known(one.quaternion)
         self._projected, self._cuboid = _known(one.corners_px), _known(one.cuboid)
         self._centroid = _known(one.centroid)
-        name = "projected_cuboid_centroid"
-        self._projected_centroid = self._numbers(name, item.get(name), 2)
+        self._projected_centroid = self._numbers("projected_cuboid_centroid", 2)
 
     def check(
         self, K: CameraMatrix | None, shape: Shape | None, mask: Mask | None, sides: Vector | None
@@ -144,13 +134,12 @@ class ObjectCheck:
             self._check_image(axes, K, shape, seen, fraction)
 
     def _add(self, field: str, got: str) -> None:
-        self._report.report(self._path, f"{self._field}.{field}", got)
+        self._place[field].report(got)
 
-    def _numbers(self, field: str, value: object, *shape: int) -> Float[np.ndarray, "..."] | None:
+    def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
         """Read a field that no source needs; None where it is missing or damaged."""
-        if value is None:
-            return None
-        return _known(numbers(self._report, self._path, f"{self._field}.{field}", value, *shape))
+        value = self._item.get(field)
+        return None if value is None else _known(self._place[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
         """Return the rotation by either order of ``quaternion_xyzw``, none where it is damaged."""
@@ -186,12 +175,12 @@ class ObjectCheck:
             self._add(field, problem)
         elif not all(fits.values()):
             way = next(way for way, fit in fits.items() if fit)
-            self._majority.vote(field, way, self._path, f"{self._field}.{field}")
+            self._majority.vote(field, way, self._place[field])
 
     def _check_transforms(self, rotations: Mapping[str, RotationMatrix]) -> None:
         """Check NDDS's matrix: rows P·Rᵀ (mirrored: Unreal is left-handed), the location below."""
         for name in ("pose_transform", "pose_transform_permuted"):
-            matrix = self._numbers(name, self._item.get(name), 4, 4)
+            matrix = self._numbers(name, 4, 4)
             if matrix is None:
                 continue
             linear = matrix[:3, :3]
@@ -218,20 +207,19 @@ class ObjectCheck:
         stated = mapping(self._item.get("bounding_box"))
         if not stated:
             return
+        place = self._place["bounding_box"]
         first, last = (
-            _known(numbers(self._report, self._path, f"{self._field}.bounding_box.{name}",
-                           stated.get(name), 2))
+            _known(place[name].numbers(stated.get(name), 2))
             for name in ("top_left", "bottom_right")
-        )  # fmt: skip
+        )
         if first is None or last is None:
             return
         if (first > last).any():
-            got = f"top_left {first.tolist()}, bottom_right {last.tolist()}"
-            self._add("bounding_box", got)
+            place.report(f"top_left {first.tolist()}, bottom_right {last.tolist()}")
         elif seen is not None:
             (a, b), (c, d) = first.tolist(), last.tolist()
             boxes = {"row, column": Box(b, a, d, c), "column, row": Box(a, b, c, d)}
-            fits = {order: box.holds(seen, PROJECTION_PX) for order, box in boxes.items()}
+            fits = {order: box.beyond(seen) <= PROJECTION_PX for order, box in boxes.items()}
             problem = f"{boxes['row, column']} does not hold the mask's {seen}"
             self._judge("bounding_box", fits, problem)
 
@@ -242,12 +230,12 @@ class ObjectCheck:
         projected, is_opengl = self._projected, False
         is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
         if location[2] < 0 and not is_before and projected is not None and K is not None:
-            middle, slack = project(_OPENGL @ location, K), np.ptp(projected, axis=0)
+            middle, slack = project(OPENGL @ location, K), np.ptp(projected, axis=0)
             low, high = projected.min(axis=0) - slack, projected.max(axis=0) + slack
             is_opengl = bool(((low <= middle) & (middle <= high)).all())
         way = "OpenGL" if is_opengl else "OpenCV"
-        self._majority.vote("camera axes", way, self._path, f"{self._field}.location")
-        return _OPENGL if is_opengl else np.eye(3)
+        self._majority.vote("camera axes", way, self._place["location"])
+        return OPENGL if is_opengl else np.eye(3)
 
     def _is_place_possible(self, location: Vector, axes: RotationMatrix) -> bool:
         """Check location, centroid and unit; tell whether projections can mean anything."""

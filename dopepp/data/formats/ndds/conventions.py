@@ -11,8 +11,8 @@ a pose, the pose puts the mesh's box somewhere on the image, and under the right
 where the file says (:func:`find_convention`). Later every object that is read is held against its
 own ``projected_cuboid`` (:func:`check_observation`).
 
-To allow for one more way of writing poses, add its value to the ``Literal`` and the tuple of its
-kind below, and what it means to :meth:`Observation.T_cam_obj`.
+To allow for one more way of writing poses, add its value to the ``Literal`` of its kind below, and
+what it means to :meth:`Observation.T_cam_obj`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ndds.fields import NddsObject
-from dopepp.data.formats.problems import STRICT
+from dopepp.data.formats.ndds.files import NddsObject
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import RotationMatrix, quaternion_to_matrix
@@ -39,11 +37,6 @@ Quaternion = Literal["xyzw", "wxyz"]
 Unit = Literal["cm", "m", "mm"]
 CameraAxes = Literal["opencv", "opengl"]
 Frame = Literal["mesh", "mesh, front x", "centred", "fixed", "fixed, centred"]
-
-METRES: Final[dict[Unit, float]] = {"cm": 0.01, "m": 1.0, "mm": 0.001}
-QUATERNIONS: Final[tuple[Quaternion, ...]] = ("xyzw", "wxyz")
-CAMERAS: Final[tuple[CameraAxes, ...]] = ("opencv", "opengl")
-FRAMES: Final[tuple[Frame, ...]] = ("mesh", "mesh, front x", "centred", "fixed", "fixed, centred")
 """What the stated pose moves.
 
 - ``mesh``: the mesh as it is.
@@ -55,10 +48,12 @@ FRAMES: Final[tuple[Frame, ...]] = ("mesh", "mesh, front x", "centred", "fixed",
 - ``fixed, centred``: the mesh after the rotation of ``fixed_model_transform``, then centred.
 """
 
+METRES: Final[dict[Unit, float]] = {"cm": 0.01, "m": 1.0, "mm": 0.001}
+
 _FRONT_X: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Rotation of a mesh with x forward, y left, z up into NDDS axes (x right, y down, z forward)."""
 
-_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
+OPENGL: Final = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -79,10 +74,10 @@ class PoseConvention:
 
 POSE_CONVENTIONS: Final = tuple(
     PoseConvention(quaternion, unit, camera, frame)
-    for frame in FRAMES
-    for camera in CAMERAS
+    for frame in get_args(Frame)
+    for camera in get_args(CameraAxes)
     for unit in METRES
-    for quaternion in QUATERNIONS
+    for quaternion in get_args(Quaternion)
 )
 """All combinations, the documented ones first: of two that fit alike, the first one counts."""
 
@@ -98,7 +93,6 @@ class Observation:
     part: Part
     K: CameraMatrix
     fixed: Transform | None
-    path: Path
 
     def T_cam_obj(self, convention: PoseConvention) -> Transform | None:  # noqa: N802
         """Return the mesh's pose, metres, under a convention; None where it cannot apply."""
@@ -115,8 +109,8 @@ class Observation:
             location = location + rotation_file @ offset
         if convention.frame.endswith("centred"):
             centroid = self.item.location if self.item.centroid is None else self.item.centroid
-            location = centroid * scale - rotation @ self._corners(convention).mean(axis=0)
-        axes = _OPENGL if convention.camera == "opengl" else np.eye(3)
+            location = centroid * scale - rotation @ self._corners[convention.frame].mean(axis=0)
+        axes = OPENGL if convention.camera == "opengl" else np.eye(3)
         return make_transform(axes @ rotation, axes @ location)
 
     def predicted_px(self, convention: PoseConvention) -> Float[np.ndarray, "8 2"] | None:
@@ -124,7 +118,7 @@ class Observation:
         T_cam_obj = self.T_cam_obj(convention)
         if T_cam_obj is None:
             return None
-        return project(transform(T_cam_obj, self._corners(convention)), self.K)
+        return project(transform(T_cam_obj, self._corners[convention.frame]), self.K)
 
     def error_px(self, convention: PoseConvention) -> float:
         """Return the median distance from ``projected_cuboid``, infinite behind the camera."""
@@ -134,20 +128,13 @@ class Observation:
         distances = np.linalg.norm(predicted - self.item.corners_px, axis=1)
         return float(np.median(np.nan_to_num(distances, nan=np.inf)))
 
-    def _corners(self, convention: PoseConvention) -> NDArray[np.float64]:
-        """Return the corners the file lists, in its order, in the mesh frame, metres."""
-        if convention.frame == "mesh, front x":
-            return self._front_corners
-        return self._fixed_corners if convention.frame.startswith("fixed") else self.part.cuboid[:8]
-
     @cached_property
-    def _front_corners(self) -> NDArray[np.float64]:
-        return _turned_corners(self.part, _FRONT_X)
-
-    @cached_property
-    def _fixed_corners(self) -> NDArray[np.float64]:
+    def _corners(self) -> dict[Frame, NDArray[np.float64]]:
+        """The corners the file lists, in its order, in the mesh frame, metres."""
+        usual, front = self.part.cuboid[:8], _turned_corners(self.part, _FRONT_X)
         rotation = np.eye(3) if self.fixed is None else self.fixed[:3, :3]
-        return _turned_corners(self.part, rotation)
+        fixed = _turned_corners(self.part, rotation)
+        return dict(zip(get_args(Frame), (usual, front, usual, fixed, fixed), strict=True))
 
 
 def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "8 3"]:
@@ -213,11 +200,8 @@ class Finding:
 def find_convention(observations: Sequence[Observation], where: str) -> Finding:
     """Find the one convention under which the part's cuboid lands on ``projected_cuboid``.
 
-    ``observations`` have ``projected_cuboid``; one is enough in most cases.
-
-    Raises:
-        UserError: None fits three quarters of the instances within 5 px, or two that give different
-            poses fit alike.
+    ``observations`` have ``projected_cuboid``; one is enough in most cases. A UserError: none fits
+    three quarters of the instances within 5 px, or two that give different poses fit alike.
     """
     errors = {
         convention: _most([one.error_px(convention) for one in observations])
@@ -241,17 +225,17 @@ def find_convention(observations: Sequence[Observation], where: str) -> Finding:
 def check_observation(one: Observation, convention: PoseConvention) -> Transform:
     """Return an instance's pose after holding it against its own ``projected_cuboid``.
 
-    Raises:
-        UserError: The pose is behind the camera, needs a ``fixed_model_transform`` that its class
-            does not have, or is off by more than 5 px and 5 % of the cuboid's longer side.
+    A UserError: it is behind the camera, needs a ``fixed_model_transform`` that its class does not
+    have, or is off by more than 5 px and 5 % of the cuboid's longer side.
     """
-    T_cam_obj, field = one.T_cam_obj(convention), one.item.field
+    T_cam_obj, place = one.T_cam_obj(convention), one.item.place
     if T_cam_obj is None:
         got = f"no fixed_model_transform of {one.item.label} in the object settings"
-        STRICT.report(one.path, f"{field}.class", got, f"one as for the others ({convention})")
+        place["class"].report(got, f"one as for the others ({convention})")
+    assert T_cam_obj is not None
     if T_cam_obj[2, 3] <= 0:
         got = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
-        STRICT.report(one.path, f"{field}.location", got, f"one before it ({convention})")
+        place["location"].report(got, f"one before it ({convention})")
     predicted = one.predicted_px(convention)
     # Projections of what nobody sees or what reaches behind the camera mean nothing.
     if predicted is None or not np.isfinite(predicted).all() or one.item.visibility == 0:
@@ -259,7 +243,7 @@ def check_observation(one: Observation, convention: PoseConvention) -> Transform
     error, extent = one.error_px(convention), float(np.ptp(predicted, axis=0).max())
     if one.item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
         got = f"{error:.3g} px from where the pose puts the cuboid of {one.part.name}"
-        STRICT.report(one.path, f"{field}.projected_cuboid", got, f"the data set's {convention}")
+        place["projected_cuboid"].report(got, f"the data set's {convention}")
     return T_cam_obj
 
 

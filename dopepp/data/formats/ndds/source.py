@@ -12,32 +12,14 @@ import hashlib
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import share
-from dopepp.data.formats.ndds.conventions import (
-    Finding,
-    Observation,
-    check_observation,
-    find_convention,
-)
-from dopepp.data.formats.ndds.fields import (
-    has_own_ids,
-    objects_of,
-    parse_object,
-    read_record,
-    stated,
-)
-from dopepp.data.formats.ndds.files import (
-    Masks,
-    Settings,
-    find_items,
-    image_of,
-    read_depth,
-    read_labels,
-)
+from dopepp.data.formats.ndds import conventions, files
+from dopepp.data.formats.ndds.conventions import Finding, Observation
 from dopepp.data.formats.problems import STRICT
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
 from dopepp.drawing.pictures import Shape, read_rgb
@@ -75,10 +57,6 @@ class NddsSource:
             (``NAME_16k``), or one that ``classes`` translates.
         part_of: First and last share of the sorted items to use, e.g. (0, 0.9) and (0.9, 1).
         classes: Names of parts by the class names that the files use for them.
-
-    Raises:
-        UserError: The folder has no items, a setting is damaged, no instance of the parts is there,
-            or it cannot be told how their poses are written.
     """
 
     def __init__(
@@ -92,8 +70,12 @@ class NddsSource:
         self.folder, self._read_depth = Path(folder), read_depth
         self.name = f"ndds/{self.folder.resolve().name}"
         self._parts = {part.name: part for part in parts}
-        self._classes = _check_classes(classes or {}, self._parts)
-        self._settings = Settings(self.folder)
+        self._classes = classes or {}
+        unknown = sorted(set(self._classes.values()) - set(self._parts))
+        if unknown:
+            allowed = f"parts of {sorted(self._parts)}"
+            raise UserError(f"classes of the parts {unknown}", allowed, "correct it")
+        self._settings = files.Settings(self.folder)
         items = _find(self.folder)
         self.items = items[share(len(items), part_of, self.name)]
         # On all items, so that training and validation shares of one folder are read alike.
@@ -105,8 +87,10 @@ class NddsSource:
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
         for path in _spread(items):
-            record = self._record(path)
-            others.update(name for _, _, name in objects_of(record, path) if not self._part(name))
+            record = files.read_record(path) or {}
+            others.update(
+                name for _, _, name in files.objects_of(record, path) if not self._part(name)
+            )
             for one in self._observations(record, path):
                 if one.item.corners_px is not None:
                     (hidden if one.item.visibility == 0 else seen).append(one)
@@ -121,10 +105,7 @@ class NddsSource:
                 "name the parts as the classes, or give classes={class: part}",
             )
         # What nobody sees may be behind the camera, where projections mean nothing.
-        return find_convention(seen or hidden, str(self.folder))
-
-    def _record(self, path: Path) -> Mapping[str, Any]:
-        return read_record(path) or {}
+        return conventions.find_convention(seen or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
         """Return the part of a class name; FAT's suffix is dropped where it hides a part's name."""
@@ -137,12 +118,12 @@ class NddsSource:
         self, record: Mapping[str, Any], path: Path, K: CameraMatrix | None = None
     ) -> Iterator[Observation]:
         """Yield the objects that are instances of the parts."""
-        for field, item, label in objects_of(record, path):
+        for place, item, label in files.objects_of(record, path):
             part = self._part(label)
             if part is not None:
                 K = self._settings.camera(record, path) if K is None else K
                 fixed = self._settings.fixed_transform(path, label)
-                yield Observation(parse_object(item, field, path), part, K, fixed, path)
+                yield Observation(files.parse_object(item, place), part, K, fixed)
 
     def __len__(self) -> int:
         return len(self.items)
@@ -150,24 +131,25 @@ class NddsSource:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an item; the epoch is ignored."""
         path = self.items[index]
-        record, image_path = self._record(path), image_of(path)
+        record, image_path = files.read_record(path) or {}, files.image_of(path)
         if image_path is None:
             STRICT.report(path, "image", "no file", "a PNG or JPEG beside it")
         image = read_rgb(image_path)
         shape: Shape = image.shape[:2]
-        masks = Masks(
-            objects_of(record, path), has_own_ids(record), path, self._settings,
-            lambda: read_labels(path, shape),
-        )  # fmt: skip
+        objects, own_ids = files.objects_of(record, path), files.has_own_ids(record)
+        values = files.label_values(objects, own_ids, path, self._settings)
+        labels = cache(lambda: files.read_labels(path, shape))
         K = check_camera(self._settings.camera(record, path), shape[::-1], str(path))
-        counts_truncation = stated(record, "visibility_counts_truncation") is True
+        counts_truncation = files.stated(record, "visibility_counts_truncation") is True
         instances = []
         for one in self._observations(record, path, K):
             if not self._is_out_of_view(one):
                 instance = self._instance(one, shape, counts_truncation)
-                instance.mask = masks.of(one.item.segmentation_id, one.item.label)
+                value = values[one.item.place.where]
+                if value is not None and (found := labels()) is not None:
+                    instance.mask = found == value
                 instances.append(instance)
-        depth = read_depth(record, path, shape) if self._read_depth else None
+        depth = files.read_depth(record, path, shape) if self._read_depth else None
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
@@ -180,7 +162,7 @@ class NddsSource:
         return behind and one.item.visibility is not None and one.item.visibility <= 0
 
     def _instance(self, one: Observation, shape: Shape, counts_truncation: bool) -> Instance:
-        T_cam_obj = check_observation(one, self.finding.convention)
+        T_cam_obj = conventions.check_observation(one, self.finding.convention)
         keypoints = project_keypoints(one.part.cuboid, T_cam_obj, one.K)
         fraction = one.item.visibility
         if fraction is None or fraction == -1:
@@ -195,7 +177,7 @@ class NddsSource:
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
-            for _, _, name in objects_of(self._record(path), path)
+            for _, _, name in files.objects_of(files.read_record(path) or {}, path)
         )
 
     def describe(self) -> list[SourceInfo]:
@@ -220,8 +202,8 @@ class NddsSource:
         kept: Counter[str] = Counter()
         left_out: Counter[str] = Counter()
         for path in self.items:
-            record = self._record(path)
-            names = [name for _, _, name in objects_of(record, path)]
+            record = files.read_record(path) or {}
+            names = [name for _, _, name in files.objects_of(record, path)]
             left_out.update(name for name in names if self._part(name) is None)
             for one in self._observations(record, path):
                 if self._is_out_of_view(one):
@@ -232,7 +214,7 @@ class NddsSource:
 
 
 def _find(folder: Path) -> list[Path]:
-    items, lonely = find_items(folder) if folder.is_dir() else ([], [])
+    items, lonely = files.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         raise UserError(
             f"{folder} without one annotated image ({len(lonely)} JSON files without an image)",
@@ -250,12 +232,3 @@ def _spread(items: Sequence[Path]) -> Iterator[Path]:
     step = max(1, len(items) // _MAX_OBSERVATIONS)
     for start in range(step):
         yield from items[start::step]
-
-
-def _check_classes(classes: Mapping[str, str], parts: Mapping[str, Part]) -> dict[str, str]:
-    unknown = sorted(set(classes.values()) - set(parts))
-    if unknown:
-        raise UserError(
-            f"classes of the parts {unknown}", f"parts of {sorted(parts)}", "correct it"
-        )
-    return dict(classes)

@@ -23,14 +23,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Integer
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
+from dopepp.data.formats.bop.images import encode_png
 from dopepp.data.formats.ndds.files import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
+from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, transform
@@ -104,12 +105,13 @@ class NddsWriter:
                 for number, instance in enumerate(sample.instances, 1)
             ],
         }
-        write_png(self._path(index, ".png"), sample.image)
+        images = {".png": sample.image, ".seg.png": segmentation}
         if sample.depth is not None:
             steps = np.nan_to_num(np.rint(sample.depth.astype(np.float64) / DEPTH_UNIT))
             steps[(steps < 0) | (steps > np.iinfo(np.uint16).max)] = 0
-            _write_map(self._path(index, ".depth.png"), steps.astype(np.uint16))
-        _write_map(self._path(index, ".seg.png"), segmentation)
+            images[".depth.png"] = steps.astype(np.uint16)
+        for suffix, image in images.items():
+            write_whole(self._path(index, suffix), encode_png(image))
         write_whole(self._path(index, ".json"), _encode(record))
 
     def _path(self, index: int, suffix: str) -> Path:
@@ -224,13 +226,10 @@ def _projected(points_cam: Float[np.ndarray, "9 3"], K: CameraMatrix) -> Float[n
 def _bounding_box(
     mask: Mask | None, corners_px: Float[np.ndarray, "8 2"]
 ) -> dict[str, list[float]]:
-    if mask is None or not mask.any():
-        (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
-    else:
-        top, bottom = np.flatnonzero(mask.any(axis=1))[[0, -1]]
-        left, right = np.flatnonzero(mask.any(axis=0))[[0, -1]]
-    corners = {"top_left": (top, left), "bottom_right": (bottom, right)}
-    return {name: [float(row), float(column)] for name, (row, column) in corners.items()}
+    seen = None if mask is None else Box.of_mask(mask)
+    box = seen or Box.of_points(corners_px)
+    assert box is not None  # all corners have finite places
+    return {"top_left": [box.top, box.left], "bottom_right": [box.bottom, box.right]}
 
 
 def segmentation_map(
@@ -242,10 +241,6 @@ def segmentation_map(
         if instance.mask is not None:
             labels[instance.mask] = number
     return labels
-
-
-def _write_map(path: Path, image: Integer[np.ndarray, "height width"]) -> None:
-    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def _encode(record: dict[str, Any]) -> bytes:

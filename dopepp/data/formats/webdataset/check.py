@@ -5,28 +5,21 @@ A shard is walked from its first to its last member; one image's members are in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Final
 
 from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.check_image import Models, Silhouettes, check_image, load_models
+from dopepp.data.formats.bop.check_image import Models, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
-from dopepp.data.formats.problems import CheckReport, attempt, load_object, picture_shape
+from dopepp.data.formats.problems import CheckReport, Place, picture_shape
+from dopepp.data.formats.webdataset import shards
 from dopepp.data.formats.webdataset.source import ShardRecords
-from dopepp.data.formats.webdataset.tar import (
-    KEY_FILE,
-    MAX_MEMBER_BYTES,
-    TarMember,
-    field_of,
-    members,
-    read_span,
-)
 from dopepp.drawing.pictures import Mask, Shape
 
-_MAX_IMAGE_BYTES: Final = 2 * MAX_MEMBER_BYTES
+_MAX_IMAGE_BYTES: Final = 2 * shards.MAX_MEMBER_BYTES
 """Of all members of an image together."""
 
 Content = dict[str, bytes]
@@ -46,7 +39,7 @@ def check_webdataset(report: CheckReport) -> None:
     seen: dict[Path, dict[str, str]] = {}
     for path in shard_paths(report.root):
         keys = seen.setdefault(path.parent, {})
-        for key, group in groupby(members(path, report), key=lambda member: member.key):
+        for key, group in groupby(shards.members(path, report), key=lambda member: member.key):
             if key in keys:
                 same = keys[key] == path.name
                 got = "its members are not together" if same else f"also in {keys[key]}"
@@ -58,61 +51,55 @@ def check_webdataset(report: CheckReport) -> None:
         if staged:
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
     for folder, keys in seen.items():
-        _check_key_file(report, folder / KEY_FILE, keys)
+        _check_key_file(report, folder / shards.KEY_FILE, keys)
 
 
 def _check_key_file(report: CheckReport, path: Path, keys: dict[str, str]) -> None:
     """Hold ``key_to_shard.json`` against the shards: ``{key: shard's number}``."""
-    listed = load_object(report, path) if path.is_file() else None
+    place = Place(report, path)
+    listed = place.load() if path.is_file() else None
     if listed:
         for key in sorted(keys.keys() - listed.keys()):
-            report.report(path, key, f"missing; it is in {keys[key]}")
+            place[key].report(f"missing; it is in {keys[key]}")
         for key in sorted(listed.keys() - keys.keys()):
-            report.report(path, key, "in no shard")
+            place[key].report("in no shard")
 
 
-def _content(report: CheckReport, path: Path, group: Iterator[TarMember]) -> Content:
+def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember]) -> Content:
     """Read an image's members, as many as may be in memory."""
     content: Content = {}
     total = 0
     for _, extension, *span in group:
         total += span[1]
         if total <= _MAX_IMAGE_BYTES:
-            data = attempt(report, path, "archive", partial(read_span, path, *span))
+            data = Place(report, path, "archive").attempt(partial(shards.read_span, path, *span))
             content |= {} if data is None else {extension: data}
     return content
 
 
 def _check_image(report: CheckReport, start: str, content: Content, models: Models | None) -> None:
     """Check the members of one key."""
-    names = {field_of(name): name for name in reversed(content)}
+    names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
     if "image" in names:
         name = names["image"]
-        shape = picture_shape(report, f"{start}.{name}", content[name])
+        shape = picture_shape(Place(report, f"{start}.{name}"), content[name])
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
     if "depth" in names:
         name = names["depth"]
-        one_channel_of(report, f"{start}.{name}", shape, content[name], DEPTH_MODES)
+        one_channel_of(Place(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
     if "camera.json" not in content:
         report.report(f"{start}.camera.json", "member", "missing")
     if "gt.json" not in content:
         report.note("some keys have no gt.json: their poses are not published")
     records = ShardRecords(start, lambda name: content.get(f"{name}.json"), report)
 
-    def silhouette(name: str) -> Callable[[int], Mask | None]:
-        is_known = shape is not None and records.json(name) is not None
-        return lambda n: records.mask(name, n, shape) if is_known and shape else None
+    camera, truths, infos = records.json("camera"), records.truths, records.infos
+    known = {name for name in ("mask", "mask_visib") if records.json(name) is not None}
 
-    check_image(
-        report,
-        records.place,
-        records.json("camera"),
-        records.truths,
-        records.infos,
-        shape,
-        "depth" in names,
-        models,
-        Silhouettes(silhouette("mask"), silhouette("mask_visib")),
-    )
+    def read_mask(name: str, number: int) -> Mask | None:
+        return records.mask(name, number, shape) if shape and name in known else None
+
+    has_depth = "depth" in names
+    check_image(records.places, camera, truths, infos, shape, has_depth, models, read_mask)

@@ -17,20 +17,11 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES
 from dopepp.data.formats import share
+from dopepp.data.formats.bop import records as bop
 from dopepp.data.formats.bop.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.bop.models import parts_by_id
-from dopepp.data.formats.bop.records import (
-    ESTIMATED,
-    BopPoses,
-    Record,
-    make_instance,
-    pair_infos,
-    read_cameras,
-    read_poses,
-)
-from dopepp.data.formats.problems import STRICT, Problems, decode_json, entries, mapping
-from dopepp.data.formats.webdataset.shards import find_shards
-from dopepp.data.formats.webdataset.tar import ShardIndex, index_shard
+from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
+from dopepp.data.formats.webdataset.shards import ShardIndex, find_shards, index_shard
 from dopepp.data.sample import Sample, SourceInfo
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import check_camera
@@ -53,9 +44,6 @@ class WebdatasetSource:
             :func:`~dopepp.data.formats.webdataset.shards.find_shards`.
         download_dir: Where shards from URLs are kept; None refuses URLs.
         allow_commands: Whether ``pipe:`` may run a command.
-
-    Raises:
-        UserError: A shard is missing, damaged or refused, a key comes twice, or no image is left.
     """
 
     def __init__(
@@ -91,16 +79,16 @@ class WebdatasetSource:
         assert content is not None  # the index holds no image without
         picture = decode_rgb(content, records.start)
         shape: Shape = picture.shape[:2]
-        K, scales = read_cameras([records.json("camera")], records.place)
+        K, scales = bop.read_cameras([records.json("camera")], records.places)
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
-        poses = self._poses(records)
+        poses = records.poses()
         instances = []
         for number in self._chosen(poses):
             mask = records.mask("mask_visib", number, shape) if has_masks else None
             part = self._parts[int(poses.obj_ids[number])]
             T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
-            instances.append(make_instance(part, T, camera, fraction, mask, shape))
+            instances.append(bop.make_instance(part, T, camera, fraction, mask, shape))
         encoded = shard.read(image, "depth") if self._read_depth else None
         depth = None
         if encoded is not None:
@@ -110,11 +98,7 @@ class WebdatasetSource:
     def _records(self, shard: ShardIndex, image: int) -> ShardRecords:
         return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
 
-    def _poses(self, records: ShardRecords) -> BopPoses:
-        """Read an image's ground truth; empty where it has none."""
-        return read_poses(records.truths, records.infos, records.place)
-
-    def _chosen(self, poses: BopPoses) -> list[int]:
+    def _chosen(self, poses: bop.BopPoses) -> list[int]:
         """Return the numbers of the objects of interest before the camera."""
         wanted = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
         return [int(number) for number in np.flatnonzero(wanted)]
@@ -125,7 +109,7 @@ class WebdatasetSource:
         if not wanted:
             return False
         for number, image in self._items.tolist():
-            poses = self._poses(self._records(self._shards[number], image))
+            poses = self._records(self._shards[number], image).poses()
             if any(int(poses.obj_ids[k]) in wanted for k in self._chosen(poses)):
                 return True
         return False
@@ -143,7 +127,7 @@ class WebdatasetSource:
             "shards": [shard.path.name for shard in self._shards],
             "members": digest.hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
-            "visible_fractions": "gt_info.json" if stated else ESTIMATED,
+            "visible_fractions": "gt_info.json" if stated else bop.ESTIMATED,
         }
         return [SourceInfo(self.name, len(self), identity)]
 
@@ -162,44 +146,50 @@ class ShardRecords:
         self.start, self._read, self._problems = start, read, problems
         self.json = cache(self._json)
 
-    def place(self, what: str, number: int) -> tuple[str, str]:
-        """Return where a record stands: member and start of the field."""
-        return f"{self.start}.{what}.json", "" if what == "camera" else f"[{number}]"
+    def _member(self, name: str) -> Place:
+        return Place(self._problems, f"{self.start}.{name}.json")
+
+    def places(self, what: str, number: int) -> Place:
+        """Return where a record stands."""
+        member = self._member(what)
+        return member if what == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
         """Return what a member holds, None where there is none or it cannot be read."""
-        content, path = self._read(name), f"{self.start}.{name}.json"
+        content, member = self._read(name), self._member(name)
         if content is None or len(content) <= MAX_BYTES:
-            return None if content is None else decode_json(self._problems, path, content)
+            return None if content is None else member.decode(content)
         allowed = f"at most {MAX_BYTES / 1e6:.0f} MB"
-        self._problems.report(path, "member", f"{len(content) / 1e6:.0f} MB", allowed)
+        member["member"].report(f"{len(content) / 1e6:.0f} MB", allowed)
         return None
 
     def _entries(self, name: str) -> list[Any]:
         found = self.json(name)
-        path = f"{self.start}.{name}.json"
-        return [] if found is None else entries(self._problems, path, "", found)
+        return [] if found is None else self._member(name).entries(found)
 
     @cached_property
-    def truths(self) -> list[Record]:
+    def truths(self) -> list[bop.Record]:
         """The ``gt`` records of the objects, none where there are none."""
         return self._entries("gt")
 
     @cached_property
-    def infos(self) -> list[Record | None]:
+    def infos(self) -> list[bop.Record | None]:
         """The ``gt_info`` record of each object, None where there is none."""
         if self.json("gt_info") is None:
             return [None] * len(self.truths)
-        path = f"{self.start}.gt_info.json"
-        return pair_infos(self.truths, self._entries("gt_info"), path, "", self._problems)
+        return bop.pair_infos(self.truths, self._entries("gt_info"), self._member("gt_info"))
+
+    def poses(self) -> bop.BopPoses:
+        """Return the ground truth; empty where there is none."""
+        return bop.read_poses(self.truths, self.infos, self.places)
 
     def mask(self, name: str, number: int, shape: Shape) -> Mask | None:
         """Return an object's mask in ``mask`` or ``mask_visib``, None where it is damaged."""
-        runs, path = self.json(name), f"{self.start}.{name}.json"
+        runs = self.json(name)
         # Objects by number, or (older shards) a list of them.
         listed = dict(enumerate(runs)) if isinstance(runs, list) else {}
         record = listed.get(number, mapping(runs).get(f"{number}"))
-        return decode_runs(record, shape, path, f"{number}", self._problems)
+        return decode_runs(record, shape, self._member(name)[f"{number}"])
 
 
 def _check_keys(shards: Sequence[ShardIndex]) -> None:

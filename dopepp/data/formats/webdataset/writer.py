@@ -16,13 +16,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path, write_whole
-from dopepp.core.json import read_json
-from dopepp.data.formats import STAGING, finalizing, stage, staged_items
+from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.images import encode_png, encode_runs
 from dopepp.data.formats.bop.writer import BopFolder
-from dopepp.data.formats.webdataset.tar import KEY_FILE, members, read_span
+from dopepp.data.formats.webdataset.shards import KEY_FILE, members, read_span
 from dopepp.data.sample import Sample
 
 _OWNER: Final = "dopepp"
@@ -91,14 +89,10 @@ class WebdatasetWriter(BopFolder):
         if not self._shard(chunk).exists():
             return
         path = self.root / self.split / KEY_FILE
-        shards = read_json(path) if path.exists() else {}
-        if not isinstance(shards, dict):
-            raise UserError(f"{path}", "the object that this writer wrote", "remove it")
+        shards = read_object(path)
         merged = shards | {member.key: chunk for member in members(self._shard(chunk))}
-        if merged == shards:
-            return
-        lines = [f"  {json.dumps(key)}: {json.dumps(merged[key])}" for key in sorted(merged)]
-        write_whole(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+        if merged != shards:
+            write_whole(path, by_line(dict(sorted(merged.items()))))
 
     def _shard(self, chunk: int) -> Path:
         return self.root / self.split / f"shard-{chunk:06d}.tar"
@@ -119,10 +113,8 @@ def _merged(path: Path, chunk: int, staged: dict[int, Path]) -> Iterator[tuple[s
             sources[_image(key)] = source
             places[_image(key)] = [(m.extension, m.offset, m.size) for m in group]
     for image in sorted(places):
-        yield (
-            _key(chunk, image),
-            {name: read_span(sources[image], start, size) for name, start, size in places[image]},
-        )
+        content = {name: read_span(sources[image], *span) for name, *span in places[image]}
+        yield _key(chunk, image), content
 
 
 def _archive(key: str, content: Content) -> bytes:

@@ -14,15 +14,10 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.problems import CheckReport, check_map, picture_shape
+from dopepp.data.formats.problems import CheckReport, Place, check_map, picture_shape
 from dopepp.data.formats.tolerances import Box, box_problem, camera_problem, translation_problem
-from dopepp.data.formats.ycb_video.frame import (
-    FOLDERS,
-    FrameMeta,
-    read_classes,
-    read_image_set,
-    read_meta,
-)
+from dopepp.data.formats.ycb_video import frame as files
+from dopepp.data.formats.ycb_video.frame import FOLDERS, FrameMeta
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.parts.mesh.measure import Points, largest_distance
@@ -32,7 +27,7 @@ _MAX_POINTS: Final = 100_000
 
 def check_ycb(report: CheckReport) -> None:
     """Check the frames of ``data/`` and ``data_syn/``; without a class list, it is a UserError."""
-    classes = read_classes(report.root)
+    classes = files.read_classes(report.root)
     if not classes or len(set(classes)) != len(classes):
         path = report.root / "image_sets" / "classes.txt"
         report.report(path, "names", "empty, or one name twice")
@@ -51,7 +46,7 @@ def _check_lists(report: CheckReport) -> None:
         absent = 0
         for subset, folder in FOLDERS.items():
             try:
-                listed = read_image_set(report.root, path.stem, subset)
+                listed = files.read_image_set(report.root, path.stem, subset)
             except UserError as error:
                 report.take(path, "line", error)
                 break
@@ -95,46 +90,47 @@ class _FrameCheck:
 
     def check(self, start: str) -> None:
         """Check the files of the frame whose paths begin like this."""
-        report = self._report
-        shape = picture_shape(report, f"{start}-color.png")
-        check_map(report, Path(f"{start}-depth.png"), shape)
-        label_path, path = Path(f"{start}-label.png"), Path(f"{start}-meta.mat")
-        label = check_map(report, label_path, shape)
-        meta = read_meta(path, report)
+        colour, depth, labels, matrices = (
+            Place(self._report, Path(f"{start}-{name}"))
+            for name in ("color.png", "depth.png", "label.png", "meta.mat")
+        )
+        shape = picture_shape(colour)
+        check_map(depth, shape)
+        label = check_map(labels, shape)
+        meta = files.read_meta(Path(f"{start}-meta.mat"), self._report)
         K = meta.K if meta.K is not None and np.isfinite(meta.K).all() else None
         problem = None if K is None or shape is None else camera_problem(K, shape)
         if problem is not None:
-            report.report(path, "intrinsic_matrix", problem)
+            matrices["intrinsic_matrix"].report(problem)
             K = None
         self._check_box_file(Path(f"{start}-box.txt"), shape)
         is_read = bool(meta.poses) or np.isfinite(meta.factor_depth)
         if label is not None and is_read:
             strangers = sorted(set(np.unique(label).tolist()) - {0, *meta.poses})
             if strangers:
-                got = f"classes {strangers} without a pose in meta.mat"
-                report.report(label_path, "values", got)
+                labels["values"].report(f"classes {strangers} without a pose in meta.mat")
         for index in meta.poses:
             seen = None if label is None else Box.of_mask(label == index)
-            self._check_pose(path, meta, index, K, seen)
+            self._check_pose(matrices, meta, index, K, seen)
 
     def _check_pose(
-        self, path: Path, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
+        self, place: Place, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
     ) -> None:
         column, T_cam_obj = meta.columns[index], meta.poses[index]
         if not 1 <= index <= len(self._classes):
             allowed = f"1 … {len(self._classes)}, the lines of classes.txt"
-            where = f"cls_indexes[{column}]"
-            self._report.report(path, where, f"unknown class {index}", allowed)
+            place["cls_indexes"][column].report(f"unknown class {index}", allowed)
             return
+        place = place["poses"][column]
         shape = self._shape(self._classes[index - 1])
-        place = translation_problem(T_cam_obj[:3, 3], None if shape is None else shape[1])
-        if place is not None:
-            self._report.report(path, f"poses[{column}].{place[0]}", place[1])
-        if place or shape is None or K is None or not np.isfinite(T_cam_obj).all():
+        apart = translation_problem(T_cam_obj[:3, 3], None if shape is None else shape[1])
+        if apart is not None:
+            place[apart[0]].report(apart[1])
+        if apart or shape is None or K is None or not np.isfinite(T_cam_obj).all():
             return
         problem = box_problem(transform(T_cam_obj, shape[0]), K, seen)
         if problem is not None:
-            self._report.report(path, f"poses[{column}].box", problem)
+            place["box"].report(problem)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
         """Check ``box.txt``, where there is one: name, left, top, right and bottom a line."""
@@ -143,19 +139,18 @@ class _FrameCheck:
             name, *values = line.split() or [""]
             if not name:
                 continue
-            where, got = f"line {number}", f"{line!r:.60}"
+            place, got = Place(self._report, path, f"line {number}"), f"{line!r:.60}"
             try:
                 left, top, right, bottom = map(float, values)
             except ValueError:
-                self._report.report(path, where, got, "a name and four numbers")
+                place.report(got, "a name and four numbers")
                 continue
             if name not in self._classes:
-                self._report.report(path, where, f"unknown object {name!r:.60}")
+                place.report(f"unknown object {name!r:.60}")
             outside = shape is not None and (
                 left >= shape[1] or top >= shape[0] or right < 0 or bottom < 0
             )
             if not (left < right and top < bottom):
-                self._report.report(path, where, got, "left < right and top < bottom")
+                place.report(got, "left < right and top < bottom")
             elif outside and shape is not None:
-                got = f"{got} outside the {shape[1]}×{shape[0]} image"
-                self._report.report(path, where, got)
+                place.report(f"{got} outside the {shape[1]}×{shape[0]} image")

@@ -9,18 +9,17 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import scipy.io
-from jaxtyping import Integer, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.problems import STRICT, Problems, numbers, read_map, scalar
+from dopepp.data.formats.problems import STRICT, Place, Problems
 from dopepp.data.formats.tolerances import rotation_problem
-from dopepp.drawing.pictures import DepthMap, Shape, read_image
+from dopepp.drawing.pictures import read_image
 from dopepp.geometry.camera import (
     CameraMatrix,
     Transform,
     camera_matrix,
-    check_camera,
     make_transform,
 )
 
@@ -30,29 +29,24 @@ FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
 
 
 def read_classes(root: Path) -> list[str]:
-    """Return the object names of ``image_sets/classes.txt``; a class index is the line from 1.
-
-    Raises:
-        UserError: The folder is missing, has no ``data/``, or has no class list.
-    """
-    layout = "a YCB-Video folder with data/, image_sets/classes.txt and models/"
-    fix = "set data.root to the unpacked YCB-Video data set"
-    if not root.is_dir():
-        raise UserError(f"data.root={root}, which is no folder", layout, fix)
-    if not (root / "data").is_dir():
-        raise UserError(f"data.root={root}, which has no data/", layout, fix)
+    """Return the object names of ``image_sets/classes.txt``; a class index is the line from 1."""
     path = root / "image_sets" / "classes.txt"
-    if not path.is_file():
-        raise UserError(f"data.root={root}, which has no image_sets/classes.txt", layout, fix)
+    for is_there, lack in (
+        (root.is_dir(), "is no folder"),
+        ((root / "data").is_dir(), "has no data/"),
+        (path.is_file(), "has no image_sets/classes.txt"),
+    ):
+        if not is_there:
+            raise UserError(
+                f"data.root={root}, which {lack}",
+                "a YCB-Video folder with data/, image_sets/classes.txt and models/",
+                "set data.root to the unpacked YCB-Video data set",
+            )
     return path.read_text().split()
 
 
 def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
-    """Return a subset's frames in ``image_sets/NAME.txt``, e.g. ``0050/000003`` or ``000000``.
-
-    Raises:
-        UserError: There is no such list, or a line is no frame.
-    """
+    """Return a subset's frames in ``image_sets/NAME.txt``, e.g. ``0050/000003`` or ``000000``."""
     path = root / "image_sets" / f"{image_set}.txt"
     if not path.is_file():
         lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
@@ -99,52 +93,48 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     A file that is missing, cut short or lacks a field, and a pose that is not finite, no rotation,
     or behind the camera, is a problem.
     """
-    fields = _load(path, problems)
+    place = Place(problems, path)
+    fields = _load(path, place["file"])
     if fields is None:
         return FrameMeta({}, {}, None, np.nan)
     for name in ("cls_indexes", "poses", "factor_depth"):
         if name not in fields:
-            problems.report(path, name, "missing", _ALLOWED)
+            place[name].report("missing", _ALLOWED)
     factor_depth = np.nan
     if "factor_depth" in fields:
-        factor_depth = scalar(problems, path, "factor_depth", fields["factor_depth"])
+        factor_depth = place["factor_depth"].scalar(fields["factor_depth"])
     if factor_depth <= 0:
-        problems.report(path, "factor_depth", f"{factor_depth:g}", "above 0")
+        place["factor_depth"].report(f"{factor_depth:g}", "above 0")
     K = fields.get("intrinsic_matrix")
     poses: dict[int, Transform] = {}
     columns: dict[int, int] = {}
-    for column, (index, pose) in enumerate(_columns(path, fields, problems)):
+    for column, (index, pose) in enumerate(_columns(place, fields)):
         if index in poses:
-            problems.report(path, f"cls_indexes[{column}]", f"class {index} twice", "each once")
+            place["cls_indexes"][column].report(f"class {index} twice", "each once")
             continue
-        poses[index] = _pose(pose, path, f"poses[{column}]", problems)
+        poses[index] = _pose(pose, place["poses"][column])
         columns[index] = column
-    return FrameMeta(
-        poses,
-        columns,
-        None if K is None else numbers(problems, path, "intrinsic_matrix", K, 3, 3),
-        factor_depth,
-    )
+    K = None if K is None else place["intrinsic_matrix"].numbers(K, 3, 3)
+    return FrameMeta(poses, columns, K, factor_depth)
 
 
-def _load(path: Path, problems: Problems) -> dict[str, NDArray[Any]] | None:
+def _load(path: Path, place: Place) -> dict[str, NDArray[Any]] | None:
     try:
         size = path.stat().st_size
         content = path.read_bytes() if size <= _MAX_META_BYTES else None
     except OSError as error:
-        problems.report(path, "file", str(error.strerror), _ALLOWED)
+        place.report(str(error.strerror), _ALLOWED)
         return None
     if content is None:
-        allowed = f"at most {_MAX_META_BYTES:,}"
-        problems.report(path, "file", f"{size:,} bytes", allowed)
+        place.report(f"{size:,} bytes", f"at most {_MAX_META_BYTES:,}")
         return None
     if not _is_complete(content):
-        problems.report(path, "file", f"cut short after {size} bytes", _ALLOWED)
+        place.report(f"cut short after {size} bytes", _ALLOWED)
     try:
         # vertmap and the like are megabytes that nobody needs.
         return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
     except Exception as error:  # SciPy lets through whatever a damaged byte happens to cause
-        problems.report(path, "file", f"damaged ({error})", _ALLOWED)
+        place.report(f"damaged ({error})", _ALLOWED)
         return None
 
 
@@ -158,35 +148,31 @@ def _is_complete(content: bytes) -> bool:
     return start == len(content) > _HEADER_BYTES
 
 
-def _columns(
-    path: Path, fields: Mapping[str, NDArray[Any]], problems: Problems
-) -> list[tuple[int, NDArray[Any]]]:
+def _columns(place: Place, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
     """Return each object's class index and 3×4 pose, none where the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
     stored = np.asarray(fields["cls_indexes"])
-    indices = numbers(problems, path, "cls_indexes", stored, stored.size)
+    indices = place["cls_indexes"].numbers(stored, stored.size)
     odd = indices[indices % 1 != 0]
     if np.isfinite(odd).any():
-        problems.report(path, "cls_indexes", f"{odd.tolist()!r:.60}", "whole numbers")
+        place["cls_indexes"].report(f"{odd.tolist()!r:.60}", "whole numbers")
     stack = np.asarray(fields["poses"])
     stack = stack[..., None] if stack.shape == (3, 4) else stack  # MATLAB drops a last axis of 1
     if stack.shape != (3, 4, len(indices)):
-        got = f"shape {stack.shape} for {len(indices)} classes"
-        problems.report(path, "poses", got, "(3, 4, N)")
+        place["poses"].report(f"shape {stack.shape} for {len(indices)} classes", "(3, 4, N)")
     elif not len(odd):
         return [(int(index), stack[..., n]) for n, index in enumerate(indices)]
     return []
 
 
-def _pose(value: NDArray[Any], path: Path, where: str, problems: Problems) -> Transform:
-    pose = numbers(problems, path, where, value, 3, 4)
+def _pose(value: NDArray[Any], place: Place) -> Transform:
+    pose = place.numbers(value, 3, 4)
     if problem := rotation_problem(pose[:, :3]):
-        problems.report(path, f"{where}.R", problem, "a rigid transform")
+        place["R"].report(problem, "a rigid transform")
         pose[:, :3] = np.nan
     if pose[2, 3] <= 0:
-        got = f"behind the camera (z = {pose[2, 3]:.3g} m)"
-        problems.report(path, f"{where}.z", got, "above 0")
+        place["z"].report(f"behind the camera (z = {pose[2, 3]:.3g} m)", "above 0")
         pose[:, 3] = np.nan
     return make_transform(pose[:, :3], pose[:, 3])
 
@@ -199,48 +185,8 @@ _CAMERAS: Final = (
 """The data set's two colour cameras: scenes 0000–0059 and data_syn, scenes 0060–0091."""
 
 
-@dataclass(frozen=True)
-class YcbFrame:
-    """What the files of a frame hold.
-
-    Attributes:
-        image: RGB, with alpha on synthetic frames.
-        label: Class index of every pixel, 0 where no object is labelled.
-        depth: Metres, 0 where unknown; None where it was not asked for.
-        poses: T_cam_obj of every object, by class index, metres.
-    """
-
-    image: UInt8[np.ndarray, "height width channels"]
-    label: Integer[np.ndarray, "height width"]
-    depth: DepthMap | None
-    K: CameraMatrix
-    poses: Mapping[int, Transform]
-
-
-def read_frame(root: Path, subset: Subset, frame: str, with_depth: bool) -> YcbFrame:
-    """Read a frame, e.g. ``0050/000003`` of the real subset.
-
-    Raises:
-        UserError: A file is missing or damaged, sizes differ, or a pose or K is impossible.
-    """
-    start = f"{root / FOLDERS[subset] / frame}-"
-    image = _read_colour(Path(start + "color.png"), alpha=subset == "synthetic")
-    shape: Shape = image.shape[:2]
-    meta = read_meta(Path(start + "meta.mat"))
-    depth = None
-    if with_depth:
-        depth = read_map(Path(start + "depth.png"), shape) / np.float32(meta.factor_depth)
-    K = _camera(subset, frame) if meta.K is None else meta.K
-    return YcbFrame(
-        image,
-        read_map(Path(start + "label.png"), shape),
-        depth,
-        check_camera(K, (shape[1], shape[0]), start + "meta.mat"),
-        meta.poses,
-    )
-
-
-def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
+def read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
+    """Read a frame's picture as RGB, with alpha (a synthetic one's) or without."""
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
         raise UserError(
@@ -251,6 +197,7 @@ def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width cha
     return image
 
 
-def _camera(subset: Subset, frame: str) -> CameraMatrix:
+def camera_of(subset: Subset, frame: str) -> CameraMatrix:
+    """Return K of a frame whose ``meta.mat`` does not state it."""
     scene = 0 if subset == "synthetic" else int(frame.partition("/")[0])
     return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]

@@ -15,18 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ycb_video.frame import (
-    FOLDERS,
-    Subset,
-    read_classes,
-    read_frame,
-    read_image_set,
-    read_meta,
-)
-from dopepp.data.rng import Purpose, item_rng
-from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
-from dopepp.drawing.pictures import Mask, Picture
-from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
+from dopepp.data.formats.bop.records import make_instance
+from dopepp.data.formats.problems import read_map
+from dopepp.data.formats.ycb_video import frame as files
+from dopepp.data.formats.ycb_video.frame import FOLDERS, Subset, read_meta
+from dopepp.data.sample import Purpose, Sample, SourceInfo, item_rng
+from dopepp.drawing.pictures import Picture, Shape
+from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -52,11 +47,6 @@ class YcbVideoSource:
         frames: Frames instead of a list: ``0050/000003`` (real) or ``000000`` (synthetic).
         backgrounds: Pictures behind synthetic frames, whose own background is transparent.
         seed: Seed of those backgrounds; they change with the epoch.
-
-    Raises:
-        UserError: The folder is wrong, an object is unknown, or none of the frames is on disk.
-        ValueError: Neither or both of ``image_set`` and ``frames``, or synthetic frames without
-            ``backgrounds``.
     """
 
     def __init__(
@@ -76,7 +66,7 @@ class YcbVideoSource:
             raise ValueError("synthetic frames are transparent: give backgrounds")
         self.root, self.subset = Path(root), subset
         self.name = f"ycb_video/{FOLDERS[subset]}"
-        classes = read_classes(self.root)
+        classes = files.read_classes(self.root)
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
             raise UserError(
@@ -84,47 +74,51 @@ class YcbVideoSource:
             )
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
-            frames = read_image_set(self.root, image_set, subset)
+            frames = files.read_image_set(self.root, image_set, subset)
         self.frames = self._present(
             list(frames or ()), f"{image_set}.txt" if image_set else "frames"
         )
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
     def _present(self, listed: list[str], where: str) -> list[str]:
-        present = [frame for frame in listed if self._path(frame, "color.png").is_file()]
-        absent = len(listed) - len(present)
-        if not present:
+        folder = self.root / FOLDERS[self.subset]
+        is_there = {frame: self._path(frame, "color.png").is_file() for frame in listed}
+        absent = [frame for frame in listed if not is_there[frame]]
+        if len(absent) == len(listed):
             raise UserError(
-                f"no frame of {where} under {self.root / FOLDERS[self.subset]} ({absent:,} listed)",
+                f"no frame of {where} under {folder} ({len(absent):,} listed)",
                 "at least one listed frame on disk",
                 "unpack the data set fully, or choose another image set",
             )
         if absent:
-            first = next(f for f in listed if not self._path(f, "color.png").is_file())
-            _log.warning(
-                "%s: %s of %s frames listed in %s are absent; first: %s",
-                self.name,
-                f"{absent:,}",
-                f"{len(listed):,}",
-                where,
-                first,
-            )
-        return present
+            counts = f"{len(absent):,} of {len(listed):,}"
+            message = "%s: %s frames listed in %s are absent; first: %s"
+            _log.warning(message, self.name, counts, where, absent[0])
+        return [frame for frame in listed if is_there[frame]]
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read a frame; only the background of a synthetic one depends on the epoch."""
-        frame = self.frames[index]
-        raw = read_frame(self.root, self.subset, frame, self._read_depth)
-        instances = [
-            self._instance(part, raw.poses[class_index], raw.K, raw.label == class_index)
-            for class_index, part in self._parts.items()
-            if class_index in raw.poses
-        ]
-        image = self._rgb(raw.image, frame, epoch)
-        return Sample(image, raw.K, instances, raw.depth, self.name, frame)
+        frame, is_real = self.frames[index], self.subset == "real"
+        image = files.read_colour(self._path(frame, "color.png"), alpha=not is_real)
+        shape: Shape = image.shape[:2]
+        path = self._path(frame, "meta.mat")
+        meta, depth = read_meta(path), None
+        if self._read_depth:
+            depth = read_map(self._path(frame, "depth.png"), shape) / np.float32(meta.factor_depth)
+        labels = read_map(self._path(frame, "label.png"), shape)
+        stated = files.camera_of(self.subset, frame) if meta.K is None else meta.K
+        K = check_camera(stated, (shape[1], shape[0]), str(path))
+        instances = []
+        for class_index, part in self._parts.items():
+            if class_index in meta.poses:
+                seen = labels == class_index
+                mask = None if is_real and not seen.any() else seen
+                pose = meta.poses[class_index]
+                instances.append(make_instance(part, pose, K, np.nan, mask, shape))
+        return Sample(self._rgb(image, frame, epoch), K, instances, depth, self.name, frame)
 
     def _path(self, frame: str, what: str) -> Path:
         return self.root / FOLDERS[self.subset] / f"{frame}-{what}"
@@ -138,19 +132,6 @@ class YcbVideoSource:
         alpha = image[..., 3:].astype(np.float32) / 255
         blend = alpha * image[..., :3] + (1 - alpha) * background
         return np.asarray(np.rint(blend), np.uint8)
-
-    def _instance(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, mask: Mask) -> Instance:
-        inside, whole = hull_areas(project(transform(T_cam_obj, part.points), K), mask.shape)
-        num_pixels = int(np.count_nonzero(mask))
-        unlabelled = num_pixels == 0 and self.subset == "real"
-        visible = inside if unlabelled else num_pixels
-        return Instance(
-            label=part.name,
-            T_cam_obj=T_cam_obj,
-            keypoints=project_keypoints(part.cuboid, T_cam_obj, K),
-            visible_fraction=min(1.0, visible / whole) if whole > 0 else 0.0,
-            mask=None if unlabelled else mask,
-        )
 
     def contains(self, label: str) -> bool:
         """Tell whether a frame holds this object, reading frames until one does."""

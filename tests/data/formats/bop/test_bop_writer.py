@@ -187,14 +187,6 @@ def test_truncated_hidden_and_far_objects(plate):
     # 20 m do not fit into 16 bits of 0.1 mm.
     assert labels.camera["depth_scale"] == 1.0
     assert labels.depth[10, 5] == 20_000
-    bare = [replace(instance, mask=None)]
-    for sample, numbers, message in (
-        (Sample(image, K, instances), {"plate": 1}, "without depth"),
-        (Sample(image, K, bare, depth), {"plate": 1}, "without a mask"),
-        (Sample(image, K, instances, depth), {"other": 1}, "'plate'"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make_labels(sample, numbers, surfaces)
 
 
 def test_refuses_a_folder_of_something_else(parts, tmp_path):

@@ -16,8 +16,9 @@ from dopepp.core.errors import UserError
 from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.images import decode_runs, encode_runs
 from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.problems import STRICT, Place
+from dopepp.data.formats.webdataset.shards import FIELDS, index_shard, members
 from dopepp.data.formats.webdataset.source import WebdatasetSource
-from dopepp.data.formats.webdataset.tar import FIELDS, index_shard, members
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 
 NUM_IMAGES = 4
@@ -107,13 +108,13 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(written, parts, sam
 def test_runs_round_trip(mask):
     record = encode_runs(mask)
     assert sum(record["counts"]) == mask.size
-    np.testing.assert_array_equal(decode_runs(record, mask.shape, "x"), mask)
+    np.testing.assert_array_equal(decode_runs(record, mask.shape, Place(STRICT, "x")), mask)
 
 
 def test_runs_go_down_the_columns_and_begin_with_zeros():
     mask = np.array([[1, 0, 0], [1, 1, 0]], bool)
     assert encode_runs(mask) == {"counts": [0, 2, 1, 1, 2], "size": [2, 3]}
-    assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), "x").sum() == 0
+    assert decode_runs({"counts": [6], "size": [2, 3]}, (2, 3), Place(STRICT, "x")).sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,7 @@ def test_runs_go_down_the_columns_and_begin_with_zeros():
 )
 def test_damaged_runs(record, message):
     with pytest.raises(UserError, match=message):
-        decode_runs(record, (2, 3), "x")
+        decode_runs(record, (2, 3), Place(STRICT, "x"))
 
 
 def image_files(key: str, **changes: object) -> list[tuple[str, bytes]]:
