@@ -87,8 +87,8 @@ def test_an_evaluation_says_when_images_are_others(run, call, tmp_path, monkeypa
 
     render = Factory.render
 
-    def darker(self: Factory, epoch: int, index: int) -> Any:
-        rendered = render(self, epoch, index)
+    def darker(self: Factory, *place: Any) -> Any:
+        rendered = render(self, *place)
         np.floor_divide(rendered.image, 2, out=rendered.image)
         return rendered
 
