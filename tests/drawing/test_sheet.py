@@ -180,7 +180,7 @@ def test_a_caption_is_written_below_its_picture(caption):
 
 @pytest.mark.parametrize("arguments", [([], 2, 10), ([Tile(plain(RED))], 0, 10)])
 def test_an_empty_sheet_is_refused(arguments):
-    with pytest.raises(ValueError, match="a sheet needs tiles, columns and a width"):
+    with pytest.raises(ValueError, match="a grid needs pictures and columns"):
         contact_sheet(*arguments)
 
 
