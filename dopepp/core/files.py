@@ -1,4 +1,4 @@
-"""Files that are there completely or not at all, PNG among them, and the user's cache folder.
+"""Files that are there completely or not at all, also PNG and CSV, and the user's cache folder.
 
 A file is written beside its place under a name of :func:`partial_path` and renamed when it is
 whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
@@ -8,10 +8,13 @@ after.
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import os
 import re
 import socket
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -27,6 +30,18 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     write_whole(path, encoded.tobytes())
+
+
+def write_csv(
+    path: Path | str, rows: Sequence[Mapping[str, object]], header: Sequence[str] = ()
+) -> None:
+    """Write a CSV under headings, by default the fullest row's; what a row lacks is empty."""
+    text = io.StringIO(newline="")
+    fullest: Mapping[str, object] = max(rows, key=len)
+    writer = csv.DictWriter(text, header or list(fullest), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(path, text.getvalue().encode())
 
 
 def write_whole(path: Path | str, content: bytes) -> None:

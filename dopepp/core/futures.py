@@ -1,4 +1,4 @@
-"""Work in parallel: this machine's cores, futures in the order they are done in, and Ray."""
+"""Work in parallel: this machine's processor, futures in the order they are done in, and Ray."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from dopepp.core.errors import UserError, require
@@ -34,6 +35,13 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def cpu_fact(*names: str) -> str:
+    """Return what Linux states of the first processor under one of these names; else nothing."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(names)), "")
 
 
 def completed(

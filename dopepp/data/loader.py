@@ -45,6 +45,7 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
     """Hands out (epoch, index) in an order that depends on (seed, epoch) only.
 
     It is a ``DistributedSampler`` so that Lightning leaves it in its place; it calls ``set_epoch``.
+    Of the next pass, this rank's first ``skip`` items are left out, to resume inside an epoch.
 
     Args:
         shuffle: Training: a new order every epoch, and every rank gets equally many items. Without
@@ -56,16 +57,12 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
     ) -> None:
         super().__init__(dataset, num_replicas=world_size, rank=rank, shuffle=shuffle, seed=seed)
         self._num_items, self._rank, self._world_size = len(dataset), rank, world_size
-        self._skip = 0
+        self.skip = 0
 
     def __len__(self) -> int:
         if self.shuffle:
             return self._num_items // self._world_size
         return len(range(self._rank, self._num_items, self._world_size))
-
-    def skip_once(self, num_items: int) -> None:
-        """Leave out this rank's first items of the next pass, to resume inside an epoch."""
-        self._skip = num_items
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         """Go through this rank's items of the epoch that was set."""
@@ -74,7 +71,7 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
         if self.shuffle:
             order = item_rng(self.seed, Purpose.SHUFFLE, epoch).permutation(order)
         mine = order[self._rank :: self._world_size][: len(self)]
-        skip, self._skip = self._skip, 0
+        skip, self.skip = self.skip, 0
         return iter([(epoch, int(index)) for index in mine[skip:]])
 
 
@@ -115,7 +112,7 @@ class PoseLoader(DataLoader[Any]):
         """Yield batches, from the batch where a loaded state says the pass was cut off."""
         self._num_batches, self._resume_at = self._resume_at, 0
         assert self.batch_size is not None
-        self._epoch_sampler.skip_once(self._num_batches * self.batch_size)
+        self._epoch_sampler.skip = self._num_batches * self.batch_size
         for batch in super().__iter__():
             if isinstance(batch, UserError):
                 break

@@ -6,8 +6,6 @@ and tests cannot see each other's. :func:`figure_image` turns one into pixels.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.pictures import Picture
 
 MAX_THRESHOLD: Final = 0.1
@@ -84,12 +82,12 @@ def save_accuracy_curves(
     path = Path(path)
     thresholds = np.linspace(0.0, max_threshold, _NUM_STEPS + 1)
     shares = [accuracy_curve(errors, max_threshold)[1] for errors in curves.values()]
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["threshold_m", *curves])
-    for threshold, *row in zip(thresholds, *shares, strict=True):
-        writer.writerow([f"{threshold:.6g}", *(f"{share:.6g}" for share in row)])
-    write_whole(path.with_name(path.name + ".csv"), text.getvalue().encode())
+    columns = {"threshold_m": thresholds, **dict(zip(curves, shares, strict=True))}
+    rows = [
+        {name: f"{values[k]:.6g}" for name, values in columns.items()}
+        for k in range(len(thresholds))
+    ]
+    write_csv(path.with_name(path.name + ".csv"), rows)
     figure = accuracy_figure(curves, max_threshold, title)
     write_png(path.with_name(path.name + ".png"), figure_image(figure))
     return figure

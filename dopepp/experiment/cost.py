@@ -10,7 +10,6 @@ a trained network would answer: the true maps of the picture's objects, with noi
 
 from __future__ import annotations
 
-import csv
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -24,14 +23,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import nn
 
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.reports.tables import csv_text
+from dopepp.experiment.reports.tables import read_csv
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.geometry.camera import Letterbox
@@ -183,7 +182,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
         }
         for number in range(len(frames.seconds))
     ]
-    write_whole(run_dir / FRAMES_FILE, csv_text(rows).encode())
+    write_csv(run_dir / FRAMES_FILE, rows)
     save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
     write_job_readme(run_dir, f"Cost of {cost.name}")
     display.show_table(
@@ -240,8 +239,7 @@ def likely_maps(
 
 def read_frames(path: Path) -> FrameTimes:
     """Return what each frame of a cost job took; earlier versions timed the network alone."""
-    with path.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_csv(path)
     whole = np.array([float(row["seconds"]) for row in rows])
     network = np.array([float(row.get("network_seconds", row["seconds"])) for row in rows])
     recovery = np.array([float(row.get("recovery_seconds", 0)) for row in rows])

@@ -20,13 +20,12 @@ from lightning.pytorch.tuner.tuning import Tuner
 from torch import Tensor
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
-from dopepp.experiment.reports.tables import csv_text
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.training.system import PoseSystem
@@ -170,7 +169,7 @@ def _report(rates: Steps, losses: Steps, run_dir: Path) -> Suggestion | None:
         {"step": step, "learning_rate": rate, "loss": loss, "smoothed_loss": mean}
         for step, (rate, loss, mean) in enumerate(zip(rates, losses, smoothed, strict=True))
     ]
-    write_whole(run_dir / TABLE_FILE, csv_text(rows).encode())
+    write_csv(run_dir / TABLE_FILE, rows)
     found = suggest(rates, losses)
     figure, axes = figure_with_axes("learning rate", "training loss")
     axes.plot(rates, losses, alpha=0.3)

@@ -91,7 +91,10 @@ def search(
     for example in examples(space):
         loader.load_sweep_config(config, example)
     folder = Path(str(config.hydra.sweep.dir))
-    facts = facts_of(OmegaConf.to_container(config, resolve=False), space.texts)
+    plain = OmegaConf.to_container(config, resolve=False)
+    # All that decides a trial's result, and what it is varied by.
+    facts = {key: str(value) for key, value in flat(plain) if not below(key, _NO_PART)}
+    facts |= {f"search.space {key}": text for key, text in space.texts.items()}
     with alone(folder, str(options["study"])):
         study = open_study(options, facts, int(config.seed))
         trials = _Trials(study, space, launcher, folder)
@@ -330,12 +333,6 @@ def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -
         "the command that the study was begun with",
         "choose another search.study=NAME",
     )
-
-
-def facts_of(config: object, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return a config, and what it is varied by, flat and without what names only places."""
-    facts = {key: str(value) for key, value in flat(config) if not below(key, _NO_PART)}
-    return {**facts, **{f"search.space {key}": text for key, text in texts.items()}}
 
 
 def outcome(folder: Path) -> tuple[TrialState, float | None]:

@@ -244,14 +244,14 @@ def _best_first(points: Correspondences) -> Poses:
     All points are tried together, then all but one, then all but two, until as many agree.
     """
     count = len(points.rays)
-    normal = _thin_axis(points.object_points)
+    extents, axes = _principal_axes(points.object_points)
     poses = Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
     for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
         starts = _sqpnp(points, list(combinations(range(count), left_out)))
         if len(starts) > NUM_STARTS:
             starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]
-        if normal is not None:
-            starts += _mirrored(starts, normal)
+        if extents[2] < PLATE * extents[0]:  # a thicker part has no second tilt
+            starts += _mirrored(starts, axes[2])
         refined = refine(points, starts)
         poses += refined[_plausible(points, refined)]
         if len(poses) > 1:
@@ -275,12 +275,8 @@ def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, 
 
 def _plausible(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "s"]:
     """Tell sound poses: rotations, all points in front of the camera, at a believable distance."""
-    sound = np.empty(len(poses), np.bool_)
-    for number in range(len(poses)):
-        sound[number] = _is_plausible(
-            points.object_points, poses.rotations[number], poses.translations[number]
-        )
-    return sound
+    pairs = zip(poses.rotations, poses.translations, strict=True)
+    return np.array([_is_plausible(points.object_points, R, t) for R, t in pairs], bool)
 
 
 @compiled()
@@ -303,10 +299,8 @@ def _is_plausible(object_points: Array, R: Array, t: Array) -> bool:
 
 def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Poses:
     """Solve all points but some with OpenCV's SQPnP; NaN where it raises or finds no pose."""
-    rotations, translations = (
-        np.full((len(left_out), 3, 3), np.nan),
-        np.full((len(left_out), 3), np.nan),
-    )
+    rotations = np.full((len(left_out), 3, 3), np.nan)
+    translations = np.full((len(left_out), 3), np.nan)
     for R, t, missing in zip(rotations, translations, left_out, strict=True):
         kept = [k for k in range(len(points.rays)) if k not in missing]
         with suppress(cv2.error):  # OpenCV 5 raises on coincident points
@@ -320,12 +314,6 @@ def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Pose
             if found:
                 R[:], t[:] = cv2.Rodrigues(turn)[0], move[:, 0]
     return Poses(rotations, translations)
-
-
-def _thin_axis(object_points: Float[np.ndarray, "n 3"]) -> Vector | None:
-    """Return the unit normal of a plate; None for a thicker part, which has no second tilt."""
-    extents, axes = _principal_axes(object_points)
-    return np.asarray(axes[2]) if extents[2] < PLATE * extents[0] else None
 
 
 @compiled()

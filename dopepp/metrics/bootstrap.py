@@ -100,7 +100,8 @@ def paired_difference(
     if np.isnan(np.concatenate(figures)).any():
         return None
     rng = np.random.default_rng(seed)
-    draws = [_drawn_seeds(rng, num_resamples, len(own)) for own in figures]
+    counts = [len(own) for own in figures]
+    draws = [rng.multinomial(n, np.full(n, 1 / n), num_resamples) / n for n in counts]
     if same_seeds:
         draws[1] = draws[0]
     resampled = _resampled_difference(mine, baseline, compute, draws, rng)
@@ -195,12 +196,6 @@ def _check(mine: Numbers, baseline: Numbers, statistic: str, same_seeds: bool) -
             "a mean over numbers that are not finite", "finite numbers",
             "turn a miss into what it counts, e.g. 0 of a pass rate",
         )  # fmt: skip
-
-
-def _drawn_seeds(rng: np.random.Generator, num_resamples: int, num_seeds: int) -> Draws:
-    """Return how often each resample draws each seed, as a share."""
-    chances = np.full(num_seeds, 1 / num_seeds)
-    return rng.multinomial(num_seeds, chances, num_resamples) / num_seeds
 
 
 def _resampled_difference(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -41,7 +41,7 @@ def recover(
     :class:`RecoveryOptions`. Returned are the detections of all objects, best score first.
     """
     return recover_batch(
-        belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, **options
+        belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, None, **options
     )[0]
 
 
@@ -52,17 +52,37 @@ def recover_batch(
     K: Cameras,
     stride: int = 8,
     names: Sequence[str] | None = None,
+    reasons: list[str] | None = None,
     **options: float,
 ) -> list[list[Detection]]:
     """Recover the poses on every image of a batch; see :func:`recover`.
 
-    Peaks are found and read on the maps' device; only they come to the host. A ``ValueError``: the
-    channels do not match the number of cuboids, maps differ in size or have no cells, or there are
-    not as many cameras as images or names as objects. A :class:`UserError`: an option is out of
-    range.
+    Peaks are found and read on the maps' device; only they come to the host. ``reasons`` takes a
+    line for each object or centroid that is left out. A ``ValueError``: the channels do not match
+    the number of cuboids, maps differ in size or have no cells, or there are not as many cameras as
+    images or names as objects. A :class:`UserError`: an option is out of range.
     """
-    decoded = _decode(belief, field, cuboids, K, stride, names, options)
-    return [detections for detections, _ in decoded]
+    chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
+    reasons = [] if reasons is None else reasons
+    cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
+    _check_shapes(belief, field, len(cuboids), K)
+    labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
+    if len(labels) != len(cuboids):
+        raise ValueError(f"{len(cuboids)} objects need as many names, got {labels}")
+    if not labels:
+        return [[] for _ in K]
+    geometry = MapGeometry(stride, chosen.sigma)
+    peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
+    cells = (belief.shape[-1], belief.shape[-2])
+    size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
+    batch = []
+    for image, camera in enumerate(K):
+        detections: list[Detection] = []
+        for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
+            own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
+            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, reasons)
+        batch.append(sorted(detections, key=lambda one: -one.score))
+    return batch
 
 
 def explain(
@@ -75,43 +95,10 @@ def explain(
     **options: float,
 ) -> list[str]:
     """Say what :func:`recover` leaves out of these maps and why, one line an object or centroid."""
+    reasons: list[str] = []
     image = np.asarray(K)[None]
-    ((_, reasons),) = _decode(belief[None], field[None], cuboids, image, stride, names, options)
+    recover_batch(belief[None], field[None], cuboids, image, stride, names, reasons, **options)
     return reasons
-
-
-def _decode(
-    belief: Beliefs,
-    field: Fields,
-    cuboids: Cuboids,
-    K: Cameras,
-    stride: int,
-    names: Sequence[str] | None,
-    options: Mapping[str, float],
-) -> list[tuple[list[Detection], list[str]]]:
-    """Return each image's detections, best first, and a reason for each that is none."""
-    chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
-    cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
-    _check_shapes(belief, field, len(cuboids), K)
-    labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
-    if len(labels) != len(cuboids):
-        raise ValueError(f"{len(cuboids)} objects need as many names, got {labels}")
-    if not labels:
-        return [([], []) for _ in K]
-    geometry = MapGeometry(stride, chosen.sigma)
-    peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
-    cells = (belief.shape[-1], belief.shape[-2])
-    batch = []
-    for image, camera in enumerate(K):
-        detections: list[Detection] = []
-        reasons: list[str] = []
-        for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
-            own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            found, missed = _recover_object(own, cuboid, camera, name, chosen, stride, cells)
-            detections += found
-            reasons += missed
-        batch.append((sorted(detections, key=lambda one: -one.score), reasons))
-    return batch
 
 
 def _recover_object(
@@ -121,17 +108,15 @@ def _recover_object(
     name: str,
     options: RecoveryOptions,
     stride: int,
-    cells: tuple[int, int],
-) -> tuple[list[Detection], list[str]]:
-    """Recover all instances of one object; a reason for each that is none."""
+    size: str,
+    reasons: list[str],
+) -> Iterator[Detection]:
+    """Yield all instances of one object, and add a reason for each that is none."""
     if not len(peaks.centroid):
-        return [], [f"{name}: no centroid's belief reaches {options.centroid_threshold:g}"]
-    detections: list[Detection] = []
-    reasons: list[str] = []
+        reasons.append(f"{name}: no centroid's belief reaches {options.centroid_threshold:g}")
     for group, result in pose_instances(peaks, cuboid, K, options.max_angle_deg, float(stride)):
         detection = make_detection(group, result, cuboid, K, name)
         x, y = group.position[CENTROID]
-        size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
         where = f"{name} at pixel ({x:.0f}, {y:.0f}) of {size}"
         if detection is None:
             reasons.append(f"{where}: {result.reason}")
@@ -140,8 +125,7 @@ def _recover_object(
         if detection.score < options.min_score:
             reasons.append(f"{where}: score {detection.score:.3f} below {options.min_score:g}")
         else:
-            detections.append(detection)
-    return detections, reasons
+            yield detection
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:

@@ -6,7 +6,6 @@ To add a logger, a line in ``dopepp/experiment/build/registries.py`` and a file 
 from __future__ import annotations
 
 import csv
-import io
 import logging
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from typing import Any, TypeVar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from dopepp.core.files import write_whole
+from dopepp.core.files import write_csv
 from dopepp.drawing.pictures import Picture
 
 _log = logging.getLogger(__name__)
@@ -81,11 +80,8 @@ class MetricsTable(Logger):
         if not self._rows:
             return
         columns = sorted({name for row in self._rows.values() for name in row})
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, ["step", *columns], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({"step": step, **row} for step, row in sorted(self._rows.items()))
-        write_whole(self.path, text.getvalue().encode())
+        rows = [{"step": step, **row} for step, row in sorted(self._rows.items())]
+        write_csv(self.path, rows, ["step", *columns])
 
     def finalize(self, status: str) -> None:
         """Write what is left."""

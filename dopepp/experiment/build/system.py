@@ -16,6 +16,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
 
 from dopepp.core.errors import UserError
+from dopepp.core.futures import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment.build.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
@@ -184,7 +185,7 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
         return ("bf16-mixed", "this GPU has bf16") if fast else ("32-true", "this GPU has no bf16")
     if accelerator != "cpu":
         return "32-true", f"bf16 is not probed on {accelerator}"
-    fast = _BF16_FLAGS & _cpu_flags()
+    fast = _BF16_FLAGS & set(cpu_fact("flags", "Features").split())
     if fast:
         return "bf16-mixed", f"this CPU has bf16 arithmetic ({', '.join(sorted(fast))})"
     return "32-true", "this CPU has no bf16 arithmetic: training takes about twice as long"
@@ -200,14 +201,6 @@ def keep_freed_memory() -> None:
         libc = ctypes.CDLL(None)
         libc.mallopt(_M_MMAP_MAX, 0)
         libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
-
-
-def _cpu_flags() -> set[str]:
-    """Return the instruction sets that Linux reports; nothing elsewhere."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.is_file() else []
-    flags = [line.partition(":")[2] for line in lines if line.startswith(("flags", "Features"))]
-    return set(flags[0].split()) if flags else set()
 
 
 def estimate_training_s(

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png, write_whole
 from dopepp.data.sample import Sample
 from dopepp.drawing.curves import (
     PlotLine,
@@ -34,7 +34,7 @@ from dopepp.experiment.reports.differences import figures, full, headline, notes
 from dopepp.experiment.reports.entries import BASELINE, Entry, Run, find_runs, group, ordered
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.reports.report import Report
-from dopepp.experiment.reports.tables import Row, csv_text, markdown_text, read_csv
+from dopepp.experiment.reports.tables import Row, markdown_text, read_csv
 from dopepp.experiment.runs import display
 from dopepp.inference.estimator import PoseEstimator
 
@@ -76,7 +76,7 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
     )
     for note in said:
         display.console.print(note)
-    write_whole(folder / TABLE_FILE, csv_text(full(table)).encode())
+    write_csv(folder / TABLE_FILE, full(table))
     text = "\n".join([markdown_text(compact), *(f"- {note}" for note in said)]) + "\n"
     write_whole(folder / TEXT_FILE, text.encode())
     curves = accuracy_curves(entries)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png, write_whole
 from dopepp.data.sample import Sample, Source
 from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
 from dopepp.drawing.curves import figure_image, rates_figure
@@ -167,7 +167,7 @@ def record_condition(
         attrgetter("method", "object", "condition"),
         lambda one: {**one.names, condition.level: one.condition, one.measure: one.value},
     )
-    write_whole(run_dir / condition.table_file, tables.csv_text(records).encode())
+    write_csv(run_dir / condition.table_file, records)
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
     write_whole(run_dir / f"{condition.name}.md", text.encode())
     _draw(run_dir / f"{condition.name}.png", condition, table, rates)

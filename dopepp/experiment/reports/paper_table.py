@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import t
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png, write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.config.parse import parse
@@ -129,7 +129,7 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
     rows, doubts = KINDS[table.kind](table, methods, folder)
     labels = sum(name in _LABELS for name in rows[0])
     display.show_table(title, rows, num_labels=labels)
-    write_whole(folder / TABLE_FILE, tables.csv_text(rows).encode())
+    write_csv(folder / TABLE_FILE, rows)
     notes = [f"- {note}" for note in (*_notes(table, entries), *doubts)]
     text = "\n".join([f"# {title}", "", tables.markdown_text(rows), *notes])
     write_whole(folder / TEXT_FILE, f"{text}\n".encode())

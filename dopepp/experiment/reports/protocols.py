@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.reports import tables
 from dopepp.experiment.runs import display
@@ -224,7 +224,7 @@ def record_breakdown(
     display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
     records = tables.pivot(table, attrgetter("condition", "method"), record)
     path = run_dir / f"by_{quantity}"
-    write_whole(path.with_suffix(".csv"), tables.csv_text(records).encode())
+    write_csv(path.with_suffix(".csv"), records)
     panels = {
         rate.title: tables.rate_curves(tables.select(table, measure=rate.field)) for rate in rates
     }

@@ -10,7 +10,6 @@ To add a rate, write it down below :class:`PassRate`; it needs a field in ``Pose
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,15 +149,6 @@ def header_of(rows: Sequence[Mapping[str, object]]) -> list[str]:
     """Return the headings of the fullest row; others may lack some."""
     fullest: Mapping[str, object] = max(rows, key=len)
     return list(fullest)
-
-
-def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return a CSV under the headings of the fullest row; what a row lacks, and None, is empty."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, header_of(rows), restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def read_csv(path: Path) -> list[Row]:

@@ -20,6 +20,7 @@ import yaml
 import dopepp
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
+from dopepp.core.futures import cpu_fact
 from dopepp.core.json import read_json as read_strict_json
 from dopepp.training.checkpointing.files import BEST, FOLDER, LAST
 from dopepp.virtual.factory import code_hash
@@ -113,7 +114,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
 
 def _hardware() -> dict[str, Any]:
     return {
-        "processor": _processor(),
+        "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "memory_bytes": _memory_bytes(),
@@ -123,14 +124,6 @@ def _hardware() -> dict[str, Any]:
         ],
         "cuda": torch.version.cuda,
     }
-
-
-def _processor() -> str:
-    """Return the processor's name, which Linux alone has in a file."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _memory_bytes() -> int | None:

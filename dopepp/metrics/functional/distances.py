@@ -31,7 +31,9 @@ def add(
     rotation, translation = R_est - R_gt, t_est - t_gt
     errors = t_est.new_empty(len(t_est))
     for chunk in _chunks(len(t_est), len(points)):
-        errors[chunk] = _lengths(rotation[chunk], translation[chunk], points).mean(dim=1)
+        each = points.T.expand(len(rotation[chunk]), *points.T.shape)
+        offsets = torch.baddbmm(translation[chunk][..., None], rotation[chunk], each)
+        errors[chunk] = offsets.square_().sum(dim=1).sqrt_().mean(dim=1)
     return nan_is_miss(errors)
 
 
@@ -70,14 +72,6 @@ def mssd(
     R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
     group = _check_symmetries(symmetries, t_est)
     return least_farthest((R_est, t_est), (R_gt, t_gt), points, group, perspective=False)
-
-
-def _lengths(rotation: Rotations, translation: Positions, points: Tensor) -> Float[Tensor, "n v"]:
-    """Return ‖A x + b‖ of every point for every pair (A, b)."""
-    offsets = torch.baddbmm(
-        translation[..., None], rotation, points.T.expand(len(rotation), *points.T.shape)
-    )
-    return offsets.square_().sum(dim=1).sqrt_()
 
 
 def reprojection_error(

@@ -148,15 +148,8 @@ class DistancePlacement(Placement):
     margin: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("nearest", "farthest"):
-            check_number(name, getattr(self, name), 1e-6, _FARTHEST, "metres", of=self)
+        _check_ends(self, "nearest", "farthest", 1e-6, _FARTHEST, "metres", "in metres")
         check_number("margin", self.margin, 0.0, 0.49, "share", of=self)
-        if self.nearest > self.farthest:
-            raise UserError(
-                f"nearest={self.nearest} and farthest={self.farthest} of DistancePlacement",
-                "nearest <= farthest, in metres",
-                "change the placement's range",
-            )
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -177,14 +170,8 @@ class FillPlacement(Placement):
     largest: float = 0.95
 
     def __post_init__(self) -> None:
-        for name in ("smallest", "largest"):
-            check_number(name, getattr(self, name), 1e-3, 1.0, "share of the image", of=self)
-        if self.smallest > self.largest:
-            raise UserError(
-                f"smallest={self.smallest} and largest={self.largest} of FillPlacement",
-                "smallest <= largest, shares of the image",
-                "change the placement's range",
-            )
+        unit = "share of the image"
+        _check_ends(self, "smallest", "largest", 1e-3, 1.0, unit, "shares of the image")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -205,6 +192,22 @@ class FillPlacement(Placement):
                 break
             pixel = pixel + missing
         return np.asarray(depth * ray - centre)
+
+
+def _check_ends(
+    of: object, first: str, last: str, lowest: float, highest: float, unit: str, units: str
+) -> None:
+    """Refuse the two ends of a placement's range outside of bounds or in the wrong order."""
+    low, high = (
+        check_number(name, getattr(of, name), lowest, highest, unit, of=of)
+        for name in (first, last)
+    )
+    if low > high:
+        raise UserError(
+            f"{first}={low} and {last}={high} of {type(of).__name__}",
+            f"{first} <= {last}, {units}",
+            "change the placement's range",
+        )
 
 
 def _depth_that_fills(

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
+from dopepp.experiment.build import system as built
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, choose_precision, estimate_training_s
 from dopepp.experiment.config.run import TrainerConfig
@@ -23,7 +24,7 @@ from dopepp.experiment.config.run import TrainerConfig
 def test_bf16_is_taken_only_where_it_is_computed_in(
     accelerator, flags, gpu_is_fast, expected, monkeypatch
 ):
-    monkeypatch.setattr(hardware, "_cpu_flags", lambda: flags)
+    monkeypatch.setattr(built, "cpu_fact", lambda *names: " ".join(flags))
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
     assert choose_precision("auto", accelerator)[0] == expected
     assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
