@@ -1,36 +1,47 @@
-"""Training speed of the quickstart's network, with and without glibc keeping freed memory.
+"""Speed of the quickstart with each network: a training step, and one picture's maps.
 
-``python benchmarks/train_step.py`` runs both settings in turn in one process and prints the ratio.
+``python benchmarks/train_step.py`` runs ``experiment=quickstart`` with every model below in turn in
+one process: images a second of forward, loss and backward, with and without glibc keeping freed
+memory, and milliseconds of one picture's maps in float32. The first model is what the others are
+compared with. Other models: ``python benchmarks/train_step.py dopepp dopepp_fast …``.
 """
 
 from __future__ import annotations
 
 import ctypes
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
-from dopepp.experiment.build.system import choose_precision, keep_freed_memory
+from dopepp.experiment.build.sources import build_parts
+from dopepp.experiment.build.system import build_untrained, choose_precision, keep_freed_memory
+from dopepp.experiment.config.run import RunConfig
 from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.spec import build_network
+from dopepp.models.network import PoseNetwork, network_cost
 
-BATCH, SIZE, WIDTH = 32, 128, 0.5
-STEPS, ROUNDS = 5, 4
+CONF = Path(__file__).parents[1] / "conf"
+MODELS = ("dopepp", "dopepp_fast")
+BATCH, SIZE = 32, 128
+STEPS, PICTURES, ROUNDS = 5, 10, 4
 
 
-def make_step() -> Callable[[], None]:
-    """Return one forward and backward pass of the quickstart's network."""
-    network = build_network(
-        {
-            "backbone": {"_target_": "dopepp.models.backbones.DSC", "width": WIDTH},
-            "attention": {"_target_": "dopepp.models.attention.CBAM"},
-            "head": {"_target_": "dopepp.models.heads.MultiScale", "width": WIDTH},
-            "activation": "exp",
-            "num_objects": 1,
-        }
-    ).to(memory_format=torch.channels_last)
+def make_network(model: str) -> PoseNetwork:
+    """Return the quickstart's network of a model, untrained."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        node = compose("train", ["experiment=quickstart", f"model={model}"])
+    config = RunConfig.of(OmegaConf.to_container(node, resolve=True))
+    network, _ = build_untrained(config, build_parts(config.data))
+    return network.to(memory_format=torch.channels_last)
+
+
+def make_step(network: PoseNetwork) -> Callable[[], None]:
+    """Return one forward and backward pass of a network."""
     loss = SpatialCrossEntropy(sigma=1.0)
     images = torch.randint(0, 256, (BATCH, 3, SIZE, SIZE), dtype=torch.uint8)
     images = images.contiguous(memory_format=torch.channels_last)
@@ -40,18 +51,30 @@ def make_step() -> Callable[[], None]:
 
     def step() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            stages = network(images)
+            stages = network.train()(images)
         loss(stages, belief, field)[0].backward()
 
     return step
 
 
-def seconds(step: Callable[[], None]) -> float:
-    """Time a few steps."""
+def make_prediction(network: PoseNetwork) -> Callable[[], None]:
+    """Return one picture's way through a network, in float32."""
+    image = torch.randint(0, 256, (1, 3, SIZE, SIZE), dtype=torch.uint8)
+
+    def predict() -> None:
+        with torch.inference_mode():
+            network.eval().maps(image)
+
+    return predict
+
+
+def seconds(call: Callable[[], None], repeats: int) -> float:
+    """Time a few calls after one that is not timed."""
+    call()
     start = time.perf_counter()
-    for _ in range(STEPS):
-        step()
-    return (time.perf_counter() - start) / STEPS
+    for _ in range(repeats):
+        call()
+    return (time.perf_counter() - start) / repeats
 
 
 def return_freed_memory() -> None:
@@ -62,21 +85,31 @@ def return_freed_memory() -> None:
     libc.mallopt(-3, 128 * 1024)
 
 
-def main() -> None:
-    """Print both rates and their ratio."""
-    step = make_step()
-    step()
-    default, kept = [], []
+def main(models: tuple[str, ...]) -> None:
+    """Print a line per model: its size, and each rate with its ratio to the first model's."""
+    networks = {model: make_network(model) for model in models}
+    calls = {model: (make_step(one), make_prediction(one)) for model, one in networks.items()}
+    # Of each model: a step with glibc's default, a step and a picture with memory kept.
+    times: dict[str, list[tuple[float, float, float]]] = {model: [] for model in models}
     for _ in range(ROUNDS):
-        return_freed_memory()
-        default.append(seconds(step))
-        keep_freed_memory()
-        step()
-        kept.append(seconds(step))
-    slow, fast = statistics.median(default), statistics.median(kept)
-    print(f"glibc's default: {BATCH / slow:6.1f} images/s")
-    print(f"memory kept:     {BATCH / fast:6.1f} images/s, {slow / fast:.2f} times as fast")
+        for model, (step, predict) in calls.items():
+            return_freed_memory()
+            default = seconds(step, STEPS)
+            keep_freed_memory()
+            times[model].append((default, seconds(step, STEPS), seconds(predict, PICTURES)))
+    print(f"{torch.get_num_threads()} threads, {BATCH} images of {SIZE}×{SIZE}")
+    first = None
+    for model, rounds in times.items():
+        default, kept, picture = (statistics.median(one) for one in zip(*rounds, strict=True))
+        num_parameters, gmacs = network_cost(networks[model], (SIZE, SIZE))
+        first = first or (kept, picture)
+        print(
+            f"{model:12} {num_parameters / 1e6:.2f} M weights, {gmacs:.3f} GMACs; training: "
+            f"{BATCH / default:.1f} images/s, memory kept {BATCH / kept:.1f} "
+            f"({first[0] / kept:.2f}×); one picture: {1000 * picture:.1f} ms "
+            f"({first[1] / picture:.2f}×)"
+        )
 
 
 if __name__ == "__main__":
-    main()
+    main(tuple(sys.argv[1:]) or MODELS)

@@ -12,12 +12,21 @@ from typing import Final, TypeAlias, cast
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from dopepp.core.checks import check_flag, check_integer
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.models.layers import Features, conv_block, find_activation, initialise, scaled_channels
+from dopepp.models.layers import (
+    MAX_BLOCKS,
+    MAX_CHANNELS,
+    Features,
+    ResidualBlock,
+    conv_block,
+    double,
+    find_activation,
+    initialise,
+    scaled_channels,
+)
 
 Beliefs = Float[Tensor, "batch 9*objects height width"]
 Fields = Float[Tensor, "batch 16*objects height width"]
@@ -133,13 +142,13 @@ class Cascade(Head):
             for kernel_size, channels in steps:
                 layers.append(conv_block(inputs, channels, kernel_size, batch_norm=batch_norm))
                 inputs = channels
-            return CascadeBranch(*layers, nn.Conv2d(inputs, outputs, 1))
+            return ChainBranch(*layers, nn.Conv2d(inputs, outputs, 1))
 
         super().__init__(in_channels, num_objects, activation, stages, make_branch)
 
 
-class CascadeBranch(nn.Sequential, Branch):
-    """One branch of a stage of DOPE's cascade: its layers in order, the last answers the maps."""
+class ChainBranch(nn.Sequential, Branch):
+    """Layers in order; the last answers the maps."""
 
     @property
     def outputs(self) -> list[nn.Conv2d]:
@@ -242,11 +251,53 @@ class MultiScaleBranch(Branch):
         half = self.down_half(full)
         quarter = self.down_quarter(half)
         top = self.up_quarter(quarter)
-        top = self.up_half(torch.cat([_double(top), half], dim=1))
-        top = self.up_full(torch.cat([_double(top), full], dim=1))
-        sides = [_double(_double(quarter)), _double(half), full] if self.learned else []
+        top = self.up_half(torch.cat([double(top), half], dim=1))
+        top = self.up_full(torch.cat([double(top), full], dim=1))
+        sides = [double(double(quarter)), double(half), full] if self.learned else []
         return [*sides, self.output(top)]
 
 
-def _double(maps: Tensor) -> Tensor:
-    return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
+class SharedTrunk(Head):
+    """One stage whose beliefs and field come from one trunk, by a short branch each.
+
+    Trunk: residual blocks of two 3×3 convolutions. Branch: 3×3, then 1×1 to the maps. Batch norm
+    behind every convolution but those of maps.
+
+    Args:
+        in_channels: Channels of the features.
+        num_objects: Number of objects.
+        activation: Name of the belief activation.
+        channels: Channels of trunk and branches, 8–1024.
+        blocks: Number of residual blocks of the trunk, 1–16.
+        width: Factor on the channel count.
+
+    Raises:
+        UserError: An argument is out of range.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        num_objects: int,
+        activation: str = "identity",
+        channels: int = 192,
+        blocks: int = 1,
+        width: float = 1.0,
+    ) -> None:
+        inside = scaled_channels(check_integer("channels", channels, 8, MAX_CHANNELS), width)
+        check_integer("blocks", blocks, 1, MAX_BLOCKS)
+
+        def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
+            convolution = conv_block(inside, inside, 3, batch_norm=True)
+            return ChainBranch(convolution, nn.Conv2d(inside, outputs, 1))
+
+        super().__init__(in_channels, num_objects, activation, 1, make_branch)
+        self.trunk = nn.Sequential(
+            ResidualBlock(in_channels, inside),
+            *(ResidualBlock(inside, inside) for _ in range(blocks - 1)),
+        )
+        initialise(self.trunk)
+
+    def forward(self, features: Float[Tensor, "batch channels height width"]) -> list[Stage]:
+        """Return the belief logits and vector field of the only stage."""
+        return super().forward(self.trunk(features))

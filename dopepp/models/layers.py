@@ -1,4 +1,4 @@
-"""What all network parts share: the convolution block, its width and initialisation, activations.
+"""What all network parts share: convolution blocks, their width and initialisation, activations.
 
 An activation turns a head's belief output into a belief map that peaks at 1. To add one, name it in
 :data:`ACTIVATIONS`; the loss that it is paired with publishes that name.
@@ -13,6 +13,7 @@ from typing import Final
 
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
@@ -21,7 +22,10 @@ Features = Float[Tensor, "batch channels height width"]
 
 MIN_WIDTH: Final = 1 / 64
 MAX_WIDTH: Final = 4.0
-"""Bounds of the width factor, so that a hostile spec cannot ask for unlimited memory."""
+MAX_CHANNELS: Final = 1024
+MAX_BLOCKS: Final = 16
+"""Bounds of the width factor, and of channels and blocks where they are options, so that a hostile
+spec cannot ask for unlimited memory."""
 
 _CHANNEL_STEP: Final = 8
 """Channel counts are multiples of this: what vectorised convolutions block by."""
@@ -41,6 +45,7 @@ def conv_block(
     stride: int = 1,
     groups: int = 1,
     batch_norm: bool = False,
+    relu: bool = True,
 ) -> nn.Sequential:
     """Return convolution, batch norm (or a bias in its place) and ReLU; size kept for stride 1."""
     conv = nn.Conv2d(
@@ -53,7 +58,44 @@ def conv_block(
         bias=not batch_norm,
     )
     norm = [nn.BatchNorm2d(out_channels)] if batch_norm else []
-    return nn.Sequential(conv, *norm, nn.ReLU(inplace=True))
+    return nn.Sequential(conv, *norm, *([nn.ReLU(inplace=True)] if relu else []))
+
+
+class ResidualBlock(nn.Module):
+    """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2).
+
+    Where the shape changes, a 1×1 convolution with batch norm brings the input to the sum.
+
+    Args:
+        in_channels: Channels in.
+        out_channels: Channels out.
+        stride: Of the first convolution.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
+        super().__init__()
+        self.residual = nn.Sequential(
+            conv_block(in_channels, out_channels, 3, stride=stride, batch_norm=True),
+            conv_block(out_channels, out_channels, 3, batch_norm=True, relu=False),
+        )
+        self.shortcut: nn.Module = nn.Identity()
+        if stride != 1 or in_channels != out_channels:
+            self.shortcut = conv_block(
+                in_channels, out_channels, 1, stride=stride, batch_norm=True, relu=False
+            )
+
+    def forward(
+        self, features: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch out_channels height/stride width/stride"]:
+        """Return the sum, after a ReLU."""
+        return functional.relu(self.residual(features) + self.shortcut(features), inplace=True)
+
+
+def double(
+    maps: Float[Tensor, "batch channels height width"],
+) -> Float[Tensor, "batch channels 2*height 2*width"]:
+    """Return maps of twice the size, every value repeated."""
+    return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
 
 
 def initialise(module: nn.Module) -> None:

@@ -6,6 +6,7 @@ running the network.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import torch
@@ -54,7 +55,7 @@ class PoseNetwork(nn.Module):
         self.activation, self.num_objects = activation, num_objects
         self.activate = find_activation(activation)
         self.stride = backbone.stride
-        self.size_multiple = backbone.stride * head.cell_multiple
+        self.size_multiple = backbone.stride * math.lcm(backbone.cell_multiple, head.cell_multiple)
         # Not persistent: they are constants of the code, and a checkpoint must not alter them.
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)

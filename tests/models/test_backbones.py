@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from dopepp.core.errors import UserError
-from dopepp.models.backbones import DSC, VGG19, VGG19Original
+from dopepp.models.backbones import DSC, VGG19, Pyramid, VGG19Original
 
 
 def num_weights(module: nn.Module) -> int:
@@ -36,6 +36,63 @@ def test_publishes_its_channels_and_stride(backbone, width, channels, batch_norm
     assert (backbone.out_channels, backbone.stride) == (channels, 8)
     with torch.no_grad():
         assert backbone(torch.zeros(1, 3, 64, 48)).shape == (1, channels, 8, 6)
+
+
+def test_a_pyramid_counts_as_its_blocks_do():
+    """Weights of convolutions by hand: of a block, of its shortcut where the shape changes."""
+
+    def block(before: int, after: int) -> int:
+        return 9 * before * after + 9 * after * after + (before * after if before != after else 0)
+
+    down = (block(8, 8), block(8, 16) + block(16, 16), block(16, 24), block(24, 40))
+    up = (40 * 24 + block(24, 24) * 2, 24 * 16)
+    backbone = Pyramid((8, 16, 24, 40), (1, 2, 1, 1), (2, 0))
+    assert num_weights(backbone) == 9 * 48 * 8 + sum(down) + sum(up)
+    assert all(one.bias is None for one in backbone.modules() if isinstance(one, nn.Conv2d))
+
+
+@pytest.mark.parametrize("size", [(64, 64), (32, 160)])
+@pytest.mark.parametrize(("width", "channels"), [(0.125, 24), (0.25, 48)])
+def test_a_pyramid_publishes_its_channels_and_stride(size, width, channels):
+    backbone = Pyramid(width=width).eval()
+    assert (backbone.out_channels, backbone.stride, backbone.cell_multiple) == (channels, 8, 4)
+    with torch.no_grad():
+        features = backbone(torch.zeros(1, 3, *size))
+    assert features.shape == (1, channels, size[0] // 8, size[1] // 8)
+
+
+def test_every_scale_of_a_pyramid_reaches_its_features():
+    torch.manual_seed(0)
+    backbone = Pyramid(width=0.0625).eval()
+    images = torch.randn(1, 3, 64, 64)
+    with torch.no_grad():
+        before = backbone(images)
+        for blocks in backbone.down[1:]:
+            hook = blocks.register_forward_hook(lambda *arguments: 2 * arguments[-1])
+            assert not torch.allclose(backbone(images), before)
+            hook.remove()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"channels": (32, 96, 128)}, r"channels=\(32, 96, 128\); allowed: a list of 4 integers"),
+        ({"channels": 64}, "channels=64; allowed: a list of 4"),
+        ({"channels": (32, 96, 4, 128)}, r"channels\[2\]=4; allowed: an integer from 8 to 1024"),
+        ({"channels": (32, 96, 128, 10**9)}, r"channels\[3\]=1000000000"),
+        ({"channels": "abcd"}, "channels='abcd'"),
+        ({"blocks": (1, 0, 2, 2)}, r"blocks\[1\]=0; allowed: an integer from 1 to 16"),
+        ({"blocks": (1, 3, 2.0, 2)}, r"blocks\[2\]=2.0"),
+        ({"blocks": None}, "blocks=None"),
+        ({"top_down": (1, 2, 3)}, r"top_down=.* a list of 2 integers"),
+        ({"top_down": (-1, 2)}, r"top_down\[0\]=-1; allowed: an integer from 0"),
+        ({"top_down": (1, True)}, r"top_down\[1\]=True"),
+        ({"width": 0}, "width=0"),
+    ],
+)
+def test_a_pyramids_arguments_are_bounded(arguments, message):
+    with pytest.raises(UserError, match=message):
+        Pyramid(**arguments)
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,13 @@
 import math
+from functools import partial
 
 import pytest
 import torch
 from torch import nn
 
 from dopepp.core.errors import UserError
-from dopepp.models.heads import Cascade, MultiScale
-from dopepp.models.layers import find_activation
+from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
+from dopepp.models.layers import find_activation, scaled_channels
 from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
 
@@ -15,19 +16,21 @@ def num_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-@pytest.mark.parametrize("backbone", ["VGG19", "DSC"])
+@pytest.mark.parametrize("backbone", ["VGG19", "DSC", "Pyramid"])
 @pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
-@pytest.mark.parametrize("head", ["Cascade", "MultiScale"])
+@pytest.mark.parametrize("head", ["Cascade", "MultiScale", "SharedTrunk"])
 @pytest.mark.parametrize("num_objects", [1, 2])
 def test_every_combination_gives_stages_of_the_right_shape(
     make_spec, backbone, attention, head, num_objects
 ):
-    options = {"backbone_width": 0.125, "head_width": 0.125, "head_batch_norm": True}
-    spec = make_spec(backbone, attention, head, num_objects=num_objects, head_stages=2, **options)
+    num_stages = 1 if head == "SharedTrunk" else 2
+    options = {"backbone_width": 0.125, "head_width": 0.125, "num_objects": num_objects}
+    options |= {"head_stages": 2, "head_batch_norm": True} if num_stages == 2 else {}
+    spec = make_spec(backbone, attention, head, **options)
     network = build_network(spec).eval()
     images = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
     stages = network(images)
-    assert len(stages) == 2
+    assert len(stages) == num_stages
     for belief, field in stages:
         assert belief.shape == (2, 9 * num_objects, 4, 8)
         assert field.shape == (2, 16 * num_objects, 4, 8)
@@ -84,9 +87,10 @@ def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
     assert not {"mean", "std"} & network.state_dict().keys()
 
 
-def test_channels_last_and_bf16_give_the_same_maps(small_spec):
+@pytest.mark.parametrize("spec", ["small_spec", "small_fast_spec"])
+def test_channels_last_and_bf16_give_the_same_maps(request, spec):
     torch.manual_seed(0)
-    network = build_network(small_spec).eval()
+    network = build_network(request.getfixturevalue(spec)).eval()
     images = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
     with torch.no_grad():
         expected = network.maps(images)[0]
@@ -107,10 +111,15 @@ def test_images_of_another_shape_are_refused(small_spec, shape):
         build_network(small_spec)(torch.zeros(shape))
 
 
-def test_cascade_alone_takes_multiples_of_its_stride(make_spec):
-    network = build_network(make_spec(head="Cascade", backbone_width=0.125, head_width=0.125))
+@pytest.mark.parametrize("head", ["Cascade", "SharedTrunk"])
+def test_sizes_are_multiples_of_what_backbone_and_head_ask_for(make_spec, head):
+    widths = {"backbone_width": 0.125, "head_width": 0.125}
+    network = build_network(make_spec(head=head, **widths)).eval()
     assert network.size_multiple == 8
     assert network(torch.zeros(1, 3, 40, 24))[-1][0].shape == (1, 9, 5, 3)
+    network = build_network(make_spec("Pyramid", head=head, **widths)).eval()
+    with pytest.raises(UserError, match="multiples of 32; fix: pad"):
+        network(torch.zeros(1, 3, 40, 32))
 
 
 def test_activations():
@@ -129,10 +138,12 @@ def test_unknown_activation_is_refused(name):
 
 
 @pytest.mark.parametrize(("activation", "expected"), [("identity", 0.0), ("exp", 0.01)])
-@pytest.mark.parametrize("head", [Cascade, MultiScale])
+@pytest.mark.parametrize(
+    "head", [partial(Cascade, stages=2), partial(MultiScale, stages=2), SharedTrunk]
+)
 def test_an_untrained_head_answers_nearly_nothing(head, activation, expected):
     torch.manual_seed(0)
-    head = head(128, 1, activation, stages=2)
+    head = head(128, 1, activation)
     with torch.no_grad():
         stages = head(torch.randn(2, 128, 16, 16).relu())
     for belief, field in stages:
@@ -183,6 +194,67 @@ def test_head_arguments_are_bounded(head, arguments, message):
         head(8, 1, **arguments)
 
 
+def test_belief_and_field_share_the_trunk_alone():
+    head = SharedTrunk(8, 2, channels=24, blocks=2)
+    belief, field = head(torch.randn(1, 8, 8, 8))[0]
+    assert (belief.shape, field.shape) == ((1, 18, 8, 8), (1, 32, 8, 8))
+    belief.sum().backward()
+    assert all(parameter.grad is None for parameter in head.field_branches.parameters())
+    for part in (head.trunk, head.belief_branches):
+        assert all(parameter.grad is not None for parameter in part.parameters())
+    # A block's convolutions, the first's shortcut; a 3×3 and a 1×1 of each branch.
+    weights = 9 * (8 * 24 + 5 * 24 * 24) + 8 * 24 + 24 * (18 + 32)
+    assert sum(p.numel() for p in head.parameters() if p.ndim == 4) == weights
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"channels": 4}, "channels=4; allowed: an integer from 8 to 1024"),
+        ({"channels": 64.0}, "channels=64.0"),
+        ({"blocks": 0}, "blocks=0; allowed: an integer from 1 to 16"),
+        ({"blocks": True}, "blocks=True"),
+        ({"width": 5}, "width=5"),
+        ({"num_objects": 65}, "num_objects=65"),
+        ({"activation": "relu"}, "activation 'relu'"),
+    ],
+)
+def test_a_shared_trunks_arguments_are_bounded(arguments, message):
+    with pytest.raises(UserError, match=message):
+        SharedTrunk(8, **{"num_objects": 1, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("channels", "width", "expected"),
+    [(128, 1, 128), (128, 0.5, 64), (64, 0.3, 16), (64, 1 / 64, 8), (512, 4, 2048)],
+)
+def test_scaled_channels(channels, width, expected):
+    assert scaled_channels(channels, width) == expected
+
+
+def test_the_fast_network_has_the_weights_that_are_documented(make_spec):
+    """conf/model/dopepp_fast.yaml: 2.65 million at the quickstart's width."""
+    widths = {"backbone_width": 0.5, "head_width": 0.5}
+    network = build_network(make_spec("Pyramid", "Identity", "SharedTrunk", **widths))
+    assert num_parameters(network) == 2_645_305
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_gradient_reaches_every_parameter_of_the_fast_network(small_fast_spec, half):
+    torch.manual_seed(0)
+    network = build_network(small_fast_spec).to(memory_format=torch.channels_last).train()
+    images = torch.randint(0, 256, (4, 3, 64, 96), dtype=torch.uint8)
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        (logits, field), *others = network(images)
+    assert not others
+    (network.activate(logits).float().square().sum() + field.float().square().sum()).backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.dtype == torch.float32
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
 def test_he_initialisation_keeps_the_scale_without_batch_norm(make_spec):
     torch.manual_seed(0)
     network = build_network(make_spec(attention="Identity"))
@@ -210,9 +282,11 @@ def macs_by_hooks(network: nn.Module, images: torch.Tensor) -> int:
 
 
 @pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
-@pytest.mark.parametrize("head", ["Cascade", "MultiScale"])
-def test_agrees_with_counting_by_hooks(make_spec, attention, head):
-    spec = make_spec(attention=attention, head=head, backbone_width=0.125, head_width=0.125)
+@pytest.mark.parametrize(
+    ("backbone", "head"), [("DSC", "Cascade"), ("DSC", "MultiScale"), ("Pyramid", "SharedTrunk")]
+)
+def test_agrees_with_counting_by_hooks(make_spec, backbone, attention, head):
+    spec = make_spec(backbone, attention, head, backbone_width=0.125, head_width=0.125)
     network = build_network(spec).eval()
     _, gmacs = network_cost(network, (96, 64))
     assert gmacs * 1e9 == pytest.approx(macs_by_hooks(network, torch.zeros(1, 3, 64, 96)))

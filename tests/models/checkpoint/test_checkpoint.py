@@ -1,4 +1,5 @@
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,18 @@ def test_round_trip(checkpoint, saved, part):
     assert not network.training
     for name, value in network.state_dict().items():
         assert torch.equal(value, checkpoint.state_dict[name])
+
+
+def test_a_spec_with_lists_comes_back(checkpoint, small_fast_spec, tmp_path):
+    network = build_network(small_fast_spec).eval()
+    stored = replace(checkpoint, spec=small_fast_spec, state_dict=network.state_dict())
+    write_atomic(stored.to_file(), tmp_path / "best.ckpt")
+    loaded, description = load_network(tmp_path / "best.ckpt")
+    assert description.spec == small_fast_spec
+    images = torch.randint(0, 256, (1, 3, 64, 96), dtype=torch.uint8)
+    with torch.no_grad():
+        for ours, theirs in zip(loaded.maps(images), network.maps(images), strict=True):
+            assert torch.equal(ours, theirs)
 
 
 def test_a_training_checkpoint_is_read_by_its_two_keys(checkpoint, tmp_path):
