@@ -174,9 +174,9 @@ class Pyramid(Backbone):
     Made for time, on CPUs too: nothing is computed at the picture's own resolution, where half of
     :class:`DSC`'s time goes, and every 3×3 convolution is a full one. 4×4 pixels become 48 channels
     (Shi et al. 2016, the other way round), then a 3×3 convolution and the residual blocks (He et
-    al. 2016) of each stride; the first block of a stride halves the size. From the coarsest stride
-    back to 8, a 1×1 convolution, doubling and a sum with the finer stride's features (Lin et al.
-    2017), then residual blocks again. Batch norm behind every convolution.
+    al. 2016) of each stride; the first block at 8, 16 and 32 halves the size. From the coarsest
+    back to stride 8: a 1×1 convolution, doubling, a sum with the finer stride's features (Lin et
+    al. 2017), then residual blocks again. Batch norm behind every convolution.
 
     Args:
         channels: Channels at strides 4, 8, 16 and 32, each 8–1024.
@@ -213,7 +213,7 @@ class Pyramid(Backbone):
                 *(ResidualBlock(after, after) for _ in range(count - 1)),
             )
             for before, after, stride, count in zip(
-                (scaled[0], *scaled), scaled, (1, 2, 2, 2), blocks, strict=False
+                (scaled[0], *scaled[:-1]), scaled, (1, 2, 2, 2), blocks, strict=True
             )
         )
         coarse_to_fine = list(zip(scaled[:1:-1], scaled[2:0:-1], top_down, strict=True))
