@@ -65,6 +65,15 @@ def rotation_vector_to_matrix(
     return np.asarray(np.eye(3) + linear * skew + 0.5 * sinc_half**2 * skew @ skew)
 
 
+def matrix_to_rotation_vector(rotation: RotationMatrix) -> Vector:
+    """Return the vector of a rotation's axis and angle in [0, π]; it undoes the exponential map."""
+    w, *axis = matrix_to_quaternion(rotation)
+    size = float(np.linalg.norm(axis))
+    # For tiny angles, 2 atan(|v| / w) / |v| is 2 / w.
+    factor = 2.0 * np.arctan2(size, w) / size if size > 0 else 2.0 / w
+    return np.asarray(factor * np.array(axis))
+
+
 def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
     """Return the angle of each rotation in [0, π].
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.geometry.rotation import (
     is_rotation,
     matrix_to_quaternion,
+    matrix_to_rotation_vector,
     quaternion_to_matrix,
     random_rotation,
     rotation_angle,
@@ -40,6 +41,14 @@ def test_matrix_to_quaternion_is_scipys_up_to_sign(quaternion):
     assert found[0] >= 0
     assert np.linalg.norm(found) == pytest.approx(1)
     assert abs(found @ [w, x, y, z]) == pytest.approx(1, abs=1e-12)
+
+
+@wide
+@given(AXES, st.sampled_from([0.0, 1e-12, 1e-6, 0.1, 2.0, 3.14]))
+def test_rotation_vectors_are_found_again(axis: list[float], angle: float) -> None:
+    vector = angle * np.array(axis) / np.linalg.norm(axis)
+    found = matrix_to_rotation_vector(rotation_vector_to_matrix(vector))
+    assert_allclose(found, vector, rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("axis", np.eye(3))

@@ -17,10 +17,9 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import Transform
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.rotation import Vector, matrix_to_rotation_vector
 from dopepp.inference.refinement.view import COVERED, GATE, DepthView, Overlay, lay_over
 from dopepp.inference.refinement.visible import PoseMatrix, Region, Seen, SurfacePoints
 
@@ -71,8 +70,7 @@ class Prior:
 
     def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
         """Return the turn and the shift from a pose to the prior's."""
-        # OpenCV's Rodrigues rounds turns below 1e-5 to none.
-        turn = Rotation.from_matrix(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T).as_rotvec()
+        turn = matrix_to_rotation_vector(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T)
         return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
 
     def doubt(self, T_cam_obj: Transform) -> str:
