@@ -75,7 +75,7 @@ INDEPENDENT: Final = 100.0
 
 @dataclass(frozen=True)
 class Refinement:
-    """What depth has made of a pose.
+    """What depth or the picture has made of a pose.
 
     Attributes:
         T_cam_obj: The refined pose, or the one that was given.
@@ -83,12 +83,14 @@ class Refinement:
             where the given pose was kept.
         reason: Why the given pose was kept; empty where it was refined.
         fit: How well the refined pose fits the depth; None where there was nothing to fit.
+        agreement: Share of the refined outline that the picture agrees with; None without it.
     """
 
     T_cam_obj: camera.Transform
     covariance: PoseMatrix | None = None
     reason: str = ""
     fit: Fit | None = None
+    agreement: float | None = None
 
 
 class DepthRefiner:

@@ -1,0 +1,235 @@
+"""Where the part ends along each normal of its outline, and what that says about the pose.
+
+Along a normal, pixels look like the part up to some place and like its surroundings beyond. If it
+ends at a shift d, the pixels' log odds before d speak for it, and the sum of them is, up to a
+constant, the logarithm of d's likelihood. Mean and variance of the shift follow. A normal along
+which all shifts are alike has the variance of none known, and its information, which is taken from
+the inverse of its variance, is zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.inference.refinement.contour import Contour
+from dopepp.inference.refinement.solver import Terms
+
+CONFIDENCE: Final = 0.5
+"""Exponent of the likelihood of neighbouring pixels, whose colours are not independent."""
+
+LEAST_DEVIATION: Final = 0.3
+"""Pixels: no place of an edge is better known than to this, of one point."""
+
+INDEPENDENT_PX: Final = 4.0
+"""Length of the outline along which its errors are one error."""
+
+LEAST_INFORMATION: Final = 1e-3
+"""Pixels⁻²; less is none."""
+
+REWEIGHTINGS: Final = 2
+
+GATE: Final = 2.0
+"""Standard deviations that a point may differ by and still count for a quarter."""
+
+ALIKE: Final = 0.5
+"""Of the part's extent: so far along the outline, errors beyond a pixel are one error."""
+
+OFFSET_PX: Final = 1.5
+"""Standard deviation of an offset that all points have in common: blur, a halo, a CAD's error."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts:
+    """How far the picture's outline is from a pose's, along each normal.
+
+    Attributes:
+        mean: Pixels, outward.
+        information: Inverse of the variance beyond what not knowing has, pixels⁻².
+    """
+
+    mean: Float[np.ndarray, "points"]
+    information: Float[np.ndarray, "points"]
+
+
+def find_shifts(
+    odds: Float32[np.ndarray, "height width"], contour: Contour, reach: float, step: float
+) -> Shifts:
+    """Read the picture along the normals.
+
+    Args:
+        odds: The pixels' log odds, 0 where unknown.
+        contour: The outline.
+        reach: Pixels to each side.
+        step: Pixels between what is read.
+    """
+    found = np.empty((len(contour), 2))
+    count = max(2, round(reach / step))
+    _shifts(odds, contour.pixels, contour.normals, step, count, found)
+    return Shifts(found[:, 0], found[:, 1])
+
+
+def outline_rows(
+    contour: Contour, T_cam_obj: Transform, K: CameraMatrix
+) -> Float[np.ndarray, "points 6"]:
+    """Return how each point moves along its normal, pixels, with (turn, shift) of the pose."""
+    rows = np.empty((len(contour), 6))
+    _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
+    return rows
+
+
+def region_terms(
+    rows: Float[np.ndarray, "points 6"],
+    shifts: Shifts,
+    prior: Terms,
+    spacing: float,
+    extent: float,
+) -> Terms:
+    """Return the pull of an outline whose points have one unknown offset in common.
+
+    The offset is a seventh unknown with a prior. Points are weighted by what remains of their
+    shifts after the step that all of them ask for: its spread is the variance of each, besides its
+    own, and what is far from the others counts little (Geman–McClure).
+
+    Args:
+        rows: How the points move.
+        shifts: Where they should go.
+        prior: Of the step, so that there always is one.
+        spacing: Between the points, pixels.
+        extent: Of the part, pixels.
+    """
+    H, g = np.zeros((7, 7)), np.zeros(7)
+    _terms(
+        rows, shifts.mean, shifts.information, *prior,
+        min(1.0, spacing / INDEPENDENT_PX), ALIKE * extent / spacing, H, g,
+    )  # fmt: skip
+    # Without the seventh unknown: its Schur complement.
+    last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
+    return H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
+
+
+@compiled()
+def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
+    """Write a point's move: along n·du with du = f (dX/Z − X dZ/Z²), and arm × that for a turn."""
+    for i in range(len(arms)):
+        x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
+        inverse = 1.0 / (z + T[2, 3])
+        a, b = normals[i, 0] * K[0, 0] * inverse, normals[i, 1] * K[1, 1] * inverse
+        c = -(a * (x + T[0, 3]) + b * (y + T[1, 3])) * inverse
+        rows[i, 0], rows[i, 1], rows[i, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+        rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c
+
+
+@compiled()
+def _terms(
+    rows: Array,
+    means: Array,
+    information: Array,
+    prior_H: Array,
+    prior_g: Array,
+    independent: float,
+    alike: float,
+    H: Array,
+    g: Array,
+) -> None:
+    """Add the reweighted terms of (turn, shift, offset).
+
+    ``independent`` is how many measurements a point stands for where errors are small, ``alike``
+    how many points have one error where they are not.
+    """
+    known = information > LEAST_INFORMATION
+    if not known.any():
+        return
+    ridge, pull, left = np.zeros((7, 7)), np.zeros(7), np.empty(len(rows))
+    ridge[:6, :6], pull[:6], ridge[6, 6] = prior_H, prior_g, 1.0 / OFFSET_PX**2
+    weights = np.where(known, information, 0.0) * independent
+    for _ in range(REWEIGHTINGS):
+        H[:], g[:] = 0.0, 0.0
+        _add(rows, means, weights, H, g)
+        step = np.linalg.solve(H + ridge, g + pull)
+        for i in range(len(rows)):
+            rest = means[i] - step[6]
+            for c in range(6):
+                rest -= rows[i, c] * step[c]
+            left[i] = rest * rest
+        # The median of a squared normal variable is 0.455 of its variance.
+        spread = np.median(left[known]) / 0.455
+        # Less than a pixel is noise; more is a shadow, a highlight, an error of the mesh.
+        share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
+        for i in range(len(rows)):
+            if known[i]:
+                variance = 1.0 / information[i] + spread
+                weights[i] = share / variance / (1.0 + left[i] / (GATE**2 * variance)) ** 2
+    H[:], g[:] = 0.0, 0.0
+    _add(rows, means, weights, H, g)
+
+
+@compiled()
+def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
+    """Add the normal equations of points that move by their row and by one in the offset."""
+    own = np.ones(7)
+    for i in range(len(rows)):
+        if weights[i] == 0.0:
+            continue
+        own[:6] = rows[i]
+        for c in range(7):
+            g[c] += weights[i] * own[c] * means[i]
+            for d in range(c + 1):
+                H[c, d] += weights[i] * own[c] * own[d]
+    for c in range(7):
+        for d in range(c):
+            H[d, c] = H[c, d]
+
+
+@compiled()
+def _shifts(
+    odds: Array, pixels: Array, normals: Array, step: float, count: int, found: Array
+) -> None:
+    """Write mean and information of every normal's shift."""
+    sums = np.empty(2 * count + 2)
+    # The part may end between any two samples, before the first one and after the last one.
+    unknown = step * step * (len(sums) ** 2 - 1) / 12.0
+    floor = LEAST_DEVIATION**2 + step * step / 12.0
+    for i in range(len(pixels)):
+        sums[0] = most = 0.0
+        for k in range(2 * count + 1):
+            along = (k - count) * step
+            value = _sampled(
+                odds, pixels[i, 0] + along * normals[i, 0], pixels[i, 1] + along * normals[i, 1]
+            )
+            sums[k + 1] = sums[k] + CONFIDENCE * value
+            most = max(most, sums[k + 1])
+        total = first = second = 0.0
+        for k in range(len(sums)):
+            likelihood = math.exp(sums[k] - most)
+            shift = (k - count - 0.5) * step
+            total += likelihood
+            first += likelihood * shift
+            second += likelihood * shift * shift
+        mean = first / total
+        variance = second / total - mean * mean
+        # That it ends beyond the reach is no measurement of where.
+        ends = math.exp(sums[0] - most) + math.exp(sums[len(sums) - 1] - most)
+        inner = 1.0 - ends / total
+        information = 1.0 / (variance + floor) - 1.0 / (unknown + floor)
+        found[i, 0] = mean
+        found[i, 1] = max(0.0, information) * inner * inner
+
+
+@compiled()
+def _sampled(values: Array, u: float, v: float) -> float:
+    """Return a value between four pixels; 0 beyond the picture."""
+    height, width = values.shape
+    if not (0.0 <= u < width - 1.0 and 0.0 <= v < height - 1.0):
+        return 0.0
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    above = values[j, i] + a * (values[j, i + 1] - values[j, i])
+    below = values[j + 1, i] + a * (values[j + 1, i + 1] - values[j + 1, i])
+    return float(above + b * (below - above))

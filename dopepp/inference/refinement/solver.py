@@ -1,0 +1,80 @@
+"""One solver for a pose: what the picture says in several terms, and what was known before.
+
+To add a kind of evidence, write an :data:`Evidence`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.refine import solve_damped
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.inference.refinement.fit import Prior
+
+Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
+"""Information matrix and vector of (turn about the object's origin, shift), camera axes: H ξ = g.
+"""
+
+Evidence = Callable[[Transform, Terms], Terms | None]
+"""Terms at a pose, given what is known of the step besides; None where there is nothing to say them
+from."""
+
+DAMPING: Final = 1e-6
+"""Share of each unknown's own information: the prior leaves none of them open."""
+
+ARRIVED: Final = 0.02
+"""Standard deviations; a shorter step ends the descent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a descent ended.
+
+    Attributes:
+        T_cam_obj: The pose.
+        information: Behind it, the prior's included.
+    """
+
+    T_cam_obj: Transform
+    information: Float[np.ndarray, "6 6"]
+
+
+def descend(
+    T_cam_obj: Transform, prior: Prior, evidence: Sequence[Evidence], steps: int
+) -> Solution | None:
+    """Take Gauss–Newton steps on the evidence and the prior; None where evidence is missing.
+
+    Args:
+        T_cam_obj: Where to start.
+        prior: What was known; it may be elsewhere.
+        evidence: The terms.
+        steps: How many at most.
+    """
+    pose, information = T_cam_obj, prior.information
+    step = np.empty(6)
+    for _ in range(steps):
+        known = prior.information, prior.information @ prior.offset(pose)
+        information, pull = known
+        for term in evidence:
+            terms = term(pose, known)
+            if terms is None:
+                return None
+            information, pull = information + terms[0], pull + terms[1]
+        solve_damped(information, -pull, DAMPING, step)
+        pose = moved(pose, step)
+        if step @ information @ step < ARRIVED**2:
+            break
+    return Solution(pose, information)
+
+
+def moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
+    """Turn a pose about the object's origin and shift it, both in camera axes."""
+    return make_transform(
+        rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
+    )

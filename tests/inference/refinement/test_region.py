@@ -1,0 +1,277 @@
+"""Pose refinement on the picture alone."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.refinement.colour import colour_bins, log_odds
+from dopepp.inference.refinement.contour import (
+    filled_mask,
+    find_contour,
+    make_outline_mesh,
+    posed,
+)
+from dopepp.inference.refinement.fit import Prior
+from dopepp.inference.refinement.lines import (
+    OFFSET_PX,
+    Shifts,
+    find_shifts,
+    outline_rows,
+    region_terms,
+)
+from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.solver import descend, moved
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.part import Part
+
+SIZE = (416, 416)
+K = camera_matrix(500, 500, 207.5, 207.5)
+TURNED = rotation_vector_to_matrix(np.array([2.5, 0.5, 0.3]))
+TRUE = make_transform(TURNED, np.array([0.01, -0.012, 0.24]))
+PART_COLOUR, AROUND_COLOUR = (200, 120, 60), (60, 90, 130)
+DEVIATIONS = np.repeat([math.radians(5), 0.003], 3)
+
+
+@pytest.fixture(scope="module", params=["pivconnector", "servoholder"])
+def part(request: pytest.FixtureRequest) -> Part:
+    return pivconnector() if request.param == "pivconnector" else servoholder()
+
+
+@pytest.fixture(scope="module")
+def refiner() -> RegionRefiner:
+    mesh = pivconnector().mesh
+    assert mesh is not None
+    return RegionRefiner(mesh.vertices, mesh.faces)
+
+
+def picture(
+    part: Part, T: np.ndarray = TRUE, around: tuple[int, int, int] = AROUND_COLOUR, noise: float = 2
+) -> np.ndarray:
+    """Draw a part in one colour by OpenCV's polygons, four times finer than the pixels."""
+    assert part.mesh is not None
+    fine = K.copy()
+    fine[:2] *= 4
+    fine[:2, 2] += 1.5
+    image = np.empty((4 * SIZE[1], 4 * SIZE[0], 3), np.uint8)
+    image[:] = around
+    corners = project(transform(T, part.mesh.vertices), fine)[part.mesh.faces]
+    for triangle in np.round(corners * 16).astype(np.int32):
+        cv2.fillConvexPoly(image, triangle, PART_COLOUR, cv2.LINE_8, 4)
+    image = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA).astype(np.float64)
+    image += np.random.default_rng(0).normal(size=image.shape) * noise
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def started(seed: int, T: np.ndarray = TRUE) -> np.ndarray:
+    return moved(T, np.random.default_rng(seed).normal(size=6) * DEVIATIONS)
+
+
+def off(T: np.ndarray, true: np.ndarray = TRUE) -> tuple[float, float]:
+    """Return degrees and millimetres."""
+    turn = float(rotation_angle(T[:3, :3] @ true[:3, :3].T))
+    return math.degrees(turn), 1000 * float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: int) -> None:
+    assert part.mesh is not None
+    T = moved(TRUE, np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 0.01, 0.01, 0.01])
+    mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    at = posed(mesh, T, K)
+    assert at is not None
+    mask = filled_mask(mesh, at, SIZE)
+
+    drawn = picture(part, T, noise=0).astype(np.float64)
+    whole = np.array(PART_COLOUR, np.float64) - AROUND_COLOUR
+    share = ((drawn - AROUND_COLOUR) @ whole) / (whole @ whole)
+    # OpenCV draws a triangle's border pixels too: a quarter of a pixel more all around.
+    assert (mask == (share > 0.5)).mean() > 0.995
+    contour = find_contour(mesh, at, mask, 1.0)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    border = np.concatenate(outlines)[:, 0]
+    distances = np.linalg.norm(contour.pixels[:, None] - border, axis=2)
+    assert distances.min(axis=1).max() < 1.6  # every point is on the border
+    assert np.mean(distances.min(axis=0) < 3.0) > 0.85  # and most of the border has points
+    assert_allclose(np.linalg.norm(contour.normals, axis=1), 1.0)
+    inner, outer = (
+        cv2.remap(
+            mask.astype(np.float32), *(contour.pixels + sign * 1.6 * contour.normals)
+            .astype(np.float32).T[:, :, None], cv2.INTER_LINEAR,
+        ) for sign in (-1, 1)
+    )  # fmt: skip
+    assert inner.mean() > 0.9 > 0.1 > outer.mean()
+    assert_allclose(project(contour.arms + T[:3, 3], K), contour.pixels, atol=1e-9)
+
+
+def test_holes_and_open_edges_are_outlined_hidden_edges_are_not() -> None:
+    # A frame of one side only, before a smaller square that it partly hides.
+    outer = np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]], np.float64)
+    vertices = np.concatenate([outer, outer / 2, outer * 0.7 + [0, 0, 1]]) / 100
+    faces = [[i, (i + 1) % 4, 4 + i] for i in range(4)]
+    faces += [[(i + 1) % 4, 4 + (i + 1) % 4, 4 + i] for i in range(4)]
+    alone = make_outline_mesh(vertices[:8], np.array(faces))
+    both = make_outline_mesh(vertices, np.array([*faces, [8, 9, 10], [8, 10, 11]]))
+    T = make_transform(np.eye(3), np.array([0, 0, 0.4]))
+    radii = []
+    for mesh in (alone, both):
+        at = posed(mesh, T, K)
+        assert at is not None
+        contour = find_contour(mesh, at, filled_mask(mesh, at, SIZE), 2.0)
+        radii.append(np.abs(contour.arms[:, :2]).max(axis=1).round(3))
+    assert set(radii[0]) == {0.02, 0.04}
+    assert set(radii[1]) == {0.04}
+
+
+def test_derivative_against_finite_differences(part: Part) -> None:
+    assert part.mesh is not None
+    mesh = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    at = posed(mesh, TRUE, K)
+    assert at is not None
+    contour = find_contour(mesh, at, filled_mask(mesh, at, SIZE), 5.0)
+    rows = outline_rows(contour, TRUE, K)
+    points = contour.arms @ TRUE[:3, :3]
+    for axis, step in enumerate(1e-6 * np.eye(6)):
+        ahead, behind = (
+            project(transform(moved(TRUE, sign * step), points), K) for sign in (1, -1)
+        )
+        slope = ((ahead - behind) * contour.normals).sum(axis=1) / 2e-6
+        assert_allclose(rows[:, axis], slope, rtol=1e-5, atol=1e-4)
+
+
+def test_terms_take_the_common_offset_out() -> None:
+    # Against the seven unknowns solved at once.
+    rng = np.random.default_rng(3)
+    rows, mean = rng.normal(size=(60, 6)) * 100, rng.normal(size=60) * 1e-3 + 1.3
+    shifts = Shifts(mean, np.full(60, 2.0))
+    prior = np.eye(6), np.zeros(6)
+    H, g = region_terms(rows, shifts, prior, spacing=8.0, extent=1.0)
+    step = np.linalg.solve(H + prior[0], g)
+    assert np.abs(rows @ step).max() < 0.2, "an offset of all points moves no pose"
+    all_rows = np.column_stack([rows, np.ones(60)])
+    ridge = np.diag([*np.ones(6), 1 / OFFSET_PX**2])
+    whole = np.linalg.solve(2 * all_rows.T @ all_rows + ridge, 2 * all_rows.T @ mean)
+    assert_allclose(step, whole[:6], atol=2e-5)
+
+
+def test_shifts_of_a_straight_edge() -> None:
+    columns = np.arange(64.0)
+    mesh = make_outline_mesh(
+        np.array([[-1, -1, 0], [0, -1, 0], [0, 1, 0], [-1, 1, 0.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    T, close = (
+        make_transform(np.eye(3), np.array([0, 0, 40.0])),
+        camera_matrix(800, 800, 31.5, 31.5),
+    )
+    at = posed(mesh, T, close)
+    assert at is not None
+    contour = find_contour(mesh, at, filled_mask(mesh, at, (64, 64)), 2.0)
+    right = contour.normals[:, 0] > 0.9
+    for edge in (30.3, 33.0, 35.6):
+        odds = np.clip(2 * (edge - columns), -1, 1) * 3
+        image = np.broadcast_to(odds, (64, 64)).astype(np.float32)
+        shifts = find_shifts(image, contour, 8.0, 1.0)
+        assert_allclose(shifts.mean[right], edge - 31.5, atol=0.15)
+        assert shifts.information[right].min() > 0.5
+    nothing = find_shifts(np.zeros((64, 64), np.float32), contour, 8.0, 1.0)
+    assert_allclose(nothing.information, 0.0, atol=1e-12)
+
+
+def test_colours_tell_part_from_surroundings() -> None:
+    mask = np.zeros((80, 80), np.uint8)
+    mask[20:60, 20:60] = 1
+    image = np.where(mask[..., None] == 1, PART_COLOUR, AROUND_COLOUR).astype(np.uint8)
+    image[35:40, 35:40] = image[5:10, 25:30] = (10, 240, 10)  # seen on both sides
+    odds = log_odds(colour_bins(image), mask, 3.0, 20.0)
+    assert odds is not None
+    assert odds[50, 50] > 2 > -2 > odds[70, 50]
+    assert abs(odds[37, 37]) < 1.5
+    assert log_odds(colour_bins(image), np.zeros_like(mask), 3.0, 20.0) is None
+
+
+def test_descent_without_evidence_returns_to_the_prior() -> None:
+    prior = Prior(TRUE, np.diag(1 / DEVIATIONS**2))
+    found = descend(started(1), prior, [lambda pose, known: (np.zeros((6, 6)), np.zeros(6))], 8)
+    assert found is not None
+    assert_allclose(found.T_cam_obj, TRUE, atol=1e-6)
+    assert descend(TRUE, prior, [lambda pose, known: None], 8) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_two_colours_are_solved(part: Part, seed: int) -> None:
+    assert part.mesh is not None
+    refined = RegionRefiner(part.mesh.vertices, part.mesh.faces).refine(
+        picture(part), K, started(seed), np.diag(DEVIATIONS**2)
+    )
+    assert not refined.reason
+    degrees, millimetres = off(refined.T_cam_obj)
+    assert degrees < 0.3
+    assert millimetres < 0.3
+    assert refined.covariance is not None
+    assert np.linalg.eigvalsh(refined.covariance).min() > 0
+    assert np.linalg.det(refined.covariance) < np.prod(DEVIATIONS**2)
+    assert refined.agreement is not None
+    assert refined.agreement > 0.9
+
+
+def test_part_behind_an_occluder_and_over_the_border(refiner: RegionRefiner) -> None:
+    image = picture(pivconnector())
+    image[150:240, 190:250] = (30, 160, 40)
+    assert max(off(refiner.refine(image, K, started(2), np.diag(DEVIATIONS**2)).T_cam_obj)) < 0.8
+    T = make_transform(TRUE[:3, :3], np.array([0.085, -0.012, 0.24]))
+    refined = refiner.refine(picture(pivconnector(), T), K, started(2, T), np.diag(DEVIATIONS**2))
+    degrees, millimetres = off(refined.T_cam_obj, T)
+    assert degrees < 1.5
+    assert millimetres < 1.5
+
+
+@pytest.mark.parametrize(
+    ("image", "pose", "reason"),
+    [
+        (np.full((416, 416, 3), 128, np.uint8), TRUE, "too alike"),
+        (picture(pivconnector(), around=PART_COLOUR), started(1), "too alike"),
+        (np.random.default_rng(0).integers(0, 256, (416, 416, 3), np.uint8), TRUE, "alike"),
+        (picture(pivconnector()), np.full((4, 4), np.nan), "not finite"),
+        (np.zeros((1, 1, 3), np.uint8), TRUE, "outside the picture"),
+        (picture(pivconnector()), make_transform(TURNED, np.array([0.5, 0, 0.24])), "outside"),
+        (picture(pivconnector()), make_transform(TURNED, np.array([0, 0, 0.01])), "behind"),
+        (picture(pivconnector()), make_transform(TURNED, np.array([0, 0, -0.3])), "behind"),
+        (picture(pivconnector()), make_transform(TURNED, np.array([0, 0, 30.0])), "pixels long"),
+        (picture(pivconnector()), make_transform(TURNED, np.array([0.13, 0, 0.24])), ""),
+    ],
+)
+def test_pose_is_kept_with_a_reason(
+    refiner: RegionRefiner, image: np.ndarray, pose: np.ndarray, reason: str
+) -> None:
+    kept = refiner.refine(image, K, pose, np.diag(DEVIATIONS**2))
+    assert kept.reason
+    assert reason in kept.reason
+    assert kept.covariance is None
+    np.testing.assert_array_equal(kept.T_cam_obj, pose)
+
+
+def test_without_a_covariance_a_broad_one_is_taken(refiner: RegionRefiner) -> None:
+    image = picture(pivconnector())
+    for covariance in (None, np.full((6, 6), np.nan)):
+        assert max(off(refiner.refine(image, K, started(4), covariance).T_cam_obj)) < 0.5
+
+
+def test_large_pictures_are_read_smaller(refiner: RegionRefiner) -> None:
+    image = cv2.resize(picture(pivconnector()), None, fx=9, fy=9, interpolation=cv2.INTER_CUBIC)
+    large = K.copy()
+    large[:2] *= 9
+    large[:2, 2] += 4
+    refined = refiner.refine(image, large, started(5), np.diag(DEVIATIONS**2))
+    assert max(off(refined.T_cam_obj)) < 0.3
+
+
+def test_faces_without_area_are_refused() -> None:
+    with pytest.raises(ValueError, match="no triangle"):
+        RegionRefiner(np.zeros((3, 3)), np.array([[0, 1, 2]]))
