@@ -30,8 +30,8 @@ KEY: Final = "dopepp"
 MAX_BYTES: Final = 2**30
 """Of a file: five times the full DOPE in float32."""
 
-MAX_HEADER_BYTES: Final = 8_000_000
-"""Of the header with its metadata: the ADD points of forty parts as text."""
+MAX_HEADER_BYTES: Final = 16_000_000
+"""Of the header with its metadata: the ADD points and meshes of forty parts as text."""
 
 _MAX_NAME: Final = 200
 """Characters of a tensor's name or of a key of the metadata."""

@@ -28,7 +28,8 @@ __all__ = ["Checkpoint", "load_network", "read", "write_atomic"]
 
 KEY: Final = released.KEY
 STATE_PREFIX: Final = "network."
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
+"""2 since parts have a mesh; files of version 1 are read as well."""
 
 MAX_SIDE: Final = 8192
 """Pixels of an input: an image is enlarged to it, so it decides about memory."""

@@ -175,7 +175,7 @@ def set_weight(value: Any) -> Any:
     [
         (lambda c: c.pop("dopepp"), "without 'dopepp' entry"),
         (lambda c: c.update(dopepp=[1]), "a list under 'dopepp'"),
-        (set_payload("format_version", 2), "format_version 2, .*allowed: 1 to 1; fix: update"),
+        (set_payload("format_version", 3), "format_version 3, .*allowed: 1 to 2; fix: update"),
         (set_payload("format_version", 0), "format_version 0"),
         (set_payload("format_version", "1"), "format_version '1'"),
         (set_payload("format_version", True), "format_version True"),

@@ -26,7 +26,8 @@ from dopepp.data.formats.bop.records import MM, is_number
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import MAX_SYMMETRIES, Mesh, Part, check_name, make_part
+from dopepp.parts.part import Mesh, Part, check_name, make_part
+from dopepp.parts.record import MAX_SYMMETRIES
 
 _log = logging.getLogger(__name__)
 
