@@ -28,7 +28,12 @@ def predict(
         typer.Option("--part", help="for --verify: built-in part, mesh file, or NAME=FILE"),
     ] = None,
     unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
-    refine: Annotated[str | None, typer.Option(help="depth: refine with --depth")] = None,
+    refine: Annotated[
+        str | None, typer.Option(help="region: on the picture; depth: with --depth")
+    ] = None,
+    max_ms: Annotated[
+        float | None, typer.Option(help="of refining, then detections keep the network's poses")
+    ] = None,
     depth: Annotated[
         Path | None, typer.Option(help="16-bit PNG aligned to the picture, 0 where unknown")
     ] = None,
@@ -42,22 +47,31 @@ def predict(
     from dopepp.geometry.camera import camera_matrix
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.inference.refinement.view import read_depth
-    from dopepp.virtual.agreement import agreement, meshes_of
+    from dopepp.parts.catalogue import with_meshes
+    from dopepp.virtual.agreement import agreement
+    from dopepp.virtual.surface import make_surface
 
     with report_errors():
         picture, K = read_rgb(image), camera_matrix(*intrinsics)
-        if (refine is None) != (depth is None):
+        if (refine == "depth") != (depth is not None):
             raise UserError(
-                "--depth without --refine" if refine is None else "--refine without --depth",
+                "--depth without --refine depth" if depth else "--refine depth without --depth",
                 "both or none of them",
-                "add --refine depth" if refine is None else "add --depth FILE",
+                "add --refine depth" if depth else "add --depth FILE",
             )
-        estimator = PoseEstimator.load(checkpoint, device, refine)
+        estimator = PoseEstimator.load(checkpoint, device, max_ms=max_ms)
+        known = (
+            with_meshes(estimator.parts, parts or (), unit)
+            if verify or refine == "region"
+            else estimator.parts
+        )
+        if refine is not None:
+            estimator = estimator.refining(refine, known)
         metres = None if depth is None else read_depth(depth, depth_scale)
         found = estimator.predict(picture, K, depth=metres)
         agreements: list[float] = []
         if verify:
-            meshes = meshes_of(estimator.parts, parts or (), unit)
+            meshes = {part.name: make_surface(part.mesh) for part in known if part.mesh}
             agreements = [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
     if not found:
         typer.echo("nothing found: " + "; ".join(estimator.explain(picture, K)), err=True)
@@ -69,6 +83,8 @@ def predict(
             "keypoints": one.keypoints.tolist(),
             "reprojection_error_px": one.reprojection_error_px,
         }
+        if refine is not None:
+            record["kept"] = one.kept or None
         if verify:
             record["agreement"] = agreements[number]
         typer.echo(json.dumps(record))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, check_camera, project_keypoints
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.inference.refinement.refiner import make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
@@ -25,8 +25,6 @@ from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
-
-_log = logging.getLogger(__name__)
 
 Decoded = TypeVar("Decoded")
 
@@ -42,8 +40,15 @@ class PoseEstimator:
         network: The trained network.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
-        refine: ``depth`` refines poses with the depth that :meth:`predict` is given; None does not.
-            Any other one, or a missing extra, is a :class:`UserError`.
+        refine: ``region`` refines poses on the picture (:mod:`dopepp.inference.refinement.region`),
+            ``depth`` with the depth that :meth:`predict` is given; None does not.
+        parts: The checkpoint's parts with their meshes, where it has none itself (an earlier
+            version's).
+        max_ms: Milliseconds of refining a picture after which its further detections, the best
+            score first, keep the network's poses; None sets no limit.
+
+    Raises:
+        UserError: The refinement is unknown, its extra is missing, or a part has no mesh.
     """
 
     def __init__(
@@ -52,26 +57,37 @@ class PoseEstimator:
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
         refine: str | None = None,
+        parts: Sequence[Part] | None = None,
+        max_ms: float | None = None,
     ) -> None:
-        if refine not in (None, "depth"):
-            raise UserError(f"refine={refine!r}", "depth, or None", "choose one of them")
-        self.refiner = None if refine is None else DepthRefiner(checkpoint.parts)
+        self.checkpoint = checkpoint
+        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.max_ms = max_ms
         self.device = torch.device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.checkpoint = checkpoint
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
+        self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     @classmethod
     def load(
-        cls, path: str | Path, device: str | torch.device = "cpu", refine: str | None = None
+        cls,
+        path: str | Path,
+        device: str | torch.device = "cpu",
+        refine: str | None = None,
+        parts: Sequence[Part] | None = None,
+        max_ms: float | None = None,
     ) -> PoseEstimator:
         """Load a checkpoint written by training; see the class for the options.
 
-        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or a
-        refinement is unknown or not installed.
+        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or the
+        refinement is not possible.
         """
-        return cls(*load_network(Path(path)), device, refine)
+        return cls(*load_network(Path(path)), device, refine, parts, max_ms)
+
+    def refining(self, refine: str, parts: Sequence[Part] | None = None) -> PoseEstimator:
+        """Return an estimator with the same network that also refines; see the class."""
+        return type(self)(self.network, self.checkpoint, self.device, refine, parts, self.max_ms)
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -93,12 +109,12 @@ class PoseEstimator:
             distortion: OpenCV distortion coefficients; the image is undistorted first, with the
                 same K, and pixels of the result refer to the undistorted image.
             depth: Metres along z, aligned to the image (and distorted as it is), 0 or NaN where
-                unknown; used where the estimator refines with depth. A refined detection has the
-                refined pose, its keypoints and, where there was one, its covariance; score, peaks
-                and reprojection error stay those of the image.
+                unknown; used where the estimator refines with depth.
 
         Returns:
-            Detections, best score first, in pixels of the given size and metres.
+            Detections, best score first, in pixels of the given size and metres. A refined one has
+            the refined pose, its keypoints and covariance; score, peaks and reprojection error stay
+            those of the network. Where refinement kept the network's pose, ``kept`` says why.
 
         Raises:
             UserError: The image is no RGB picture, K cannot belong to it, there is no lens model
@@ -113,11 +129,30 @@ class PoseEstimator:
             depth = None if depth is None else undistorted_depth(depth, K, coefficients)
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
         found = self._decode(recover, image, K, letterbox)
-        cuboids = {part.name: part.cuboid for part in self.parts}
+        cuboids = self._cuboid_of
         detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
-        if self.refiner is None or depth is None:
+        return self._refined(detections, image, K, depth)
+
+    def _refined(
+        self, detections: list[Detection], image: Picture, K: CameraMatrix, depth: Depth | None
+    ) -> list[Detection]:
+        """Refine detections until the time is spent; K is that of the image without distortion."""
+        if self.refiner is None:
             return detections
-        return [_refined(self.refiner, one, cuboids[one.object], depth, K) for one in detections]
+        refined: list[Detection] = []
+        start = time.perf_counter()
+        for one in detections:
+            if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
+                refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
+                continue
+            result = self.refiner(one, image, K, depth)
+            if result.covariance is None:
+                refined.append(replace(one, kept=result.reason))
+                continue
+            T, covariance = result.T_cam_obj, result.covariance
+            keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
+            refined.append(replace(one, T_cam_obj=T, keypoints=keypoints, covariance=covariance))
+        return refined
 
     def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
         """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
@@ -197,22 +232,6 @@ def _checked_distortion(distortion: Coefficients) -> Coefficients:
             "pass the camera's calibration, or None for an undistorted image",
         )
     return coefficients
-
-
-def _refined(
-    refiner: DepthRefiner, detection: Detection, cuboid: Cuboid, depth: Depth, K: CameraMatrix
-) -> Detection:
-    """Refine a detection with depth, or keep it where depth is in doubt."""
-    refined = refiner.refine(detection.object, detection.T_cam_obj, depth, K, detection.covariance)
-    if refined.covariance is None:
-        _log.debug("%s keeps the image's pose: %s", detection.object, refined.reason)
-        return detection
-    return replace(
-        detection,
-        T_cam_obj=refined.T_cam_obj,
-        keypoints=project_keypoints(cuboid, refined.T_cam_obj, K),
-        covariance=refined.covariance,
-    )
 
 
 def _in_original(

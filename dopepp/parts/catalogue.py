@@ -11,7 +11,9 @@ To add a built-in part, write its solid with the shapes below and a function lik
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -23,6 +25,8 @@ from dopepp.core.errors import UserError
 from dopepp.parts.mesh.measure import weld
 from dopepp.parts.mesh.read import READERS, read_in_unit
 from dopepp.parts.part import Mesh, Part, make_part
+
+_log = logging.getLogger(__name__)
 
 BACK: Final = -3.5
 PLATE: Final = 0.5
@@ -110,6 +114,60 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
         )
     mesh, taken = read_in_unit(path, unit)
     return make_part(path.stem, mesh, unit=taken)
+
+
+def with_meshes(
+    known: Sequence[Part], given: Sequence[str] = (), unit: str | None = None
+) -> list[Part]:
+    """Return a checkpoint's parts, each with a mesh.
+
+    Args:
+        known: The parts; those of earlier versions' checkpoints have no mesh.
+        given: Meshes that are used instead of a checkpoint's: ``NAME=FILE``, where NAME may be left
+            out if it is the file's stem or there is one part only.
+        unit: Of the mesh files; None takes the one they have by their format.
+
+    Returns:
+        The parts in order. A built-in part's mesh is found by its name. The log warns of a mesh
+        other than the one that was trained on.
+
+    Raises:
+        UserError: A part has no mesh, a given one is not known, or a file cannot be used.
+    """
+    names = [part.name for part in known]
+    chosen: dict[str, str] = {}
+    for text in given:
+        name, named, path = text.rpartition("=")
+        path = path if named else text
+        if not named:
+            single = len(names) == len(given) == 1
+            name = names[0] if single else text if text in BUILTIN else Path(text).stem
+        if name not in names:
+            raise UserError(
+                f"--part {text}, which is no part of the checkpoint", ", ".join(names),
+                "name the part: --part NAME=FILE",
+            )  # fmt: skip
+        chosen[name] = path
+    return [_with_mesh(part, chosen.get(part.name), unit) for part in known]
+
+
+def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
+    """Return a part with the chosen mesh, its own one, or that of the built-in part."""
+    if chosen is None and part.mesh is not None:
+        return part
+    if chosen is None and part.name not in BUILTIN:
+        raise UserError(
+            f"no mesh of {part.name}: an earlier version wrote this checkpoint",
+            "a mesh file for every part of the checkpoint",
+            f"add --part {part.name}=FILE and its --unit, or train again",
+        )
+    loaded = load_part(chosen or part.name, unit)
+    if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
+        _log.warning(
+            "the mesh of %s (%s) is not the one the checkpoint was trained on",
+            part.name, chosen or "built in",
+        )  # fmt: skip
+    return replace(part, mesh=loaded.mesh, mesh_deviation=loaded.mesh_deviation)
 
 
 def _tapered(foot: float, top: float, *sections: CrossSection) -> Manifold:

@@ -51,6 +51,7 @@ class Detection:
         reprojection_error_px: RMS distance between the two over the PnP inliers, pixels.
         covariance: Of a small turn about the object's origin (rotation vector in the camera
             frame, radians) and a small shift (camera frame, metres), from the peaks' covariances.
+        kept: Why a refinement that was asked for kept the network's pose; empty elsewhere.
     """
 
     object: str
@@ -61,6 +62,7 @@ class Detection:
     peaks: Float[np.ndarray, "9 2"]
     reprojection_error_px: float
     covariance: Float[np.ndarray, "6 6"]
+    kept: str = ""
 
 
 def peaks_of_object(

@@ -10,22 +10,17 @@ each profile by its own sum makes strong and weak contrasts count alike.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
-from dopepp.parts.catalogue import BUILTIN, load_part
-from dopepp.parts.part import Part
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import NEAR, SceneObject
-from dopepp.virtual.surface import Surface, make_surface
+from dopepp.virtual.surface import Surface
 
 _log = logging.getLogger(__name__)
 
@@ -60,50 +55,6 @@ def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Su
         best = shifted.max(axis=1) + FLOOR**2 * kernel.sum()
         total += float(np.mean(shifted[:, reach] / best))
     return total / 2
-
-
-def meshes_of(
-    known: Sequence[Part], given: Sequence[str], unit: str | None = None
-) -> dict[str, Surface]:
-    """Find the surfaces of a checkpoint's parts, which itself holds no mesh.
-
-    ``given`` are built-in parts, which need not be given, mesh files named as the part, or
-    ``NAME=FILE``. A single file stands for a single part whatever its name. ``unit`` is the files'.
-    A mesh other than the one that was trained on is used, and the log warns of it. A UserError: a
-    part has no mesh, a given one is not known, or a file cannot be used.
-    """
-    names = [part.name for part in known]
-    chosen = {name: name for name in names if name in BUILTIN}
-    for text in given:
-        name, named, path = text.rpartition("=")
-        path = path if named else text
-        if not named:
-            single = len(names) == len(given) == 1
-            name = names[0] if single else text if text in BUILTIN else Path(text).stem
-        if name not in names:
-            raise UserError(
-                f"--part {text}, which is no part of the checkpoint", ", ".join(names),
-                "name the part: --part NAME=FILE",
-            )  # fmt: skip
-        chosen[name] = path
-    surfaces = {}
-    for part in known:
-        if part.name not in chosen:
-            raise UserError(
-                f"no mesh of {part.name}, which a checkpoint does not hold",
-                "a mesh file for every part of the checkpoint",
-                f"add --part {part.name}=FILE and its --unit",
-            )
-        loaded = load_part(chosen[part.name], unit)
-        if loaded.mesh is None:
-            raise UserError(f"part {chosen[part.name]} without a mesh", "a mesh", "give its file")
-        if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
-            _log.warning(
-                "the mesh of %s (%s) is not the one the checkpoint was trained on",
-                part.name, chosen[part.name],
-            )  # fmt: skip
-        surfaces[part.name] = make_surface(loaded.mesh)
-    return surfaces
 
 
 def _contour(

@@ -78,18 +78,20 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
     pytest.importorskip("small_gicp")
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
-    options = ("--verify", "--refine", "depth", "--depth", depth)
-    done = call("predict", checkpoint, picture, *K, *options)
-    assert done.exit_code == 0, done.output
-    for line in done.stdout.splitlines():
-        assert 0 <= json.loads(line)["agreement"] <= 1
+    for options in (("depth", "--depth", depth), ("region",)):
+        done = call("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
+        assert done.exit_code == 0, done.output
+        for line in done.stdout.splitlines():
+            assert 0 <= json.loads(line)["agreement"] <= 1
+            assert json.loads(line)["kept"]  # noise shows no part
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--refine", "depth"], "--refine without --depth"),
-        (["--depth", "d.png"], "--depth without --refine"),
+        (["--refine", "depth"], "--refine depth without --depth"),
+        (["--depth", "d.png"], "--depth without --refine depth"),
+        (["--refine", "icp"], "refine='icp'"),
         (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],

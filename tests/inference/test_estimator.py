@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -198,7 +201,7 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
     with pytest.raises(UserError, match=message) as caught:
         estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"refine='icp'.*depth, or None"):
+    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, or none"):
         PoseEstimator.load(checkpoint_path, refine="icp")
 
 
@@ -234,29 +237,69 @@ def test_an_unknown_name_of_the_package():
         _ = dopepp.PoseEstimater
 
 
-def test_refines_with_depth_where_it_is_given(save):
-    pytest.importorskip("small_gicp")
+TRUE = make_transform(random_rotation(np.random.default_rng(3)), np.array([0.01, 0.0, 0.4]))
+
+
+@pytest.fixture
+def parts_path(save):
     from dopepp.parts.catalogue import pivconnector, servoholder
+
+    return save([servoholder(), pivconnector()])
+
+
+def seen(path, refine, nearer=0.012, **options):
+    """What an estimator whose network is off along the viewing axis finds on a rendered part."""
     from dopepp.virtual import Scene, SceneObject, make_surface, render
 
-    path = save([servoholder(), pivconnector()])
-    T = make_transform(random_rotation(np.random.default_rng(3)), np.array([0.01, 0.0, 0.4]))
-    off = T.copy()
-    off[2, 3] += 0.012
-    mesh = servoholder().mesh
-    assert mesh is not None
-    picture = image(640, 480)
-    scene = Scene(K_VGA, picture, (SceneObject(make_surface(mesh), T),))
-    depth = render(scene).depth
-    errors = []
-    for refine in (None, "depth"):
-        estimator = Oracle.load(path, refine=refine)
-        estimator.show((640, 480), K_VGA, [(0, off)])  # type: ignore[attr-defined]
-        found = estimator.predict(picture, K_VGA, depth=depth)[0]
-        assert_array_equal(
-            found.keypoints, project_keypoints(estimator.cuboids[0], found.T_cam_obj, K_VGA)
-        )
-        errors.append(np.linalg.norm(found.T_cam_obj[:3, 3] - T[:3, 3]))
-        alone = estimator.predict(picture, K_VGA)[0]
-        assert abs(np.linalg.norm(alone.T_cam_obj[:3, 3] - off[:3, 3])) < 0.004
-    assert errors[1] < 0.002 < 0.009 < errors[0]
+    off = TRUE.copy()
+    off[2, 3] += nearer
+    estimator = Oracle.load(path, refine=refine, **options)
+    surface = make_surface(estimator.parts[0].mesh)
+    wall = np.full((480, 640, 3), (40, 110, 60), np.uint8)
+    rendered = render(Scene(K_VGA, wall, (SceneObject(surface, TRUE),)))
+    estimator.show((640, 480), K_VGA, [(0, off)])
+    return estimator, rendered
+
+
+def error(pose):
+    return np.linalg.norm(pose[:3, 3] - TRUE[:3, 3])
+
+
+def test_refines_with_depth_where_it_is_given(parts_path):
+    pytest.importorskip("small_gicp")
+    estimator, rendered = seen(parts_path, "depth")
+    found = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
+    alone = estimator.predict(rendered.image, K_VGA)[0]
+    assert error(found.T_cam_obj) < 0.002 < 0.009 < error(alone.T_cam_obj)
+    assert (found.kept, alone.kept) == ("", "no depth image was given")
+    assert_array_equal(
+        found.keypoints, project_keypoints(estimator.cuboids[0], found.T_cam_obj, K_VGA)
+    )
+
+
+def test_refines_on_the_picture(parts_path):
+    estimator, rendered = seen(parts_path, "region", nearer=0.005)
+    found = estimator.predict(rendered.image, K_VGA)[0]
+    # These peaks claim a pixel; an outline may be off by as much, so they are told to be wide.
+    wide = replace(found, covariance=16 * found.covariance)
+    refined = estimator.refiner(wide, rendered.image, K_VGA, None)
+    assert error(refined.T_cam_obj) < 0.002 < 0.004 < error(found.T_cam_obj)
+    alone = estimator.predict(np.full_like(rendered.image, 90), K_VGA)[0]
+    assert alone.kept == "colours inside and around the part are too alike"
+    assert_array_equal(alone.T_cam_obj, found.T_cam_obj)
+
+
+def test_refines_no_longer_than_it_may(parts_path):
+    estimator, rendered = seen(parts_path, "region", max_ms=0.0)
+    assert estimator.predict(rendered.image, K_VGA)[0].kept == "max_ms=0 was spent"
+
+
+def test_a_checkpoint_without_meshes_names_the_option(parts_path):
+    estimator, _ = seen(parts_path, None)
+    bare = replace(
+        estimator.checkpoint, parts=[replace(part, mesh=None) for part in estimator.parts]
+    )
+    write_atomic(bare.to_file(), parts_path)
+    with pytest.raises(UserError, match=r"no mesh of servoholder.*--part servoholder=FILE"):
+        PoseEstimator.load(parts_path, refine="region")
+    PoseEstimator.load(parts_path, refine="region", parts=estimator.parts)

@@ -1,17 +1,12 @@
-import logging
 import math
-from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.stats import spearmanr
 
-from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Part
-from dopepp.virtual.agreement import agreement, meshes_of
+from dopepp.parts.catalogue import servoholder
+from dopepp.virtual.agreement import agreement
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS
 
@@ -45,26 +40,3 @@ def test_nothing_agrees_with_an_empty_image_or_outside_it():
     for place in ((9.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.0, 0.0, 0.0)):
         T = make_transform(np.eye(3), np.array(place))
         assert agreement(grey, K, T, item.surface) == 0.0
-
-
-def known(name: str, mesh_hash: str) -> Part:
-    return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
-
-
-def test_meshes_are_found_by_name_and_compared(tmp_path, caplog):
-    own = servoholder().mesh_hash
-    with caplog.at_level(logging.WARNING):
-        found = meshes_of([known("servoholder", own), known("other", own)], ["other=servoholder"])
-    assert sorted(found) == ["other", "servoholder"]
-    assert not caplog.records
-    with caplog.at_level(logging.WARNING):
-        meshes_of([known("bracket", own)], ["pivconnector"])
-    assert "is not the one the checkpoint was trained on" in caplog.text
-
-
-def test_missing_or_unknown_meshes():
-    part = known("bracket", "")
-    with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
-        meshes_of([part], [])
-    with pytest.raises(UserError, match="no part of the checkpoint"):
-        meshes_of([part, pivconnector()], ["wrong=servoholder"])

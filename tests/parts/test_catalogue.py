@@ -1,0 +1,38 @@
+import logging
+from dataclasses import replace
+
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.parts.catalogue import pivconnector, servoholder, with_meshes
+from dopepp.parts.part import Part
+
+
+def known(name: str, mesh_hash: str) -> Part:
+    return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
+
+
+def test_meshes_are_found_by_name_and_compared(tmp_path, caplog):
+    own = servoholder().mesh_hash
+    with caplog.at_level(logging.WARNING):
+        found = with_meshes([known("servoholder", own), known("other", own)], ["other=servoholder"])
+    assert [part.name for part in found] == ["servoholder", "other"]
+    assert all(part.mesh is not None for part in found)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        with_meshes([known("bracket", own)], ["pivconnector"])
+    assert "is not the one the checkpoint was trained on" in caplog.text
+
+
+def test_a_checkpoints_own_mesh_is_taken_unless_another_is_given():
+    part = replace(servoholder(), name="bracket")
+    assert with_meshes([part])[0].mesh is part.mesh
+    assert with_meshes([part], ["pivconnector"])[0].mesh is pivconnector().mesh
+
+
+def test_missing_or_unknown_meshes():
+    part = known("bracket", "")
+    with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
+        with_meshes([part], [])
+    with pytest.raises(UserError, match="no part of the checkpoint"):
+        with_meshes([part, pivconnector()], ["wrong=servoholder"])
