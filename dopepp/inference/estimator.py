@@ -120,7 +120,7 @@ class PoseEstimator:
             UserError: The image is no RGB picture, K cannot belong to it, there is no lens model
                 with so many coefficients, or the depth is not aligned or not in metres.
         """
-        image, K = _checked(image, K)
+        image, K = checked_picture(image, K)
         if depth is not None:
             depth = checked_depth(depth, (image.shape[1], image.shape[0]))
         if distortion is not None:
@@ -131,14 +131,21 @@ class PoseEstimator:
         found = self._decode(recover, image, K, letterbox)
         cuboids = self._cuboid_of
         detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
-        return self._refined(detections, image, K, depth)
+        return self.refined(detections, image, K, depth)
 
-    def _refined(
-        self, detections: list[Detection], image: Picture, K: CameraMatrix, depth: Depth | None
+    def refined(
+        self,
+        detections: Sequence[Detection],
+        image: Picture,
+        K: CameraMatrix,
+        depth: Depth | None = None,
     ) -> list[Detection]:
-        """Refine detections until the time is spent; K is that of the image without distortion."""
+        """Refine detections, whoever made them, where the estimator refines at all.
+
+        Image, K and depth are as in :meth:`predict`, checked and without distortion.
+        """
         if self.refiner is None:
-            return detections
+            return list(detections)
         refined: list[Detection] = []
         start = time.perf_counter()
         for one in detections:
@@ -151,7 +158,9 @@ class PoseEstimator:
                 continue
             T, covariance = result.T_cam_obj, result.covariance
             keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
-            refined.append(replace(one, T_cam_obj=T, keypoints=keypoints, covariance=covariance))
+            refined.append(
+                replace(one, T_cam_obj=T, keypoints=keypoints, covariance=covariance, kept="")
+            )
         return refined
 
     def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
@@ -159,7 +168,7 @@ class PoseEstimator:
 
         An image or a K that :meth:`predict` refuses is a :class:`UserError`.
         """
-        image, K = _checked(image, K)
+        image, K = checked_picture(image, K)
         letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
         return self._decode(explain, image, K, letterbox)
 
@@ -209,8 +218,8 @@ def letterboxed(
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
 
 
-def _checked(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMatrix]:
-    """Check that the arguments are an RGB image and its camera matrix."""
+def checked_picture(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMatrix]:
+    """Check that the arguments are an RGB image and its camera matrix; a UserError if not."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise UserError(

@@ -1,0 +1,179 @@
+"""Tracking on rendered sequences: how near, how steady, how soon again, how fast.
+
+    python benchmarks/track.py [--checkpoint pretrained/NAME] [--seeds 3] [--pictures FOLDER]
+
+The part rests, is turned (up to 8° a frame) and shifted (up to 5 % of its distance a frame), passes
+behind a hand-sized occluder, is covered completely for 15 frames, and rests again, while the light
+changes. Times are process time of one thread at 640×480, rendering aside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+
+from dopepp.core.files import write_png
+from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
+from dopepp.geometry.camera import make_transform, project_keypoints
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.tracker import PoseTracker
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Mesh, Part
+from dopepp.virtual import PRESETS, Factory, Scene, SceneObject, make_surface, render
+from dopepp.virtual.scene import Light, Material
+
+SIZE = (640, 480)
+REST = 60
+"""Frames at each end in which nothing moves."""
+
+COVERED = range(190, 205)
+PASSING = range(110, 160)
+WITHIN = (0.005, 2.0)
+"""Metres and degrees within which a frame counts as right."""
+
+LEAST_VISIBLE = 0.3
+"""Share of the part that must be in view for a frame to count."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame: the picture, its camera, the true pose and what is visible of the part."""
+
+    image: np.ndarray
+    K: np.ndarray
+    T: np.ndarray
+    visible: float
+
+
+def pose_at(frame: float, frames: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the pose of a smooth motion that rests at both ends."""
+    phases = rng.uniform(0, 2 * math.pi, 6)
+    # Time runs slower towards the rests, so that speeds rise and fall.
+    moving = np.clip(frame - REST, 0, frames - 2 * REST)
+    length = max(frames - 2 * REST, 1)
+    warped = moving - length / (2 * math.pi) * math.sin(2 * math.pi * moving / length)
+    periods = (110, 90, 75, 140, 65, 120)
+    swing = [math.sin(2 * math.pi * warped / period + phase)
+             for period, phase in zip(periods, phases, strict=True)]  # fmt: skip
+    tilt = rotation_vector_to_matrix(np.array([0.45 * swing[0], 0.45 * swing[1], 0.0]))
+    turn = rotation_vector_to_matrix(np.array([0.0, 0.0, 0.65 * swing[2]]))
+    z = 0.19 + 0.04 * swing[3]
+    place = np.array([0.25 * z * swing[4], 0.15 * z * swing[5], z])
+    facing = np.diag([1.0, -1.0, -1.0])
+    return make_transform(tilt @ turn @ facing, place)
+
+
+def sequence(part: Part, seed: int, frames: int) -> Iterator[Frame]:
+    """Render a sequence that depends on the seed alone."""
+    factory = Factory([part], PRESETS["wide"].resized(*SIZE), seed)
+    base = factory.scene(0, 0)
+    target = base.objects[base.targets[0]]
+    hand = trimesh.creation.icosphere(3)
+    hand = make_surface(Mesh(hand.vertices * (0.02, 0.045, 0.015), hand.faces.astype(np.int32)))
+    wall = trimesh.creation.box((0.4, 0.4, 0.01))
+    wall = make_surface(Mesh(wall.vertices.copy(), wall.faces.astype(np.int32)))
+    skin = Material(colour=(0.5, 0.28, 0.2))
+    for frame in range(frames):
+        T = pose_at(frame, frames, np.random.default_rng(seed))
+        objects = [replace(target, T_cam_obj=T)]
+        if frame in PASSING:
+            share = (frame - PASSING.start) / len(PASSING)
+            place = T[:3, 3] * 0.8 + np.array([0.16 * (share - 0.5), 0.0, 0.0])
+            objects.append(SceneObject(hand, make_transform(np.eye(3), place), skin))
+        if frame in COVERED:
+            objects.append(SceneObject(wall, make_transform(np.eye(3), T[:3, 3] * 0.5), skin))
+        wave = math.sin(2 * math.pi * frame / 80)
+        lights = tuple(
+            replace(one, position=(one.position[0] + 0.3 * wave, *one.position[1:]))
+            for one in base.lights
+        ) or (Light((0.3 * wave, -0.5, -0.2)),)
+        sensor = replace(base.sensor, exposure_ev=base.sensor.exposure_ev + 0.4 * wave,
+                         noise_seed=frame, motion_px=(0.0, 0.0))  # fmt: skip
+        rendered = render(
+            Scene(base.K, base.background, tuple(objects), lights, base.ambient, sensor=sensor)
+        )
+        yield Frame(rendered.image, base.K, T, float(rendered.visible_fractions[0]))
+
+
+def is_right(pose: np.ndarray | None, true: np.ndarray) -> bool:
+    """Tell whether a pose is near the truth."""
+    if pose is None:
+        return False
+    turn = math.degrees(float(rotation_angle(pose[:3, :3] @ true[:3, :3].T)))
+    return bool(np.linalg.norm(pose[:3, 3] - true[:3, 3]) <= WITHIN[0] and turn <= WITHIN[1])
+
+
+def measure(
+    estimator: PoseEstimator, part: Part, seed: int, frames: int, pictures: Path | None
+) -> list[str]:
+    """Return one row of the table."""
+    tracker = PoseTracker(estimator)
+    right: list[bool] = []
+    times: list[float] = []
+    resting: list[np.ndarray] = []
+    recovery = None
+    for number, frame in enumerate(sequence(part, seed, frames)):
+        began = time.process_time()
+        found = tracker.track(frame.image, frame.K)
+        times.append(1e3 * (time.process_time() - began))
+        pose = found[0].detection.T_cam_obj if found else None
+        good = is_right(pose, frame.T)
+        if frame.visible >= LEAST_VISIBLE:
+            right.append(good)
+        if pose is not None and 10 <= number < REST:
+            resting.append(pose)
+        if recovery is None and number >= COVERED.stop and good:
+            recovery = number - COVERED.stop + 1
+        if pictures is not None and (number % 10 == 0 or not good):
+            true = Wireframe(project_keypoints(part.cuboid, frame.T, frame.K), GREEN, "true")
+            seen = [Wireframe(one.detection.keypoints, YELLOW, f"{one.identity}") for one in found]
+            write_png(pictures / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *seen]))
+    # Steps from frame to frame over √2: a slow drift is no trembling.
+    shifts = np.array([after[:3, 3] - before[:3, 3] for before, after in pairwise(resting)])
+    turns = [float(rotation_angle(after[:3, :3] @ before[:3, :3].T))
+             for before, after in pairwise(resting)]  # fmt: skip
+    return [
+        str(seed),
+        f"{np.mean(right):.1%}",
+        f"{1e3 * math.sqrt(float((shifts**2).sum(axis=1).mean()) / 2):.2f}",
+        f"{math.degrees(math.sqrt(float(np.mean(np.square(turns))) / 2)):.2f}",
+        "never" if recovery is None else str(recovery),
+        f"{1e3 / np.mean(times[1:]):.0f}",
+        f"{np.median(times):.1f}",
+        f"{np.percentile(times, 95):.1f}",
+    ]
+
+
+def main() -> None:
+    """Print a row for every seed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--pictures", type=Path)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    estimator = PoseEstimator.load(arguments.checkpoint)
+    part = load_part(estimator.parts[0].name)
+    estimator = estimator.refining("region", [part])
+    titles = "seed | within 5 mm and 2° | at rest mm | at rest ° | frames to recover | frames/s"
+    print(f"| {titles} | ms p50 | p95 |\n" + "| --- " * 8 + "|")
+    for seed in range(arguments.seeds):
+        row = measure(estimator, part, seed, arguments.frames, arguments.pictures)
+        print("| " + " | ".join(row) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

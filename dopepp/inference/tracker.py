@@ -1,0 +1,231 @@
+"""PoseTracker: parts followed from frame to frame; the network runs only where it must.
+
+A part that was seen in the last frame is looked for where its motion takes it, by refinement alone
+(:mod:`dopepp.inference.refinement.region`): first near there, then as far as a hand may have moved
+it. Where neither is believed, the network looks; where it finds nothing either, the part is lost,
+and the network looks in every frame until it is there again, under the same identity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from dopepp.core.checks import check_integer
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.rotation import matrix_to_rotation_vector
+from dopepp.inference.estimator import PoseEstimator, checked_picture
+from dopepp.inference.refinement.solver import moved
+from dopepp.recovery.detection import Detection
+
+Step = Float[np.ndarray, "6"]
+"""A turn about the object's origin (rotation vector) and a shift, camera axes: radians, metres."""
+
+STILL: Final = (math.radians(0.15), 5e-4)
+"""Standard deviations of what a part at rest seems to move by a frame: radians along each axis, and
+metres per metre of its distance. The smaller, the less a resting pose trembles."""
+
+SUDDEN: Final = (math.radians(4.0), 0.025)
+"""The same of a part that a hand takes up or turns round: half of 8° and of 5 % a frame."""
+
+SWERVE: Final = 0.5
+"""Share of its last step by which a moving part may do otherwise in the next one."""
+
+SMOOTHING: Final = 0.6
+"""Weight of the last step in the velocity: a step is known to a few pixels' worth only."""
+
+PERSISTENCE: Final = 0.9
+"""Share of the velocity that is left after a frame."""
+
+NEAR: Final = 0.5
+"""Diameters between the centres of a track and a detection that may be the same part."""
+
+ELSEWHERE: Final = 0.1
+"""Diameters, of mean distance between keypoints: farther apart, track and detection disagree."""
+
+OUTVOTED: Final = 2
+"""Detections in a row that disagree with a track before it is moved to them."""
+
+FORGOTTEN: Final = 300
+"""Frames after which a lost part is no longer looked for."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """A part that was found on a frame.
+
+    Attributes:
+        identity: Of this instance, the same as long as it is followed, and when it is found again.
+        detection: Its pose, keypoints and covariance on this frame; score and peaks are those of
+            the network's last look.
+        velocity: Its motion a frame, camera axes: a turn (rotation vector, radians) about the
+            object's origin, and a shift (metres).
+        detected: Whether this frame's pose came from the network's detection.
+    """
+
+    identity: int
+    detection: Detection
+    velocity: Step
+    detected: bool
+
+
+@dataclass
+class _State:
+    """What is known of a part between two frames.
+
+    ``unseen`` counts the frames since it was last seen, ``disagreements`` the network's answers in
+    a row that were elsewhere.
+    """
+
+    track: Track
+    unseen: int = 0
+    disagreements: int = 0
+
+
+class PoseTracker:
+    """Follows the parts of an estimator through the frames of one camera.
+
+    Args:
+        estimator: One that refines poses on the picture (``refine="region"``).
+        detect_every: The network looks at every so manieth frame even where all parts are followed,
+            for parts that have come into view.
+
+    Raises:
+        UserError: The estimator does not refine, or ``detect_every`` is below 1.
+    """
+
+    def __init__(self, estimator: PoseEstimator, detect_every: int = 30) -> None:
+        if estimator.refiner is None:
+            raise UserError(
+                "a tracker of an estimator that does not refine", "refine='region'",
+                "load it with PoseEstimator.load(path, refine='region')",
+            )  # fmt: skip
+        self.detect_every = check_integer("detect_every", detect_every, 1, 1_000_000)
+        self._estimator = estimator
+        self._cuboid_of = {part.name: part.cuboid for part in estimator.parts}
+        self._diameters = {part.name: part.diameter for part in estimator.parts}
+        self._states: list[_State] = []
+        self._frame = 0
+        self._identities = 0
+
+    def track(self, image: Picture, K: CameraMatrix) -> list[Track]:
+        """Find the parts on the next frame.
+
+        Args:
+            image: RGB, uint8, without lens distortion.
+            K: Camera matrix, pixels.
+
+        Returns:
+            The parts that were found, in the order of their identities.
+
+        Raises:
+            UserError: The image is no RGB picture, or K cannot belong to it.
+        """
+        image, K = checked_picture(image, K)
+        for state in self._states:
+            self._follow(state, image, K)
+        due = self._frame % self.detect_every == 0
+        if due or not self._states or any(one.unseen or one.disagreements for one in self._states):
+            self._look(image, K)
+        self._frame += 1
+        self._states = [one for one in self._states if one.unseen <= FORGOTTEN]
+        return [one.track for one in self._states if not one.unseen]
+
+    def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
+        """Look for a part where its motion takes it."""
+        old = state.track.detection
+        velocity = PERSISTENCE * state.track.velocity
+        expected = moved(old.T_cam_obj, velocity)
+        if not state.unseen and expected[2, 3] > 0:
+            for spread in (_spread(expected, velocity), _at(expected, SUDDEN)):
+                given = replace(
+                    old, T_cam_obj=expected, covariance=old.covariance + np.diag(spread**2)
+                )
+                found = self._estimator.refined([given], image, K)[0]
+                if not found.kept:
+                    step = _step(old.T_cam_obj, found.T_cam_obj)
+                    velocity = SMOOTHING * step + (1 - SMOOTHING) * velocity
+                    state.track = replace(
+                        state.track, detection=found, velocity=velocity, detected=False
+                    )
+                    return
+        state.unseen += 1
+
+    def _look(self, image: Picture, K: CameraMatrix) -> None:
+        """Let the network look, and tell known parts from new ones."""
+        found = [one for one in self._estimator.predict(image, K) if not one.kept]
+        for state, one in self._matched(found):
+            if state is None:
+                self._states.append(
+                    _State(Track(self._identities, one, np.zeros(6), detected=True))
+                )
+                self._identities += 1
+            elif state.unseen:
+                state.track = Track(state.track.identity, one, np.zeros(6), detected=True)
+                state.unseen = state.disagreements = 0
+            elif self._apart(state.track.detection, one) <= ELSEWHERE:
+                state.disagreements = 0
+            else:
+                state.disagreements += 1
+                if state.disagreements == OUTVOTED:
+                    state.track = Track(state.track.identity, one, np.zeros(6), detected=True)
+                    state.disagreements = 0
+
+    def _matched(self, found: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
+        """Pair detections with the parts they show: first the followed ones, then the lost."""
+        pairs: list[tuple[_State | None, Detection]] = []
+        for name in self._cuboid_of:
+            left = [one for one in found if one.object == name]
+            own = [one for one in self._states if one.track.detection.object == name]
+            for lost, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
+                states = [one for one in own if bool(one.unseen) == lost]
+                distances = np.array(
+                    [[_distance(one.track.detection, other) for other in left] for one in states]
+                ).reshape(len(states), len(left))
+                taken = set()
+                for row, column in zip(*linear_sum_assignment(distances), strict=True):
+                    if distances[row, column] <= limit:
+                        pairs.append((states[row], left[column]))
+                        taken.add(column)
+                left = [one for number, one in enumerate(left) if number not in taken]
+            pairs += [(None, one) for one in left]
+        return pairs
+
+    def _apart(self, one: Detection, other: Detection) -> float:
+        """Return the mean distance between the cuboids' corners, diameters."""
+        cuboid = self._cuboid_of[one.object]
+        first, second = (
+            cuboid @ pose.T_cam_obj[:3, :3].T + pose.T_cam_obj[:3, 3] for pose in (one, other)
+        )
+        apart = np.linalg.norm(first - second, axis=1).mean()
+        return float(apart / self._diameters[one.object])
+
+
+def _spread(expected: Transform, velocity: Step) -> Step:
+    """Return by how much a part may be elsewhere than its motion takes it, standard deviations."""
+    speeds = (np.linalg.norm(velocity[:3]), np.linalg.norm(velocity[3:]))
+    swerve = np.repeat([SWERVE / math.sqrt(3) * float(speed) for speed in speeds], 3)
+    return np.asarray(np.maximum(_at(expected, STILL), swerve))
+
+
+def _at(expected: Transform, deviations: tuple[float, float]) -> Step:
+    """Return deviations of turn and shift at a part's distance, axis by axis."""
+    turn, shift = deviations
+    return np.array([turn] * 3 + [shift * float(expected[2, 3])] * 3)
+
+
+def _step(before: Transform, after: Transform) -> Step:
+    turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
+    return np.concatenate([turn, after[:3, 3] - before[:3, 3]])
+
+
+def _distance(one: Detection, other: Detection) -> float:
+    return float(np.linalg.norm(one.T_cam_obj[:3, 3] - other.T_cam_obj[:3, 3]))

@@ -1,0 +1,174 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import make_transform, project_keypoints
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
+from dopepp.inference.tracker import FORGOTTEN, PoseTracker
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.recovery.detection import Detection
+
+K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
+IMAGE = np.zeros((480, 640, 3), np.uint8)
+
+
+class Stage:
+    """An estimator of a play: it knows where the actors are, and who can be seen.
+
+    Refinement finds an actor within three standard deviations of where it is told to look; the
+    network finds all that are not hidden from it.
+    """
+
+    def __init__(self, *parts):
+        self.parts, self.refiner = parts, True
+        self.actors = {}
+        self.hidden, self.unknown_to_network = set(), set()
+        self.looks = self.refinements = 0
+
+    def put(self, name, part, place, turn=(0.0, 0.0, 0.0)):
+        pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
+        self.actors[name] = part.name, pose
+
+    def predict(self, image, K):
+        self.looks += 1
+        return [
+            self._detection(part, pose)
+            for name, (part, pose) in self.actors.items()
+            if name not in self.hidden | self.unknown_to_network
+        ]
+
+    def _detection(self, part, pose):
+        cuboid = next(one.cuboid for one in self.parts if one.name == part)
+        keypoints = project_keypoints(cuboid, pose, K)
+        return Detection(part, 0.9, 0.8, pose, keypoints, keypoints, 0.5, np.eye(6) * 1e-6)
+
+    def refined(self, given, image, K):
+        self.refinements += len(given)
+        return [self._refined(one) for one in given]
+
+    def _refined(self, one):
+        for name, (part, pose) in self.actors.items():
+            if part != one.object or name in self.hidden:
+                continue
+            deviation = np.sqrt(np.diag(one.covariance))
+            turn = rotation_angle(pose[:3, :3] @ one.T_cam_obj[:3, :3].T)
+            shift = np.linalg.norm(pose[:3, 3] - one.T_cam_obj[:3, 3])
+            if turn <= 3 * deviation[0] and shift <= 3 * deviation[3]:
+                return self._detection(part, pose)
+        return replace(one, kept="nothing there")
+
+
+@pytest.fixture
+def stage():
+    return Stage(pivconnector(), servoholder())
+
+
+def test_follows_a_part_and_looks_only_when_due(stage):
+    tracker = PoseTracker(stage, detect_every=10)
+    for frame in range(30):
+        angle = math.radians(8) * frame
+        stage.put("a", pivconnector(), (0.1 * math.sin(angle), 0.0, 0.3), (0.0, 0.0, angle))
+        (track,) = tracker.track(IMAGE, K)
+        assert track.identity == 0
+        assert track.detected == (frame == 0)
+        np.testing.assert_allclose(track.detection.T_cam_obj, stage.actors["a"][1], atol=1e-12)
+    assert stage.looks == 3
+
+
+def test_a_steady_motion_is_foreseen(stage):
+    tracker = PoseTracker(stage)
+    for frame in range(12):
+        turn = (0.0, math.radians(6) * frame, 0.0)
+        stage.put("a", pivconnector(), (0.01 * frame, 0.0, 0.3), turn)
+        (track,) = tracker.track(IMAGE, K)
+    np.testing.assert_allclose(track.velocity[:3], (0, math.radians(6), 0), atol=math.radians(1))
+    np.testing.assert_allclose(track.velocity[3:], (0.01, 0, 0), atol=0.002)
+    before = stage.refinements
+    stage.put("a", pivconnector(), (0.12, 0.0, 0.3), (0.0, math.radians(72), 0.0))
+    tracker.track(IMAGE, K)
+    assert stage.refinements == before + 1  # where it was expected, at once
+
+
+def test_a_lost_part_is_looked_for_and_keeps_its_identity(stage):
+    tracker = PoseTracker(stage)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    assert len(tracker.track(IMAGE, K)) == 1
+    stage.hidden = {"a"}
+    for _ in range(7):
+        assert tracker.track(IMAGE, K) == []
+    assert stage.looks == 8
+    stage.hidden = set()
+    stage.put("a", pivconnector(), (0.08, 0.0, 0.4), (0.0, 0.0, 2.0))
+    (track,) = tracker.track(IMAGE, K)
+    assert (track.identity, track.detected) == (0, True)
+    assert not track.velocity.any()
+    tracker.track(IMAGE, K)
+    assert stage.looks == 9
+
+
+def test_a_part_is_forgotten(stage):
+    tracker = PoseTracker(stage, detect_every=1_000_000)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    stage.put("b", servoholder(), (0.1, 0.0, 0.3))
+    tracker.track(IMAGE, K)
+    stage.hidden = {"a"}
+    for _ in range(FORGOTTEN + 2):
+        (track,) = tracker.track(IMAGE, K)
+        assert track.detection.object == "servoholder"
+    assert stage.looks == FORGOTTEN + 2
+    stage.hidden = set()
+    assert [one.identity for one in tracker.track(IMAGE, K)] == [1]
+
+
+def test_two_parts_of_a_kind_keep_their_identities_when_one_comes_back(stage):
+    tracker = PoseTracker(stage, detect_every=5)
+    stage.put("left", pivconnector(), (-0.1, 0.0, 0.4))
+    stage.put("right", pivconnector(), (0.1, 0.0, 0.4))
+    places = {one.identity: one.detection.T_cam_obj[0, 3] for one in tracker.track(IMAGE, K)}
+    stage.hidden = {"left"}
+    seen = [tracker.track(IMAGE, K) for _ in range(4)][-1]
+    assert [one.detection.T_cam_obj[0, 3] for one in seen] == [0.1]
+    stage.hidden = set()
+    stage.put("third", pivconnector(), (0.0, 0.1, 0.4))
+    again = {one.identity: one.detection.T_cam_obj[0, 3] for one in tracker.track(IMAGE, K)}
+    assert again == {**places, 2: 0.0}
+
+
+def test_a_sudden_move_is_followed_without_the_network(stage):
+    tracker = PoseTracker(stage)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    for _ in range(5):
+        tracker.track(IMAGE, K)
+    stage.unknown_to_network = {"a"}
+    stage.put("a", pivconnector(), (0.015, 0.0, 0.3), (math.radians(8), 0.0, 0.0))
+    (track,) = tracker.track(IMAGE, K)
+    assert not track.detected
+    stage.put("a", pivconnector(), (0.1, 0.0, 0.3))
+    assert tracker.track(IMAGE, K) == []
+
+
+def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
+    tracker = PoseTracker(stage, detect_every=5)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker.track(IMAGE, K)
+    true = stage.predict
+    turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
+    stage.predict = lambda *given: [replace(one, T_cam_obj=turned) for one in true(*given)]
+    detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
+    # Frame 5 disagrees, so frame 6 looks again.
+    assert detected == [False] * 5 + [True]
+
+
+def test_bad_input(stage):
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker = PoseTracker(stage)
+    with pytest.raises(UserError, match="uint8"):
+        tracker.track(IMAGE[..., 0], K)
+    with pytest.raises(UserError, match="detect_every=0"):
+        PoseTracker(stage, detect_every=0)
+    stage.refiner = None
+    with pytest.raises(UserError, match="refine='region'"):
+        PoseTracker(stage)
