@@ -92,6 +92,7 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
         (["--refine", "depth"], "--refine depth without --depth"),
         (["--depth", "d.png"], "--depth without --refine depth"),
         (["--refine", "icp"], "refine='icp'"),
+        (["--track", "--verify"], "--track with --verify"),
         (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
     ],
@@ -99,6 +100,30 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
 def test_predict_tells_wrong_options(checkpoint, picture, options, message):
     assert message in refused("predict", checkpoint, picture, *K, *options)
     assert refused("predict", picture, picture, *K, *options).startswith("got ")
+
+
+def test_predict_follows_parts_through_a_folder(tmp_path):
+    from dopepp.parts.catalogue import pivconnector
+    from dopepp.virtual import PRESETS, Factory
+
+    released = Path("pretrained", "pivconnector")
+    rendered = Factory([pivconnector()], PRESETS["quickstart"].resized(640, 480), 2).render(0, 5)
+    frames, drawn = tmp_path / "frames", tmp_path / "drawn"
+    frames.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(frames / f"{number:03d}.png"), rendered.image[..., ::-1])
+    (frames / "notes.txt").write_text("no frame")
+    camera = rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    done = call("predict", released, frames, "--K", *camera, "--track", "--overlay", drawn)
+    assert done.exit_code == 0, done.output
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [one["frame"] for one in records] == ["000.png", "001.png", "002.png"]
+    assert {one["identity"] for one in records} == {0}
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
+    for one in records:
+        assert np.linalg.norm(np.array(one["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
+    assert len(list(drawn.iterdir())) == 3
+    assert "with frames" in refused("predict", released, drawn.parent, "--K", *camera, "--track")
 
 
 def test_compare_tells_an_unfinished_run(tmp_path):
