@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from dopepp.core.errors import UserError
@@ -42,17 +43,20 @@ def measure_and_record(
     bop_csv: bool = False,
     all_measures: bool = False,
     protocols: Protocols | None = None,
+    refine: str | None = None,
 ) -> list[Report]:
     """Measure methods on a test set; show and write tables, curves and pictures.
 
     Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
     challenge CSVs of other methods. The parts are those that are scored, as the test data have
     them; ``details`` are further plain facts of the last report. ``bop_csv`` writes the poses of
-    each method, ``all_measures`` prints the symmetric measures of every object.
+    each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
+    every estimator is measured without and with it.
 
     Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
     """
     protocols = protocols or Protocols()
+    estimators = with_refined(estimators, refine, parts)
     source = held_out_source(data, parts, "test")
     numbers = evaluators.object_numbers(data, parts)
     files = {
@@ -76,6 +80,10 @@ def measure_and_record(
     reports[-1].details.update(details or {})
     for report in reports:
         display.show_report(report, all_measures)
+    if refine is not None and not files:
+        share = made_worse(reports[-2], reports[-1])
+        reports[-1].details |= {"unrefined": reports[-2].name, "made_worse": share}
+        display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
     record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
@@ -144,6 +152,30 @@ def _write_results(
         write_results(run_dir / results_name(method, dataset, split), rows)
 
 
+def with_refined(
+    estimators: Mapping[str, PoseEstimator], refine: str | None, parts: Parts
+) -> dict[str, PoseEstimator]:
+    """Return every estimator, and behind it the same one refining: two rows in every table.
+
+    A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.
+    """
+    if refine is None:
+        return dict(estimators)
+    known = {part.name: part for part in parts}
+    pairs: dict[str, PoseEstimator] = {}
+    for name, one in estimators.items():
+        own = [part if part.mesh is not None else known.get(part.name, part) for part in one.parts]
+        pairs |= {name: one, f"{name} + {refine}": one.refining(refine, own)}
+    return pairs
+
+
+def made_worse(network: Report, refined: Report) -> float:
+    """Return the share of instances whose ADD refinement has made larger by more than 1 mm."""
+    pairs = [(network.errors[name], errors) for name, errors in refined.errors.items()]
+    worse = np.concatenate([after > before + 0.001 for before, after in pairs])
+    return float(worse.mean()) if len(worse) else 0.0
+
+
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
     """Return the last estimator's parts as the test data have them; without one, all of these."""
     if not estimators:
@@ -176,7 +208,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
-    loaded = [PoseEstimator.load(path, device, asked.refine) for path in paths]
+    loaded = [PoseEstimator.load(path, device) for path in paths]
     own = loaded[-1].checkpoint if loaded else None
     measured = str(asked.results if own is None else paths[-1])
     stored = None if own is None else trained_on(own.data)
@@ -204,6 +236,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         bop_csv=asked.bop_csv,
         all_measures=asked.all_measures,
         protocols=asked.protocols,
+        refine=asked.refine,
     )
     write_job_readme(run_dir, f"Evaluation of {measured}", reports[-1])
     return reports
@@ -224,7 +257,8 @@ def _tune_only(
     if asked.ckpt_path is None or len(loaded) > 1:
         allowed = "one ckpt_path, and no baseline"
         raise UserError("tune=true", allowed, "tune one checkpoint at a time")
-    tune_and_record(loaded[0], Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
+    *_, estimator = with_refined({"": loaded[0]}, asked.refine, parts).values()
+    tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
     display.show_files(run_dir)
 
 

@@ -21,7 +21,6 @@ from dopepp.data.sample import Instance, Sample, Source
 from dopepp.experiment.build import sources
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
-from dopepp.geometry.camera import Transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
@@ -103,42 +102,76 @@ def tune(
 ) -> Tuning:
     """Choose factor, weights and threshold on validation images; measure them on test images.
 
+    Of an estimator that refines, first those of the network alone and then, on the refined poses,
+    those of theirs; ``before`` are the figures of the network as it was.
+
     A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
     """
-    old = estimator.recovery
+    old, refiner = estimator.recovery, estimator.refiner
     validation = sources.held_out_source(data, parts, "val")
     test = sources.held_out_source(data, parts, "test")
     empty = sources.build_source_without_objects(data, parts, "val", target.num_empty)
     empty_test = sources.build_source_without_objects(data, parts, "test", target.num_empty)
+    rate = target.false_positive_rate
 
     def scored(options: RecoveryOptions, source: Source) -> Scored:
-        # Every detection counts here, whatever its score.
-        estimator.recovery = replace(options, min_score=0.0)
+        estimator.recovery = options
         return score_images(estimator, parts, source)
 
     try:
-        before = _figures(scored(old, test), scored(old, empty_test), old.min_score)
-        estimator.recovery = replace(old, min_score=0.0, distance_factor=1.0)
-        factor = calibration.fit_distance_factor(*matched_poses(estimator, parts, validation))
-        new = replace(old, distance_factor=factor)
-        chosen = choose(scored(new, validation), scored(new, empty), target.false_positive_rate)
-        new = replace(new, **chosen)  # type: ignore[arg-type]
-        after = _figures(scored(new, test), scored(new, empty_test), new.min_score)
+        estimator.refiner = None
+        # Every detection counts here, whatever its score.
+        heard = replace(old, min_score=0.0, covariance_factor=1.0)
+        before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
+        estimator.recovery = replace(heard, distance_factor=1.0, covariance_factor=1.0)
+        factors = _fit_factors(matched_poses(estimator, parts, validation))
+        heard = replace(heard, distance_factor=factors["distance_factor"])
+        chosen = choose(scored(heard, validation), scored(heard, empty), rate)
+        new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
+        threshold = new.min_score
+        heard = replace(new, min_score=0.0)
+        if refiner is not None:
+            estimator.refiner = refiner
+            heard = replace(new, min_score=min(new.min_score, calibration.CANDIDATE))
+            refined = choose(scored(heard, validation), scored(heard, empty), rate, refined=True)
+            chosen |= refined
+            threshold = refined.pop("refined_min_score")
+            heard = replace(new, **refined)  # type: ignore[arg-type]
+        after = _figures(scored(heard, test), scored(heard, empty_test), threshold)
     finally:
-        estimator.recovery = old
-    changed = {"distance_factor": factor} | chosen
-    return Tuning(changed, before, after, (len(test), target.num_empty))
+        estimator.recovery, estimator.refiner = old, refiner
+    return Tuning(factors | chosen, before, after, (len(test), target.num_empty))
+
+
+def _fit_factors(
+    pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
+) -> dict[str, float]:
+    """Fit the factors on distances and covariances to poses that were found with factors of 1."""
+    estimated = np.reshape([one.T_cam_obj for one, _ in pairs], (-1, 4, 4))
+    true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
+    distance = calibration.fit_distance_factor(estimated, true)
+    surprises = []
+    for one, equivalents in pairs:
+        T = one.T_cam_obj.copy()
+        T[:3, 3] *= distance
+        surprises.append(
+            min(calibration.squared_distance(T, one.covariance, other) for other in equivalents)
+        )
+    covariance = calibration.fit_covariance_factor(np.array(surprises))
+    return {"distance_factor": distance, "covariance_factor": covariance}
 
 
 def choose(
     shown: Scored,
     empty: Scored,
     false_positive_rate: float = FalsePositiveTarget.false_positive_rate,
+    *,
+    refined: bool = False,
 ) -> dict[str, float]:
     """Choose the weights and the threshold from detections on images with objects and without.
 
-    ``false_positive_rate`` is as in :class:`FalsePositiveTarget`. A :class:`UserError`: there is
-    nothing to learn from.
+    ``false_positive_rate`` is as in :class:`FalsePositiveTarget`; ``refined`` tells that the poses
+    are. A :class:`UserError`: there is nothing to learn from.
     """
     features = np.concatenate([shown.features, empty.features])
     correct = np.concatenate([shown.correct, empty.correct])
@@ -156,22 +189,29 @@ def choose(
     allowed = int(false_positive_rate * empty.num_images)
     # A detection passes from the threshold on, so it lies just above the first that must not.
     threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
-    named = zip(calibration.FEATURES, weights, strict=True)
-    return {"min_score": threshold} | {f"score_{name}": float(value) for name, value in named}
+    if refined:
+        names = ["refined_min_score", *(f"refined_{one}" for one in calibration.REFINED_FEATURES)]
+    else:
+        names = ["min_score", *(f"score_{one}" for one in calibration.FEATURES)]
+    return dict(zip(names, [threshold, *map(float, weights)], strict=True))
 
 
 def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scored:
-    """Run an estimator over a source and judge every detection."""
+    """Run an estimator over a source and judge every detection; features are of what it does."""
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
     for number, sample, part, own, true in _by_object(estimator, parts, source):
         num_instances += sum(map(counted, true))
         right, judged = _judge(part, own, true)
         for one, is_right in zip(compress(own, judged), right[judged], strict=True):
-            features = calibration.detection_features(one, part.cuboid, sample.K)
+            features = (
+                calibration.detection_features(one, part.cuboid, sample.K)
+                if estimator.refiner is None
+                else calibration.refined_features(one)
+            )
             rows.append((features, one.score, bool(is_right), number))
     return Scored(
-        np.array([row[0] for row in rows]).reshape(-1, len(calibration.FEATURES)),
+        np.array([row[0] for row in rows]).reshape(len(rows), -1),
         np.array([row[1] for row in rows], np.float64),
         np.array([row[2] for row in rows], bool),
         np.array([row[3] for row in rows], np.int64),
@@ -182,16 +222,18 @@ def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scor
 
 def matched_poses(
     estimator: PoseEstimator, parts: Parts, source: Source
-) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
-    """Return the poses found on a source and, for each, that of the instance it found."""
-    estimated: list[Transform] = []
-    true: list[Transform] = []
+) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
+    """Return the detections on a source and the true poses of the instance each has found.
+
+    A symmetric part's are all that look alike.
+    """
+    found = []
     for _, _, part, own, instances in _by_object(estimator, parts, source):
+        group = symmetries(part).numpy()
         for one, number in zip(own, assign(part.cuboid[CENTROID], own, instances), strict=True):
             if number >= 0 and counted(instances[number]):
-                estimated.append(one.T_cam_obj)
-                true.append(instances[number].T_cam_obj)
-    return np.reshape(estimated, (-1, 4, 4)), np.reshape(true, (-1, 4, 4))
+                found.append((one, instances[number].T_cam_obj @ group))
+    return found
 
 
 def _by_object(

@@ -23,6 +23,7 @@ from dopepp.inference.refinement.visible import Depth
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
+from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 
@@ -131,7 +132,9 @@ class PoseEstimator:
         found = self._decode(recover, image, K, letterbox)
         cuboids = self._cuboid_of
         detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
-        return self.refined(detections, image, K, depth)
+        if self.refiner is None:
+            return detections
+        return rescored(self.refined(detections, image, K, depth), self.recovery)
 
     def refined(
         self,
@@ -154,13 +157,16 @@ class PoseEstimator:
                 continue
             result = self.refiner(one, image, K, depth)
             if result.covariance is None:
-                refined.append(replace(one, kept=result.reason))
+                refined.append(replace(one, kept=result.reason, agreement=None))
                 continue
             T, covariance = result.T_cam_obj, result.covariance
             keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
             refined.append(
-                replace(one, T_cam_obj=T, keypoints=keypoints, covariance=covariance, kept="")
-            )
+                replace(
+                    one, T_cam_obj=T, keypoints=keypoints, covariance=covariance, kept="",
+                    agreement=result.agreement,
+                )
+            )  # fmt: skip
         return refined
 
     def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
@@ -183,7 +189,8 @@ class PoseEstimator:
         belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
         names = [part.name for part in self.parts]
         K, stride = letterbox.camera(K), self.network.stride
-        return decoder(belief, field, self.cuboids, K, stride, names, **vars(self.recovery))
+        options = self.recovery if self.refiner is None else self.recovery.of_candidates()
+        return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
 
     def maps(self, image: Picture) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""

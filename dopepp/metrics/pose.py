@@ -25,7 +25,15 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import Vector
 from dopepp.metrics.functional import average_precision, match
 from dopepp.metrics.references import REFERENCES, reference_rows
-from dopepp.metrics.row import PoseErrors, PoseRow, finite_median, mean_row, summarise, symmetries
+from dopepp.metrics.row import (
+    PoseErrors,
+    PoseRow,
+    finite_median,
+    finite_p90,
+    mean_row,
+    summarise,
+    symmetries,
+)
 from dopepp.parts.part import Part
 
 MEAN: Final = "mean"
@@ -271,6 +279,7 @@ class Gathered:
         row = summarise(part.name, method, part.diameter, errors, num_symmetries)
         matched = int(errors.add.isfinite().sum())
         row.median_translation = finite_median(errors.translation)
+        row.p90_translation = finite_p90(errors.translation)
         row.miss_rate = 1 - matched / len(errors.add)
         row.precision = matched / max(matched + num_false, 1)
         row.false_positives = num_false

@@ -110,6 +110,8 @@ class PoseRow:
         method: What produced the poses: the estimator, or a reference row's name.
         num_instances: Ground-truth instances that count; poses tried in a reference row.
         add_01d: Share with ADD below a tenth of the diameter.
+        add_005d: Share with ADD below a twentieth of the diameter.
+        add_002d: Share with ADD below a fiftieth of the diameter.
         pass_5cm: Share with ADD below 0.05 m.
         pass_10cm: Share with ADD below 0.1 m.
         auc_10cm: Exact area under the ADD accuracy-threshold curve up to 0.1 m.
@@ -117,6 +119,8 @@ class PoseRow:
         auc_s_10cm: Exact area under the ADD-S curve up to 0.1 m.
         median_rotation_deg: Over matched instances, degrees.
         median_translation: Over matched instances, metres.
+        p90_rotation_deg: Nine of ten matched instances are below, degrees.
+        p90_translation: Nine of ten matched instances are below, metres.
         miss_rate: Share of instances without a matched prediction.
         precision: TP / (TP + FP); 0 without predictions.
         false_positives: Predictions matched with no instance.
@@ -132,6 +136,8 @@ class PoseRow:
     method: str
     num_instances: int
     add_01d: float | None = None
+    add_005d: float | None = None
+    add_002d: float | None = None
     pass_5cm: float | None = None
     pass_10cm: float | None = None
     auc_10cm: float | None = None
@@ -139,6 +145,8 @@ class PoseRow:
     auc_s_10cm: float | None = None
     median_rotation_deg: float | None = None
     median_translation: float | None = None
+    p90_rotation_deg: float | None = None
+    p90_translation: float | None = None
     miss_rate: float | None = None
     precision: float | None = None
     false_positives: int | None = None
@@ -188,6 +196,8 @@ class Column:
 COLUMNS: Final[tuple[Column, ...]] = (
     Column("num_instances", "instances"),
     Column("add_01d", "ADD-0.1d %", 100, 1, "ADD"),
+    Column("add_005d", "ADD-0.05d %", 100, 1, "ADD"),
+    Column("add_002d", "ADD-0.02d %", 100, 1, "ADD"),
     Column("pass_5cm", "ADD<5cm %", 100, 1, "ADD"),
     Column("pass_10cm", "ADD<10cm %", 100, 1, "ADD"),
     Column("auc_10cm", "AUC[0,10cm] %", 100, 1, "ADD"),
@@ -199,6 +209,8 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("ar_mspd", "AR_MSPD %", 100, 1, "BOP"),
     Column("median_rotation_deg", "rotation °", 1, 1, "median"),
     Column("median_translation", "translation mm", 1000, 1, "median"),
+    Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median"),
+    Column("p90_translation", "translation 90 % mm", 1000, 1, "median"),
     Column("miss_rate", "missed %", 100, 1, "detection"),
     Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),
@@ -227,12 +239,15 @@ def summarise(
         method=method,
         num_instances=len(errors.add),
         add_01d=pass_rate(errors.add, 0.1 * diameter),
+        add_005d=pass_rate(errors.add, 0.05 * diameter),
+        add_002d=pass_rate(errors.add, 0.02 * diameter),
         pass_5cm=pass_rate(errors.add, 0.05),
         pass_10cm=pass_rate(errors.add, 0.1),
         auc_10cm=auc(errors.add, 0.1),
         add_s_01d=pass_rate(errors.add_s, 0.1 * diameter),
         auc_s_10cm=auc(errors.add_s, 0.1),
         median_rotation_deg=finite_median(errors.rotation_deg),
+        p90_rotation_deg=finite_p90(errors.rotation_deg),
         mssd_01d=pass_rate(errors.mssd, 0.1 * diameter),
         ar_mssd=average_recall(errors.mssd, [share * diameter for share in BOP_THRESHOLDS]),
         ar_mspd=None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS),
@@ -247,6 +262,12 @@ def finite_median(errors: Float[Tensor, "n"]) -> float | None:
     if len(finite) == 0:
         return None
     return float((finite[(len(finite) - 1) // 2] + finite[len(finite) // 2]) / 2)
+
+
+def finite_p90(errors: Float[Tensor, "n"]) -> float | None:
+    """90th percentile of the finite errors, between two of them linearly; None if there is none."""
+    finite = errors[errors.isfinite()].double()
+    return float(finite.quantile(0.9)) if len(finite) else None
 
 
 def mean_row(rows: Sequence[PoseRow], method: str) -> PoseRow:

@@ -5,6 +5,9 @@
 Distance: a network's keypoints are means over the poses it holds possible, and the mean of a turned
 figure is a smaller one, so its poses are too far away, each by about the same factor.
 
+Covariance: peaks tell how uncertain each keypoint is, not what is wrong with all of them alike, so
+that poses are farther off than their covariances say, by about the same factor.
+
 Score: how likely a detection's ADD is below a tenth of the diameter, a logistic model of what
 recovery knows about a pose. As long as nobody has fitted it, its weights make the score the mean
 belief. To add a feature, name it in :data:`FEATURES`, compute it in :func:`detection_features`
@@ -13,6 +16,7 @@ and give ``RecoveryOptions`` its weight.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,15 +24,29 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import CameraMatrix, project, project_keypoints, transform
+from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
+from dopepp.geometry.rotation import matrix_to_rotation_vector
 from dopepp.recovery.detection import Detection
 
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
 """What the score is made of, in this order."""
 
+REFINED_FEATURES: Final = ("bias", "score", "agreement")
+"""What the score of a refined pose is made of, in this order."""
+
+CANDIDATE: Final = 0.01
+"""Score from which a detection is refined where the refined poses have a score of their own: the
+picture, looked at closely, tells a ghost from a part that the network was in doubt about."""
+
 DISTANCE_FACTORS: Final = (0.5, 2.0)
 """Smallest and greatest factor on a distance; trained networks' are within a tenth of 1."""
+
+COVARIANCE_FACTORS: Final = (0.01, 100.0)
+"""Smallest and greatest factor on a covariance; trained networks' are 1 to 4."""
+
+_MEDIAN_DISTANCE: Final = 5.348
+"""Median of a squared Mahalanobis distance in six dimensions (chi-squared)."""
 
 _HEAVIEST: Final = 1000.0
 """Largest weight of a feature; fitted ones are a hundred times smaller."""
@@ -55,6 +73,9 @@ _STEPS: Final = 50
 _MEAN_BELIEF: Final = tuple(float(name == "belief") for name in FEATURES)
 """The weights that make the score the mean belief."""
 
+_NETWORK_SCORE: Final = tuple(float(name == "score") for name in REFINED_FEATURES)
+"""The weights that leave a refined pose the network's score."""
+
 
 @dataclass(frozen=True)
 class RecoveryOptions:
@@ -68,8 +89,12 @@ class RecoveryOptions:
         max_peaks: Most peaks kept per channel.
         min_score: Detections below this score are dropped.
         distance_factor: On the distance of every pose, as ``evaluate.py tune=true`` measures it.
+        covariance_factor: On the covariance of every pose, idem; the score is not changed by it.
         score_bias: It and the following are the weights of the score's features, as ``evaluate.py
             tune=true`` fits them; these defaults leave the mean belief.
+        refined_min_score: Refined detections below this score are dropped.
+        refined_bias: It and the following are the weights of the score of refined poses, as
+            ``evaluate.py tune=true refine=region`` fits them; these defaults leave the network's.
     """
 
     sigma: float = 1.0
@@ -79,11 +104,16 @@ class RecoveryOptions:
     max_peaks: int = 16
     min_score: float = 0.0
     distance_factor: float = 1.0
+    covariance_factor: float = 1.0
     score_bias: float = 0.0
     score_belief: float = 1.0
     score_spread: float = 0.0
     score_misfit: float = 0.0
     score_found: float = 0.0
+    refined_min_score: float = 0.0
+    refined_bias: float = 0.0
+    refined_score: float = 1.0
+    refined_agreement: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -94,7 +124,10 @@ class RecoveryOptions:
             "max_peaks": (1, 1000),
             "min_score": (0.0, 1.0),
             "distance_factor": DISTANCE_FACTORS,
+            "covariance_factor": COVARIANCE_FACTORS,
             **{f"score_{name}": (-_HEAVIEST, _HEAVIEST) for name in FEATURES},
+            "refined_min_score": (0.0, 1.0),
+            **{f"refined_{name}": (-_HEAVIEST, _HEAVIEST) for name in REFINED_FEATURES},
         }
         for name, (lowest, highest) in limits.items():
             value = getattr(self, name)
@@ -108,11 +141,22 @@ class RecoveryOptions:
         """Weights of the score's features, in their order."""
         return tuple(getattr(self, f"score_{name}") for name in FEATURES)
 
+    @property
+    def refined_weights(self) -> tuple[float, ...]:
+        """Weights of the features of a refined pose's score, in their order."""
+        return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
+
+    def of_candidates(self) -> RecoveryOptions:
+        """Return the options that let all through which refinement is to judge."""
+        if self.refined_weights == _NETWORK_SCORE:
+            return self
+        return replace(self, min_score=min(self.min_score, CANDIDATE))
+
 
 def calibrated(
     detection: Detection, cuboid: Cuboid, K: CameraMatrix, options: RecoveryOptions
 ) -> Detection:
-    """Return a detection at its corrected distance, with its score.
+    """Return a detection at its corrected distance, with its score and corrected covariance.
 
     The part moves along the ray through its origin. With nobody's weights the score is the mean
     belief.
@@ -122,10 +166,31 @@ def calibrated(
         T[:3, 3] *= options.distance_factor
         keypoints = project_keypoints(cuboid, T, K)
         detection = replace(detection, T_cam_obj=T, keypoints=keypoints)
-    if options.score_weights == _MEAN_BELIEF:
-        return replace(detection, score=detection.belief)
-    features = detection_features(detection, cuboid, K)
-    return replace(detection, score=float(score(features, np.array(options.score_weights))))
+    said = detection.belief
+    if options.score_weights != _MEAN_BELIEF:
+        features = detection_features(detection, cuboid, K)
+        said = float(score(features, np.array(options.score_weights)))
+    covariance = options.covariance_factor * detection.covariance
+    return replace(detection, score=said, covariance=covariance)
+
+
+def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
+    """Return the detections that refinement has judged, with their scores, the best first."""
+    if options.refined_weights != _NETWORK_SCORE:
+        weights = np.array(options.refined_weights)
+        refined = [replace(one, score=float(score(refined_features(one), weights)))
+                   for one in refined]  # fmt: skip
+    passed = [one for one in refined if one.score >= options.refined_min_score]
+    return sorted(passed, key=lambda one: -one.score)
+
+
+def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
+    """Return the features of a detection after refinement; a pose that was kept has no agreement.
+
+    Its score is still the network's.
+    """
+    sure = float(np.clip(detection.score, _CERTAIN, 1 - _CERTAIN))
+    return np.array([1.0, np.log(sure / (1 - sure)), detection.agreement or 0.0])
 
 
 def fit_distance_factor(
@@ -139,6 +204,30 @@ def fit_distance_factor(
         return 1.0
     distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
     return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
+
+
+def squared_distance(
+    T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"], true: Transform
+) -> float:
+    """Return the squared Mahalanobis distance of a true pose from an estimated one.
+
+    The covariance is that of :class:`~dopepp.recovery.detection.Detection`.
+    """
+    turn = matrix_to_rotation_vector(true[:3, :3] @ T_cam_obj[:3, :3].T)
+    away = np.concatenate([turn, true[:3, 3] - T_cam_obj[:3, 3]])
+    return float(away @ np.linalg.solve(covariance, away))
+
+
+def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
+    """Return the factor on covariances that makes the true poses as far from them as they say.
+
+    The squared Mahalanobis distances of true poses were found with a factor of 1. Their median is
+    compared, which wrong detections do not move. Without any, the factor is 1.
+    """
+    if not len(squared_distances):
+        return 1.0
+    factor = float(np.median(squared_distances)) / _MEDIAN_DISTANCE
+    return float(np.clip(factor, *COVARIANCE_FACTORS))
 
 
 def detection_features(

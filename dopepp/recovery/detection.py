@@ -52,6 +52,8 @@ class Detection:
         covariance: Of a small turn about the object's origin (rotation vector in the camera
             frame, radians) and a small shift (camera frame, metres), from the peaks' covariances.
         kept: Why a refinement that was asked for kept the network's pose; empty elsewhere.
+        agreement: Share of the refined outline that the picture agrees with, in [0, 1]; None where
+            none was refined.
     """
 
     object: str
@@ -63,6 +65,7 @@ class Detection:
     reprojection_error_px: float
     covariance: Float[np.ndarray, "6 6"]
     kept: str = ""
+    agreement: float | None = None
 
 
 def peaks_of_object(

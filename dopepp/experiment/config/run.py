@@ -160,6 +160,8 @@ class MeasurementConfig:
             ``by`` and ``num_bins``.
         tune: Whether to learn a factor on distances, a score and its threshold first.
         false_positives: What tuning demands: ``num_empty`` and ``false_positive_rate``.
+        refine: ``region`` measures, and tunes, with poses refined on the picture as well, ``depth``
+            with poses refined where the images have depth.
         output_dir: Folder of run folders.
     """
 
@@ -167,6 +169,7 @@ class MeasurementConfig:
     protocols: Protocols
     tune: bool
     false_positives: FalsePositiveTarget
+    refine: str | None
     output_dir: Any
 
 
@@ -255,7 +258,6 @@ class EvaluationConfig(MeasurementConfig):
         virtual: How to render, idem.
         bop_csv: Whether to write every method's poses as such a file.
         all_measures: Whether to print the symmetric measures of parts without symmetries, too.
-        refine: ``depth`` refines poses where the images have depth.
         device: torch's name, or ``auto``.
         num_pictures: Images that are drawn.
     """
@@ -268,7 +270,6 @@ class EvaluationConfig(MeasurementConfig):
     virtual: Mapping[str, Any] | None = None
     bop_csv: bool
     all_measures: bool
-    refine: str | None
     device: Any
     num_pictures: Annotated[int, Range(0, _MOST)]
 
