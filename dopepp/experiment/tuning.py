@@ -124,7 +124,7 @@ def tune(
         heard = replace(old, min_score=0.0, covariance_factor=1.0)
         before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
         estimator.recovery = replace(heard, distance_factor=1.0, covariance_factor=1.0)
-        factors = _fit_factors(matched_poses(estimator, parts, validation))
+        factors = fit_factors(matched_poses(estimator, parts, validation))
         heard = replace(heard, distance_factor=factors["distance_factor"])
         chosen = choose(scored(heard, validation), scored(heard, empty), rate)
         new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
@@ -143,7 +143,7 @@ def tune(
     return Tuning(factors | chosen, before, after, (len(test), target.num_empty))
 
 
-def _fit_factors(
+def fit_factors(
     pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
 ) -> dict[str, float]:
     """Fit the factors on distances and covariances to poses that were found with factors of 1."""
@@ -198,20 +198,22 @@ def choose(
 
 def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scored:
     """Run an estimator over a source and judge every detection; features are of what it does."""
+    refined = estimator.refiner is not None
+    names = calibration.REFINED_FEATURES if refined else calibration.FEATURES
     rows: list[tuple[np.ndarray, float, bool, int]] = []
     num_instances = 0
     for number, sample, part, own, true in _by_object(estimator, parts, source):
         num_instances += sum(map(counted, true))
         right, judged = _judge(part, own, true)
         for one, is_right in zip(compress(own, judged), right[judged], strict=True):
-            features = (
-                calibration.detection_features(one, part.cuboid, sample.K)
-                if estimator.refiner is None
-                else calibration.refined_features(one)
+            known = (
+                calibration.refined_features(one)
+                if refined
+                else calibration.detection_features(one, part.cuboid, sample.K)
             )
-            rows.append((features, one.score, bool(is_right), number))
+            rows.append((known, one.score, bool(is_right), number))
     return Scored(
-        np.array([row[0] for row in rows]).reshape(len(rows), -1),
+        np.array([row[0] for row in rows]).reshape(-1, len(names)),
         np.array([row[1] for row in rows], np.float64),
         np.array([row[2] for row in rows], bool),
         np.array([row[3] for row in rows], np.int64),

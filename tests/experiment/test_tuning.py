@@ -14,11 +14,13 @@ from dopepp.experiment.tuning import (
     FalsePositiveTarget,
     Scored,
     choose,
+    fit_factors,
     matched_poses,
     score_images,
     write_tuned,
 )
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
+from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import expected_calibration_error
 from dopepp.models.checkpoint.schema import Checkpoint
@@ -107,8 +109,8 @@ def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
     )
 
 
-def estimator(*detections: Detection) -> Any:
-    return SimpleNamespace(predict=lambda image, K: list(detections))
+def estimator(*detections: Detection, refiner: object = None) -> Any:
+    return SimpleNamespace(predict=lambda image, K: list(detections), refiner=refiner)
 
 
 def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
@@ -132,11 +134,43 @@ def test_what_finds_a_hidden_instance_is_not_judged():
 
 def test_poses_are_paired_with_the_instances_that_they_find():
     near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
-    estimated, true = matched_poses(estimator(near, stray), [PART], Images(POSE))
-    assert np.array_equal(estimated, near.T_cam_obj[None])
+    ((one, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
+    assert one is near
     assert np.array_equal(true, POSE[None])
-    hidden = matched_poses(estimator(near), [PART], Images(POSE, 0.05))
-    assert [poses.shape for poses in hidden] == [(0, 4, 4)] * 2
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    symmetric = replace(PART, symmetries_discrete=flip[None])
+    ((_, alike),) = matched_poses(estimator(near), [symmetric], Images(POSE))
+    assert np.array_equal(alike, [POSE, POSE @ flip])
+    assert matched_poses(estimator(near), [PART], Images(POSE, 0.05)) == []
+
+
+def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
+    rng = np.random.default_rng(0)
+    deviation = np.array([0.02, 0.02, 0.01, 0.002, 0.002, 0.004])
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    pairs = []
+    for number in range(2000):
+        step = 2.0 * deviation * rng.normal(size=6)
+        turn = rotation_vector_to_matrix(step[:3])
+        T = make_transform(turn @ POSE[:3, :3], 0.9 * (POSE[:3, 3] + step[3:]))
+        one = replace(found(T, 0.9), covariance=np.diag(deviation**2))
+        equivalents = [POSE, POSE @ flip]
+        pairs.append((one, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
+    factors = fit_factors(pairs)
+    assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
+    assert factors["covariance_factor"] == pytest.approx(4.0, rel=0.1)
+    assert fit_factors([]) == {"distance_factor": 1.0, "covariance_factor": 1.0}
+
+
+def test_refined_poses_are_scored_by_their_agreement():
+    sure = replace(found(POSE, 0.3), agreement=0.9)
+    result = score_images(estimator(sure, refiner=True), [PART], Images(POSE))
+    expected = [1.0, np.log(0.3 / 0.7), 0.9]
+    np.testing.assert_allclose(result.features, [expected, expected])
+    kept = score_images(estimator(found(POSE, 0.3), refiner=True), [PART], Images(POSE))
+    assert kept.features[0, 2] == 0.0
+    nothing = score_images(estimator(refiner=True), [PART], Images(POSE))
+    assert nothing.features.shape == (0, 3)
 
 
 def test_a_symmetric_part_is_right_at_any_of_its_poses():

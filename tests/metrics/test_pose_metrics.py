@@ -77,6 +77,8 @@ def test_rows_agree_with_the_functions():
     assert row == replace(
         PoseRow("box", "estimate", 30, precision=1.0, miss_rate=0.0, false_positives=0),
         add_01d=pass_rate(errors, 0.012),
+        add_005d=pass_rate(errors, 0.006),
+        add_002d=pass_rate(errors, 0.0024),
         pass_5cm=pass_rate(errors, 0.05),
         pass_10cm=pass_rate(errors, 0.1),
         auc_10cm=pytest.approx(auc(errors, 0.1), rel=1e-12),
@@ -84,6 +86,10 @@ def test_rows_agree_with_the_functions():
         auc_s_10cm=pytest.approx(auc(errors_s, 0.1), rel=1e-12),
         median_rotation_deg=pytest.approx(np.median(np.degrees(relative.magnitude())), rel=1e-9),
         median_translation=pytest.approx(np.median(np.linalg.norm(split[1] - split[3], axis=1))),
+        p90_rotation_deg=pytest.approx(np.percentile(np.degrees(relative.magnitude()), 90)),
+        p90_translation=pytest.approx(
+            np.percentile(np.linalg.norm(split[1] - split[3], axis=1), 90)
+        ),
         average_precision=row.average_precision,
         mssd_01d=pass_rate(surface, 0.012),
         ar_mssd=pytest.approx(np.mean([pass_rate(surface, s * 0.12) for s in shares])),
@@ -173,8 +179,8 @@ def test_all_missed_gives_zero_and_no_nan():
     for _ in range(3):
         metric.update([], [truth("box", pose())])
     row = metric.compute()["box"]
-    zeros = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d", "auc_s_10cm",
-             "precision", "average_precision", "mssd_01d", "ar_mssd")  # fmt: skip
+    zeros = ("add_01d", "add_005d", "add_002d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d",
+             "auc_s_10cm", "precision", "average_precision", "mssd_01d", "ar_mssd")  # fmt: skip
     expected = PoseRow("box", "estimate", 3, miss_rate=1.0, false_positives=0)
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 

@@ -4,7 +4,7 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.parts import Mesh, make_part
+from dopepp.parts import Mesh, make_part, servoholder
 
 
 def box(size: tuple[float, float, float]) -> Mesh:

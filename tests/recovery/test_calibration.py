@@ -7,19 +7,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from scipy.spatial.distance import mahalanobis
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+from scipy.stats import chi2
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.recovery.calibration import (
+    CANDIDATE,
     DISTANCE_FACTORS,
     FEATURES,
     RecoveryOptions,
     calibrated,
     detection_features,
+    fit_covariance_factor,
     fit_distance_factor,
     fit_weights,
+    rescored,
     score,
+    squared_distance,
 )
 from dopepp.recovery.detection import Detection
 
@@ -82,6 +90,47 @@ def test_the_factor_is_the_median_ratio_of_distances():
     assert fit_distance_factor(estimated, true) == pytest.approx(1 / 1.07, abs=0.01)
     assert fit_distance_factor(true[:0], true[:0]) == 1.0
     assert fit_distance_factor(100 * true, true) == DISTANCE_FACTORS[0]
+
+
+def test_the_covariance_grows_and_the_score_does_not():
+    fitted = RecoveryOptions(score_bias=0.5, score_spread=-1.0, covariance_factor=2.5)
+    sure = replace(fitted, covariance_factor=1.0)
+    before, after = (calibrated(detection(), CUBOID, K, one) for one in (sure, fitted))
+    assert after.score == before.score
+    np.testing.assert_allclose(after.covariance, 2.5 * before.covariance)
+
+
+def test_the_covariance_factor_is_that_of_chi_squared():
+    drawn = 3.0 * chi2(6).rvs(20_000, random_state=0)
+    drawn[:500] = 1e9  # wrong detections
+    assert fit_covariance_factor(drawn) == pytest.approx(3.0, rel=0.05)
+    assert fit_covariance_factor(drawn[:0]) == 1.0
+
+
+def test_the_distance_of_a_pose_is_that_of_its_turn_and_shift():
+    step = np.array([0.02, -0.01, 0.03, 0.001, 0.002, -0.004])
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = make_transform(turn @ T[:3, :3], T[:3, 3] + step[3:])
+    covariance = np.diag([1e-4, 4e-4, 1e-4, 1e-6, 1e-6, 9e-6])
+    covariance[0, 1] = covariance[1, 0] = 1e-4
+    expected = mahalanobis(step, np.zeros(6), np.linalg.inv(covariance)) ** 2
+    assert squared_distance(T, covariance, moved) == pytest.approx(expected)
+
+
+def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
+    said = [replace(detection(), score=0.2), replace(detection(), score=0.8)]
+    assert [one.score for one in rescored(said, RecoveryOptions())] == [0.8, 0.2]
+    options = RecoveryOptions(min_score=0.5)
+    assert options.of_candidates() is options
+    fitted = RecoveryOptions(
+        min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_agreement=6.0,
+        refined_min_score=0.4,
+    )  # fmt: skip
+    assert fitted.of_candidates().min_score == CANDIDATE
+    judged = [replace(said[0], agreement=0.9), replace(said[1], agreement=None, kept="no")]
+    (only,) = rescored(judged, fitted)
+    assert only.agreement == 0.9
+    assert only.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9))
 
 
 def test_missing_keypoints_and_worse_fits_are_seen():
