@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -67,6 +69,12 @@ def rotation_vector_to_matrix(
 
 def matrix_to_rotation_vector(rotation: RotationMatrix) -> Vector:
     """Return the vector of a rotation's axis and angle in [0, π]; it undoes the exponential map."""
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64).tolist()
+    axial = 0.5 * np.array([h - f, c - g, d - b])
+    cosine = 0.5 * (a + e + i - 1.0)
+    if cosine > 0.0:  # its sine is far from that of any other angle's
+        sine = math.hypot(*axial)
+        return np.asarray(axial * (math.atan2(sine, cosine) / sine if sine > 0 else 1.0))
     w, *axis = matrix_to_quaternion(rotation)
     size = float(np.linalg.norm(axis))
     # For tiny angles, 2 atan(|v| / w) / |v| is 2 / w.

@@ -67,7 +67,7 @@ def log_odds(
     few_bins = bins[::thinned, ::thinned]
     if not _table(few_bins, within, beyond, unsure_within, unsure, unsure + ring, table):
         return None
-    return np.asarray(table[bins])
+    return np.asarray(table.take(bins))
 
 
 @compiled()

@@ -12,18 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.camera import CameraMatrix, Transform
-from dopepp.parts.mesh.decimate import decimate
-from dopepp.parts.mesh.measure import Faces, Vertices, face_areas, weld
-
-MAX_FACES: Final = 4000
-"""Triangles of an outline's mesh: their edges are two pixels long on a part of 100 pixels."""
-
-NEAR: Final = 1e-3
-"""Metres before the camera that every vertex must keep."""
+from dopepp.inference.refinement.mesh import OutlineMesh
+from dopepp.inference.refinement.silhouette import Posed
 
 WINDOW_PX: Final = 3.0
 """Radius of the disc of the mask in which a point's outward direction is read."""
@@ -33,65 +26,6 @@ BESIDE_PX: Final = 1.25
 
 LONG_PX: Final = 4.0
 """Edges of at least this length have their own normal; shorter ones zigzag about the outline."""
-
-
-@dataclass(frozen=True, eq=False)
-class OutlineMesh:
-    """Triangles with what their outlines need.
-
-    Attributes:
-        vertices: Positions, metres.
-        faces: Corners of each triangle.
-        planes: Normal of each triangle (of any length) and its product with a corner.
-        edges: The two vertices of each edge.
-        sides: The two triangles at it; the second is −1 where there is one only.
-        opposed: 1 where these two run along it in the same direction, else 0.
-        is_closed: Whether the triangles that face the camera hide all others.
-        deviation: Largest distance that a vertex was moved by to have fewer triangles, metres.
-    """
-
-    vertices: Vertices
-    faces: Faces
-    planes: Float[np.ndarray, "faces 4"]
-    edges: Int[np.ndarray, "edges 2"]
-    sides: Int[np.ndarray, "edges 2"]
-    opposed: UInt8[np.ndarray, "edges"]
-    is_closed: bool
-    deviation: float
-
-
-def make_outline_mesh(vertices: Vertices, faces: Faces, max_faces: int = MAX_FACES) -> OutlineMesh:
-    """Prepare triangles; more than ``max_faces`` of them are replaced by fewer.
-
-    Raises:
-        ValueError: The triangles have no area.
-    """
-    vertices, faces = weld(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
-    faces = faces[face_areas(vertices, faces) > 0]
-    if not len(faces):
-        raise ValueError("no triangle with an area")
-    deviation = 0.0
-    if len(faces) > max_faces:
-        vertices, faces, _, deviation = decimate(vertices, faces, None, max_faces)
-        faces = faces[face_areas(vertices, faces) > 0]
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    normals = np.cross(b - a, c - a)
-    planes = np.column_stack([normals, (normals * a).sum(axis=1)])
-    start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    keys = np.minimum(start, end) * len(vertices) + np.maximum(start, end)
-    order = np.argsort(keys, kind="stable")
-    first = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    uses = np.diff(first, append=len(keys))
-    one, other = order[first], order[np.where(uses > 1, first + 1, first)]
-    opposed = (start[one] == start[other]) & (uses > 1)
-    return OutlineMesh(
-        vertices, faces, planes,
-        edges=np.stack([start[one], end[one]], axis=1),
-        sides=np.stack([one // 3, np.where(uses > 1, other // 3, -1)], axis=1),
-        opposed=opposed.astype(np.uint8),
-        is_closed=bool((uses == 2).all() and not opposed.any()),
-        deviation=deviation,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,41 +46,6 @@ class Contour:
         return len(self.pixels)
 
 
-@dataclass(frozen=True, eq=False)
-class Posed:
-    """A mesh at a pose.
-
-    Attributes:
-        T_cam_obj: The pose.
-        arms: Vertices from the object's origin, camera axes, metres.
-        pixels: Where they are on the picture.
-        front: Which triangles face the camera.
-    """
-
-    T_cam_obj: Transform
-    arms: Float[np.ndarray, "vertices 3"]
-    pixels: Float[np.ndarray, "vertices 2"]
-    front: Bool[np.ndarray, "faces"]
-
-
-def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> Posed | None:
-    """Put a mesh at a pose; None where some of it is not before the camera."""
-    arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
-    front = np.empty(len(mesh.faces), np.bool_)
-    if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
-        return None
-    return Posed(T_cam_obj, arms, pixels, front)
-
-
-def filled_mask(
-    mesh: OutlineMesh, at: Posed, size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width"]:
-    """Return 1 at the pixels of (width, height) whose centres a posed mesh covers, else 0."""
-    mask = np.zeros(size[::-1], np.uint8)
-    _fill(at.pixels, mesh.faces, at.front | (not mesh.is_closed), mask)
-    return mask
-
-
 def find_contour(
     mesh: OutlineMesh, at: Posed, mask: UInt8[np.ndarray, "height width"], spacing: float
 ) -> Contour:
@@ -163,62 +62,6 @@ def find_contour(
         float(at.T_cam_obj[2, 3]), mask, spacing,
     )  # fmt: skip
     return Contour(rows[:, :3], rows[:, 3:5], rows[:, 5:])
-
-
-@compiled()
-def _pose(
-    vertices: Array, planes: Array, T: Array, K: Array, arms: Array, pixels: Array, front: Array
-) -> bool:
-    """Write arms, pixels and facing; False where a vertex is not before the camera."""
-    for i in range(len(vertices)):
-        for r in range(3):
-            arms[i, r] = (
-                T[r, 0] * vertices[i, 0] + T[r, 1] * vertices[i, 1] + T[r, 2] * vertices[i, 2]
-            )
-        z = arms[i, 2] + T[2, 3]
-        if not z > NEAR:
-            return False
-        pixels[i, 0] = K[0, 0] * (arms[i, 0] + T[0, 3]) / z + K[0, 2]
-        pixels[i, 1] = K[1, 1] * (arms[i, 1] + T[1, 3]) / z + K[1, 2]
-    # The camera's place in the object's frame.
-    x = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
-    y = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
-    z = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
-    for f in range(len(planes)):
-        front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
-    return True
-
-
-@compiled()
-def _fill(pixels: Array, faces: Array, chosen: Array, mask: Array) -> None:
-    """Set the pixels whose centres lie in a chosen triangle, row by row."""
-    height, width = mask.shape
-    left, right = np.empty(height), np.empty(height)
-    for f in range(len(faces)):
-        if not chosen[f]:
-            continue
-        top, bottom = height, -1
-        for c in range(3):
-            y = pixels[faces[f, c], 1]
-            top, bottom = min(top, max(0.0, math.ceil(y))), max(bottom, math.floor(y))
-        first, last = int(top), int(min(bottom, height - 1.0))
-        for v in range(first, last + 1):
-            left[v], right[v] = math.inf, -math.inf
-        for c in range(3):
-            i, j = faces[f, c], faces[f, (c + 1) % 3]
-            if pixels[i, 1] > pixels[j, 1]:
-                i, j = j, i
-            y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
-            slope = (pixels[j, 0] - pixels[i, 0]) / rise if rise > 0.0 else 0.0
-            low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.floor(pixels[j, 1]))
-            for v in range(int(low), int(high) + 1):
-                x = pixels[i, 0] + slope * (v - y)
-                left[v], right[v] = min(left[v], x), max(right[v], x)
-        for v in range(first, last + 1):
-            # Rounding must not open a gap between two triangles.
-            start, end = max(0.0, math.ceil(left[v] - 1e-9)), min(width - 1.0, right[v] + 1e-9)
-            if end >= start:
-                mask[v, int(start) : int(end) + 1] = 1
 
 
 @compiled()

@@ -2,9 +2,11 @@
 
 Along a normal, pixels look like the part up to some place and like its surroundings beyond. If it
 ends at a shift d, the pixels' log odds before d speak for it, and the sum of them is, up to a
-constant, the logarithm of d's likelihood. Mean and variance of the shift follow. A normal along
-which all shifts are alike has the variance of none known, and its information, which is taken from
-the inverse of its variance, is zero.
+constant, the logarithm of d's likelihood. It also ends where the picture changes more than it does
+on average, whatever the colours: that is what tells a part from surroundings of its own colour, and
+an edge to better than a pixel. Mean and variance of the shift follow. A normal along which all
+shifts are alike has the variance of none known, and its information, which is taken from the
+inverse of its variance, is zero.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
@@ -23,6 +25,15 @@ from dopepp.inference.refinement.solver import Terms
 
 CONFIDENCE: Final = 0.5
 """Exponent of the likelihood of neighbouring pixels, whose colours are not independent."""
+
+EDGE: Final = 1.0
+"""Exponent of a place's likelihood of an edge: one, plus the square of its change over the mean."""
+
+LEAST_CHANGE: Final = 3.0
+"""Grey levels that are noise: a picture that changes less has no edges."""
+
+CHANCE: Final = 1.2
+"""Variance of no knowledge over one that is read from nothing but noise, at most."""
 
 LEAST_DEVIATION: Final = 0.3
 """Pixels: no place of an edge is better known than to this, of one point."""
@@ -59,19 +70,26 @@ class Shifts:
 
 
 def find_shifts(
-    odds: Float32[np.ndarray, "height width"], contour: Contour, reach: float, step: float
+    odds: Float32[np.ndarray, "height width"],
+    colours: UInt8[np.ndarray, "height width 3"],
+    contour: Contour,
+    reach: float,
+    step: float,
 ) -> Shifts:
     """Read the picture along the normals.
 
     Args:
         odds: The pixels' log odds, 0 where unknown.
+        colours: The pixels.
         contour: The outline.
         reach: Pixels to each side.
         step: Pixels between what is read.
     """
-    found = np.empty((len(contour), 2))
     count = max(2, round(reach / step))
-    _shifts(odds, contour.pixels, contour.normals, step, count, found)
+    changes = np.empty((len(contour), 2 * count + 2))
+    strength = _changes(colours, contour.pixels, contour.normals, step, count, changes)
+    found = np.empty((len(contour), 2))
+    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, found)
     return Shifts(found[:, 0], found[:, 1])
 
 
@@ -188,8 +206,49 @@ def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
 
 
 @compiled()
+def _changes(
+    colours: Array, pixels: Array, normals: Array, step: float, count: int, changes: Array
+) -> float:
+    """Write how much the picture changes between any two samples; return the mean change.
+
+    It is that of the two samples before against the two after, in the colour where it is largest.
+    """
+    height, width = colours.shape[:2]
+    samples = np.empty((2 * count + 5, 3))
+    total = 0.0
+    for i in range(len(pixels)):
+        for k in range(len(samples)):
+            along = (k - count - 2) * step
+            u = min(max(0.0, pixels[i, 0] + along * normals[i, 0]), width - 1.001)
+            v = min(max(0.0, pixels[i, 1] + along * normals[i, 1]), height - 1.001)
+            column, row = int(u), int(v)
+            a, b = u - column, v - row
+            for c in range(3):
+                above = (1.0 - a) * colours[row, column, c] + a * colours[row, column + 1, c]
+                below = (1.0 - a) * colours[row + 1, column, c] + a * colours[
+                    row + 1, column + 1, c
+                ]
+                samples[k, c] = (1.0 - b) * above + b * below
+        for k in range(2 * count + 2):
+            most = 0.0
+            for c in range(3):
+                before = samples[k, c] + samples[k + 1, c]
+                most = max(most, abs(samples[k + 2, c] + samples[k + 3, c] - before))
+            changes[i, k] = 0.25 * most
+            total += changes[i, k]
+    return total / changes.size + LEAST_CHANGE
+
+
+@compiled()
 def _shifts(
-    odds: Array, pixels: Array, normals: Array, step: float, count: int, found: Array
+    odds: Array,
+    pixels: Array,
+    normals: Array,
+    changes: Array,
+    strength: float,
+    step: float,
+    count: int,
+    found: Array,
 ) -> None:
     """Write mean and information of every normal's shift."""
     sums = np.empty(2 * count + 2)
@@ -197,27 +256,26 @@ def _shifts(
     unknown = step * step * (len(sums) ** 2 - 1) / 12.0
     floor = LEAST_DEVIATION**2 + step * step / 12.0
     for i in range(len(pixels)):
-        sums[0] = most = 0.0
-        for k in range(2 * count + 1):
+        before, most = 0.0, -math.inf
+        for k in range(len(sums)):
+            sums[k] = before + EDGE * math.log(1.0 + (changes[i, k] / strength) ** 2)
+            most = max(most, sums[k])
             along = (k - count) * step
-            value = _sampled(
+            before += CONFIDENCE * _sampled(
                 odds, pixels[i, 0] + along * normals[i, 0], pixels[i, 1] + along * normals[i, 1]
             )
-            sums[k + 1] = sums[k] + CONFIDENCE * value
-            most = max(most, sums[k + 1])
         total = first = second = 0.0
         for k in range(len(sums)):
-            likelihood = math.exp(sums[k] - most)
+            sums[k] = math.exp(sums[k] - most)
             shift = (k - count - 0.5) * step
-            total += likelihood
-            first += likelihood * shift
-            second += likelihood * shift * shift
+            total += sums[k]
+            first += sums[k] * shift
+            second += sums[k] * shift * shift
         mean = first / total
         variance = second / total - mean * mean
         # That it ends beyond the reach is no measurement of where.
-        ends = math.exp(sums[0] - most) + math.exp(sums[len(sums) - 1] - most)
-        inner = 1.0 - ends / total
-        information = 1.0 / (variance + floor) - 1.0 / (unknown + floor)
+        inner = 1.0 - (sums[0] + sums[len(sums) - 1]) / total
+        information = 1.0 / (variance + floor) - CHANCE / (unknown + floor)
         found[i, 0] = mean
         found[i, 1] = max(0.0, information) * inner * inner
 

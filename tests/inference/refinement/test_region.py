@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy import ndimage
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.refinement.colour import colour_bins, log_odds
-from dopepp.inference.refinement.contour import (
-    filled_mask,
-    find_contour,
-    make_outline_mesh,
-    posed,
-)
+from dopepp.inference.refinement.contour import Contour, find_contour
+from dopepp.inference.refinement.crop import crop_around
 from dopepp.inference.refinement.fit import Prior
 from dopepp.inference.refinement.lines import (
     OFFSET_PX,
@@ -26,7 +26,9 @@ from dopepp.inference.refinement.lines import (
     outline_rows,
     region_terms,
 )
+from dopepp.inference.refinement.mesh import make_outline_mesh
 from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.silhouette import filled_mask, posed
 from dopepp.inference.refinement.solver import descend, moved
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
@@ -36,6 +38,7 @@ K = camera_matrix(500, 500, 207.5, 207.5)
 TURNED = rotation_vector_to_matrix(np.array([2.5, 0.5, 0.3]))
 TRUE = make_transform(TURNED, np.array([0.01, -0.012, 0.24]))
 PART_COLOUR, AROUND_COLOUR = (200, 120, 60), (60, 90, 130)
+FLAT = np.full((64, 64, 3), 128, np.uint8)
 DEVIATIONS = np.repeat([math.radians(5), 0.003], 3)
 
 
@@ -110,6 +113,27 @@ def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: i
     assert_allclose(project(contour.arms + T[:3, 3], K), contour.pixels, atol=1e-9)
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_winding_border_fills_what_all_triangles_fill(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    part = servoholder().mesh
+    assert part is not None
+    mesh = make_outline_mesh(part.vertices, part.faces)
+    assert mesh.is_closed
+    # Near and beside the picture too: clipped on all sides.
+    shift = rng.uniform([-0.1, -0.1, 0.08], [0.1, 0.1, 0.5])
+    at = posed(mesh, make_transform(rotation_vector_to_matrix(rng.normal(size=3)), shift), K)
+    if at is None:
+        return
+    whole, triangles = (
+        filled_mask(dataclasses.replace(mesh, is_closed=closed), at, SIZE)
+        for closed in (True, False)
+    )
+    # A centre on a border, or within rounding of it, may be told either way.
+    assert (whole != triangles).sum() <= 2
+
+
 def test_holes_and_open_edges_are_outlined_hidden_edges_are_not() -> None:
     # A frame of one side only, before a smaller square that it partly hides.
     outer = np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]], np.float64)
@@ -160,28 +184,66 @@ def test_terms_take_the_common_offset_out() -> None:
     assert_allclose(step, whole[:6], atol=2e-5)
 
 
-def test_shifts_of_a_straight_edge() -> None:
-    columns = np.arange(64.0)
+def straight_edge() -> tuple[Contour, np.ndarray]:
+    """Return a square's outline in a picture of 64 pixels, and which points are right."""
     mesh = make_outline_mesh(
         np.array([[-1, -1, 0], [0, -1, 0], [0, 1, 0], [-1, 1, 0.0]]),
         np.array([[0, 1, 2], [0, 2, 3]]),
     )
-    T, close = (
-        make_transform(np.eye(3), np.array([0, 0, 40.0])),
-        camera_matrix(800, 800, 31.5, 31.5),
-    )
-    at = posed(mesh, T, close)
+    T = make_transform(np.eye(3), np.array([0, 0, 40.0]))
+    at = posed(mesh, T, camera_matrix(800, 800, 31.5, 31.5))
     assert at is not None
     contour = find_contour(mesh, at, filled_mask(mesh, at, (64, 64)), 2.0)
-    right = contour.normals[:, 0] > 0.9
+    return contour, contour.normals[:, 0] > 0.9
+
+
+def test_shifts_of_a_straight_edge() -> None:
+    columns = np.arange(64.0)
+    contour, right = straight_edge()
     for edge in (30.3, 33.0, 35.6):
         odds = np.clip(2 * (edge - columns), -1, 1) * 3
         image = np.broadcast_to(odds, (64, 64)).astype(np.float32)
-        shifts = find_shifts(image, contour, 8.0, 1.0)
+        shifts = find_shifts(image, FLAT, contour, 8.0, 1.0)
         assert_allclose(shifts.mean[right], edge - 31.5, atol=0.15)
         assert shifts.information[right].min() > 0.5
-    nothing = find_shifts(np.zeros((64, 64), np.float32), contour, 8.0, 1.0)
+    nothing = find_shifts(np.zeros((64, 64), np.float32), FLAT, contour, 8.0, 1.0)
     assert_allclose(nothing.information, 0.0, atol=1e-12)
+
+
+def test_an_edge_is_found_where_colours_tell_nothing() -> None:
+    contour, right = straight_edge()
+    for edge in (28.5, 31.5, 35.0):
+        columns = np.arange(64.0)
+        grey = 100 + 60 * np.clip(columns - edge + 0.5, 0, 1)
+        colours = np.broadcast_to(grey[:, None], (64, 64, 3)).astype(np.uint8)
+        shifts = find_shifts(np.zeros((64, 64), np.float32), colours, contour, 6.0, 1.0)
+        weights = shifts.information[right]
+        assert weights.min() > 0.05
+        assert abs(np.average(shifts.mean[right], weights=weights) - (edge - 31.5)) < 0.7
+    noise = np.random.default_rng(0).normal(128, 2, (64, 64, 3)).astype(np.uint8)
+    nothing = find_shifts(np.zeros((64, 64), np.float32), noise, contour, 6.0, 1.0)
+    assert nothing.information.mean() < 0.003
+
+
+@pytest.mark.parametrize("extent", [40.0, 150.0, 900.0])
+def test_crop_keeps_places(extent: float) -> None:
+    rng = np.random.default_rng(1)
+    image = cv2.resize(rng.integers(0, 256, (20, 25, 3), np.uint8), (1250, 1000))
+    middle = np.array([600.0, 480.0])
+    box = middle + extent / 2 * np.array([[-1, -1], [1, 1]])
+    crop = crop_around(image, K, box, 120)
+    assert not isinstance(crop, str)
+    assert crop.extent <= 1.5 * 120
+    assert crop.extent == pytest.approx(extent * crop.scale)
+    # A pixel of the crop shows what the picture shows at the place that has the same ray.
+    rays = np.stack(np.meshgrid(*(np.linspace(5, size - 6, 9) for size in crop.size)), -1)
+    rays = (rays - crop.K[:2, 2]) / np.diag(crop.K)[:2]
+    own, whole = (
+        ndimage.map_coordinates(
+            pixels[..., 0].astype(float), (rays * np.diag(M)[:2] + M[:2, 2]).T[::-1], order=1
+        ) for pixels, M in ((crop.colours, crop.K), (image, K))
+    )  # fmt: skip
+    assert_allclose(own, whole, atol=12)
 
 
 def test_colours_tell_part_from_surroundings() -> None:

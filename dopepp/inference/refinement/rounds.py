@@ -1,0 +1,195 @@
+"""One of the rounds in which a pose is refined on the picture: its crop, colours, pull and verdict.
+
+To add evidence that the outline does not give, return one more from :meth:`Round.evidence`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from dopepp.geometry.camera import Transform
+from dopepp.inference.refinement.colour import log_odds
+from dopepp.inference.refinement.contour import Contour, find_contour
+from dopepp.inference.refinement.crop import EDGE_PX, Crop
+from dopepp.inference.refinement.fit import Prior
+from dopepp.inference.refinement.lines import (
+    CONFIDENCE,
+    INDEPENDENT_PX,
+    LEAST_INFORMATION,
+    Shifts,
+    find_shifts,
+    outline_rows,
+    region_terms,
+)
+from dopepp.inference.refinement.mesh import OutlineMesh
+from dopepp.inference.refinement.silhouette import Posed, filled_mask, posed
+from dopepp.inference.refinement.solver import Evidence, Solution, Terms
+
+RING: Final = 0.2
+"""Of the part's extent: width of what counts as its surroundings."""
+
+SAMPLES: Final = 7
+"""Steps on each side of a normal, which are 1 to 4 pixels."""
+
+FEWEST_POINTS: Final = 24
+"""Of an outline on the picture, to fix six numbers."""
+
+LEAST_GAIN: Final = 2.0
+"""Of the logarithm of the covariance's volume, below which the picture says nothing."""
+
+AGREE_PX: Final = 2.0
+LEAST_AGREEING: Final = 0.3
+"""Share of a refined outline, by information, that the picture's is so near to."""
+
+FARTHEST: Final = 4.5
+"""Standard deviations (Mahalanobis distance of six numbers) that a pose may be moved."""
+
+
+class UndecidedError(Exception):
+    """Why a picture does not decide about a pose."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How a round looks at the picture.
+
+    Attributes:
+        longest_px: A part that is longer on the picture is read from a smaller one.
+        reach: Of the normals, share of the first reach.
+        steps: Gauss–Newton steps.
+        points: About so many on the outline.
+    """
+
+    longest_px: int
+    reach: float
+    steps: int
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Silhouette:
+    """A mesh at a pose and the pixels it covers."""
+
+    at: Posed
+    mask: UInt8[np.ndarray, "height width"]
+
+
+class Round:
+    """One stage on its crop, with the colours that it has learned.
+
+    Args:
+        mesh: The part.
+        crop: The picture at the stage's size.
+        stage: The stage.
+    """
+
+    def __init__(self, mesh: OutlineMesh, crop: Crop, stage: Stage) -> None:
+        self.crop, self.stage, self._mesh = crop, stage, mesh
+        self._spacing = max(1.5, 3.0 * crop.extent / stage.points)
+        self._odds: Float32[np.ndarray, "height width"] = np.zeros(crop.size[::-1], np.float32)
+        self._soft = self._odds
+        self._last: tuple[Transform, _Silhouette | None] = np.empty((0, 0)), None
+
+    def learn(self, pose: Transform, reach: float) -> None:
+        """Learn the colours at a pose that may be off by the stage's share of ``reach``."""
+        silhouette = self._silhouette(pose)
+        reach = self.reach(reach)
+        ring = RING * self.crop.extent
+        odds = None
+        if silhouette is not None:
+            odds = log_odds(self.crop.bins, silhouette.mask, 0.5 * reach, ring)
+        if odds is None:
+            raise UndecidedError("too few pixels of the part and around it are on the picture")
+        self._odds = self._soft = odds
+        step = round(_step(reach))
+        if step >= 2:
+            self._soft = cv2.blur(odds, (step, step))
+
+    def contour(self, pose: Transform) -> Contour | None:
+        """Return the outline; None where too little of it is on the picture."""
+        silhouette = self._silhouette(pose)
+        if silhouette is None:
+            return None
+        contour = find_contour(self._mesh, silhouette.at, silhouette.mask, self._spacing)
+        return contour if len(contour) >= FEWEST_POINTS else None
+
+    def evidence(self, reach: float) -> Sequence[Evidence]:
+        """Return what pulls, as functions of the pose."""
+
+        def outline(pose: Transform, known: Terms) -> Terms | None:
+            contour = self.contour(pose)
+            if contour is None:
+                return None
+            rows = outline_rows(contour, pose, self.crop.K)
+            shifts = self._shifts(contour, reach)
+            return region_terms(rows, shifts, known, self._spacing, self.crop.extent)
+
+        return [outline]
+
+    def log_likelihood(self, pose: Transform, prior: Prior) -> float:
+        """Return the logarithm of a pose's probability, up to a constant."""
+        silhouette = self._silhouette(pose)
+        if silhouette is None:
+            return -math.inf
+        inside = float(self._odds.ravel() @ silhouette.mask.ravel()) * CONFIDENCE / INDEPENDENT_PX
+        offset = prior.offset(pose)
+        return inside - 0.5 * float(offset @ prior.information @ offset)
+
+    def agreement(self, end: Solution, prior: Prior, reach: float) -> float:
+        """Return the share of a refined outline, by information, that the picture agrees with.
+
+        Raises:
+            UndecidedError: The picture does not decide for this pose.
+        """
+        contour = self.contour(end.T_cam_obj)
+        if contour is None:
+            raise UndecidedError("the part's outline left the picture")
+        gain = np.linalg.slogdet(end.information)[1] - np.linalg.slogdet(prior.information)[1]
+        if gain < LEAST_GAIN:
+            raise UndecidedError("colours inside and around the part are too alike")
+        shifts = self._shifts(contour, reach)
+        weights = shifts.information
+        away = np.abs(shifts.mean - np.average(shifts.mean, weights=weights + LEAST_INFORMATION))
+        agreeing = float(weights[away <= AGREE_PX].sum() / max(weights.sum(), LEAST_INFORMATION))
+        if agreeing < LEAST_AGREEING:
+            raise UndecidedError(f"only {agreeing:.0%} of the outline agrees with the picture")
+        offset = prior.offset(end.T_cam_obj)
+        distance = math.sqrt(float(offset @ prior.information @ offset))
+        if distance > FARTHEST:
+            raise UndecidedError(
+                f"{distance:.1f} standard deviations from the given pose, more than {FARTHEST:g}"
+            )
+        after = self.log_likelihood(end.T_cam_obj, prior)
+        if after <= self.log_likelihood(prior.T_cam_obj, prior):
+            raise UndecidedError("the picture fits the given pose no worse")
+        return agreeing
+
+    def reach(self, reach: float) -> float:
+        """Return the stage's share of a reach, in pixels of its crop."""
+        return max(EDGE_PX, self.stage.reach * reach * self.crop.scale)
+
+    def _shifts(self, contour: Contour, reach: float) -> Shifts:
+        reach = self.reach(reach)
+        return find_shifts(self._soft, self.crop.colours, contour, reach, _step(reach))
+
+    def _silhouette(self, pose: Transform) -> _Silhouette | None:
+        """Return that of a pose, kept while the same pose is asked for."""
+        if self._last[0] is not pose:
+            at = posed(self._mesh, pose, self.crop.K)
+            silhouette = None
+            if at is not None:
+                silhouette = _Silhouette(at, filled_mask(self._mesh, at, self.crop.size))
+            self._last = pose, silhouette
+        return self._last[1]
+
+
+def _step(reach: float) -> float:
+    """Return the pixels between two samples."""
+    return min(max(1.0, reach / SAMPLES), 4.0)
