@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.rotation import matrix_to_rotation_vector
 from dopepp.inference.estimator import PoseEstimator, checked_picture
 from dopepp.inference.refinement.solver import moved
@@ -54,6 +54,20 @@ ELSEWHERE: Final = 0.1
 OUTVOTED: Final = 2
 """Detections in a row that disagree with a track before it is moved to them."""
 
+DOUBTFUL: Final = 0.8
+"""Share of its usual agreement below which a track may have been drawn away by what hides it: on
+rendered sequences, right poses kept 0.97 of it and wrong ones half."""
+
+TRUSTED: Final = 0.6
+"""Agreement below which no pose is taken over, except the first: half of a wrong one's outline may
+lie on edges of something else."""
+
+USUAL: Final = 0.1
+"""Weight of a frame in the usual agreement."""
+
+PATIENCE: Final = 6
+"""Doubtful frames in a row, in which a part goes on as it was going, before it is lost."""
+
 FORGOTTEN: Final = 300
 """Frames after which a lost part is no longer looked for."""
 
@@ -81,13 +95,26 @@ class Track:
 class _State:
     """What is known of a part between two frames.
 
-    ``unseen`` counts the frames since it was last seen, ``disagreements`` the network's answers in
-    a row that were elsewhere.
+    ``usual`` is its agreement with the picture on late frames. ``unseen`` counts the frames since
+    it was last seen, ``doubts`` those in which it agreed less than usual, and ``disagreements`` the
+    network's answers in a row that were elsewhere.
     """
 
     track: Track
+    usual: float
     unseen: int = 0
+    doubts: int = 0
     disagreements: int = 0
+
+    @property
+    def in_question(self) -> bool:
+        """Whether the network is to look."""
+        return bool(self.unseen or self.doubts or self.disagreements)
+
+    def move_to(self, one: Detection) -> None:
+        """Go on from where the network has found the part."""
+        self.track = Track(self.track.identity, one, np.zeros(6), detected=True)
+        self.unseen = self.doubts = self.disagreements = 0
 
 
 class PoseTracker:
@@ -133,7 +160,7 @@ class PoseTracker:
         for state in self._states:
             self._follow(state, image, K)
         due = self._frame % self.detect_every == 0
-        if due or not self._states or any(one.unseen or one.disagreements for one in self._states):
+        if due or not self._states or any(one.in_question for one in self._states):
             self._look(image, K)
         self._frame += 1
         self._states = [one for one in self._states if one.unseen <= FORGOTTEN]
@@ -144,49 +171,63 @@ class PoseTracker:
         old = state.track.detection
         velocity = PERSISTENCE * state.track.velocity
         expected = moved(old.T_cam_obj, velocity)
+        doubtful = None
         if not state.unseen and expected[2, 3] > 0:
             for spread in (_spread(expected, velocity), _at(expected, SUDDEN)):
                 given = replace(
                     old, T_cam_obj=expected, covariance=old.covariance + np.diag(spread**2)
                 )
                 found = self._estimator.refined([given], image, K)[0]
-                if not found.kept:
+                if found.kept:
+                    continue
+                agreement = _agreement(found)
+                if agreement >= max(DOUBTFUL * state.usual, min(TRUSTED, state.usual)):
                     step = _step(old.T_cam_obj, found.T_cam_obj)
                     velocity = SMOOTHING * step + (1 - SMOOTHING) * velocity
                     state.track = replace(
                         state.track, detection=found, velocity=velocity, detected=False
                     )
+                    state.usual += USUAL * (agreement - state.usual)
+                    state.doubts = 0
                     return
-        state.unseen += 1
+                doubtful = doubtful or replace(given, agreement=agreement)
+        if doubtful is None or state.doubts == PATIENCE:
+            state.unseen += 1
+            return
+        keypoints = project_keypoints(self._cuboid_of[old.object], expected, K)
+        doubtful = replace(doubtful, keypoints=keypoints)
+        state.track = replace(state.track, detection=doubtful, velocity=velocity, detected=False)
+        state.doubts += 1
 
     def _look(self, image: Picture, K: CameraMatrix) -> None:
         """Let the network look, and tell known parts from new ones."""
         found = [one for one in self._estimator.predict(image, K) if not one.kept]
         for state, one in self._matched(found):
             if state is None:
-                self._states.append(
-                    _State(Track(self._identities, one, np.zeros(6), detected=True))
-                )
+                track = Track(self._identities, one, np.zeros(6), detected=True)
+                self._states.append(_State(track, _agreement(one)))
                 self._identities += 1
-            elif state.unseen:
-                state.track = Track(state.track.identity, one, np.zeros(6), detected=True)
-                state.unseen = state.disagreements = 0
+            elif _agreement(one) < min(TRUSTED, state.usual):
+                continue
+            elif state.unseen or (
+                state.doubts and _agreement(one) > _agreement(state.track.detection)
+            ):
+                state.move_to(one)
             elif self._apart(state.track.detection, one) <= ELSEWHERE:
                 state.disagreements = 0
             else:
                 state.disagreements += 1
                 if state.disagreements == OUTVOTED:
-                    state.track = Track(state.track.identity, one, np.zeros(6), detected=True)
-                    state.disagreements = 0
+                    state.move_to(one)
 
     def _matched(self, found: Sequence[Detection]) -> list[tuple[_State | None, Detection]]:
-        """Pair detections with the parts they show: first the followed ones, then the lost."""
+        """Pair detections with the parts they show: first those followed, then lost or in doubt."""
         pairs: list[tuple[_State | None, Detection]] = []
         for name in self._cuboid_of:
             left = [one for one in found if one.object == name]
             own = [one for one in self._states if one.track.detection.object == name]
-            for lost, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
-                states = [one for one in own if bool(one.unseen) == lost]
+            for astray, limit in ((False, NEAR * self._diameters[name]), (True, math.inf)):
+                states = [one for one in own if bool(one.unseen or one.doubts) == astray]
                 distances = np.array(
                     [[_distance(one.track.detection, other) for other in left] for one in states]
                 ).reshape(len(states), len(left))
@@ -207,6 +248,10 @@ class PoseTracker:
         )
         apart = np.linalg.norm(first - second, axis=1).mean()
         return float(apart / self._diameters[one.object])
+
+
+def _agreement(one: Detection) -> float:
+    return 0.0 if one.agreement is None else one.agreement
 
 
 def _spread(expected: Transform, velocity: Step) -> Step:

@@ -7,7 +7,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.inference.tracker import FORGOTTEN, PoseTracker
+from dopepp.inference.tracker import FORGOTTEN, PATIENCE, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
@@ -27,6 +27,7 @@ class Stage:
         self.actors = {}
         self.hidden, self.unknown_to_network = set(), set()
         self.looks = self.refinements = 0
+        self.agreement = self.network_agreement = 0.95
 
     def put(self, name, part, place, turn=(0.0, 0.0, 0.0)):
         pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
@@ -35,7 +36,7 @@ class Stage:
     def predict(self, image, K):
         self.looks += 1
         return [
-            self._detection(part, pose)
+            replace(self._detection(part, pose), agreement=self.network_agreement)
             for name, (part, pose) in self.actors.items()
             if name not in self.hidden | self.unknown_to_network
         ]
@@ -57,7 +58,7 @@ class Stage:
             turn = rotation_angle(pose[:3, :3] @ one.T_cam_obj[:3, :3].T)
             shift = np.linalg.norm(pose[:3, 3] - one.T_cam_obj[:3, 3])
             if turn <= 3 * deviation[0] and shift <= 3 * deviation[3]:
-                return self._detection(part, pose)
+                return replace(self._detection(part, pose), agreement=self.agreement)
         return replace(one, kept="nothing there")
 
 
@@ -160,6 +161,37 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
     # Frame 5 disagrees, so frame 6 looks again.
     assert detected == [False] * 5 + [True]
+
+
+def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
+    tracker = PoseTracker(stage)
+    for frame in range(10):
+        stage.put("a", pivconnector(), (0.005 * frame, 0.0, 0.3))
+        tracker.track(IMAGE, K)
+    assert stage.looks == 1
+    # A hand comes: what is found agrees with half of the outline, and the network sees nothing.
+    stage.agreement, stage.unknown_to_network = 0.5, {"a"}
+    stage.put("a", pivconnector(), (0.047, 0.006, 0.3))
+    for number in range(1, PATIENCE + 1):
+        (track,) = tracker.track(IMAGE, K)
+        place = track.detection.T_cam_obj[:3, 3]
+        assert 0.045 < place[0] < 0.045 + 0.005 * number
+        assert place[1] == 0.0
+    assert stage.looks == 1 + PATIENCE
+    assert tracker.track(IMAGE, K) == []
+    stage.agreement, stage.unknown_to_network = 0.95, set()
+    (track,) = tracker.track(IMAGE, K)
+    assert (track.identity, track.detected) == (0, True)
+
+
+def test_the_network_settles_a_doubt_where_it_agrees_better(stage):
+    tracker = PoseTracker(stage)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker.track(IMAGE, K)
+    stage.agreement, stage.network_agreement = 0.5, 0.4
+    assert not tracker.track(IMAGE, K)[0].detected
+    stage.network_agreement = 0.8
+    assert tracker.track(IMAGE, K)[0].detected
 
 
 def test_bad_input(stage):
