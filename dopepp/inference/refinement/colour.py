@@ -1,7 +1,9 @@
 """Colours inside a part's outline against those around it: how much each pixel looks like the part.
 
 Both are histograms of 16 steps a channel, blurred a little, and the answer is the logarithm of
-their ratio at a pixel's colour. A colour that neither has seen says nothing.
+their ratio at a pixel's colour. A colour that neither has seen says nothing. A part may be of
+several colours and lie before several: each tile of its box counts its own and its neighbours'
+pixels most, and the others a little (local histograms, Lankton and Tannenbaum 2008; RBOT).
 """
 
 from __future__ import annotations
@@ -18,8 +20,11 @@ from dopepp.core.compiled import Array, compiled
 STEPS: Final = 16
 """Of a channel."""
 
-UNSEEN: Final = 20.0
-"""Pixels of any colour that both histograms have from the start."""
+UNSEEN: Final = 0.3
+"""Pixels of each colour that both histograms have from the start."""
+
+KNOWN: Final = 100.0
+"""Pixels that the whole part's colours, and those all around, count for in each tile."""
 
 MOST: Final = 3.0
 """Bound of the logarithm: no colour proves more than 20 to 1, because colours come in patches."""
@@ -45,6 +50,7 @@ def log_odds(
     mask: UInt8[np.ndarray, "height width"],
     unsure: float,
     ring: float,
+    tiles: int,
 ) -> Float32[np.ndarray, "height width"] | None:
     """Return the logarithm of part against surroundings for every pixel.
 
@@ -53,21 +59,37 @@ def log_odds(
         mask: 1 where the part is taken to be.
         unsure: Pixels on both sides of the outline that count for neither.
         ring: Width of the surroundings, pixels.
+        tiles: Along each side of the part's box; each has colours of its own.
 
     Returns:
         None where one of them has too few pixels on the picture.
     """
-    table = np.empty(STEPS**3, np.float32)
     thinned = math.ceil(max(mask.shape) / LONGEST_PX)
     few, unsure, ring = mask[::thinned, ::thinned], unsure / thinned, ring / thinned
     within = cv2.distanceTransform(np.ascontiguousarray(few), cv2.DIST_L2, 3)
     beyond = cv2.distanceTransform(1 - few, cv2.DIST_L2, 3)
     # A slender part keeps the inner half of its width.
     unsure_within = min(unsure, 0.5 * float(within.max()))
-    few_bins = bins[::thinned, ::thinned]
-    if not _table(few_bins, within, beyond, unsure_within, unsure, unsure + ring, table):
+    left, top, width, height = cv2.boundingRect(few)
+    columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)
+    rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)
+    counts = np.zeros((2, tiles, tiles, STEPS**3), np.float32)
+    _count(
+        bins[::thinned, ::thinned], within, beyond, unsure_within, unsure, unsure + ring,
+        rows[::thinned], columns[::thinned], counts,
+    )  # fmt: skip
+    if counts.sum(axis=(1, 2, 3)).min() < FEWEST:
         return None
-    return np.asarray(table.take(bins))
+    tables = np.empty((tiles, tiles, STEPS**3), np.float32)
+    _tables(counts, tables)
+    odds = np.empty(bins.shape, np.float32)
+    _look_up(bins, rows, columns, tables, odds)
+    return odds
+
+
+def _tile_of(length: int, start: int, extent: int, tiles: int) -> Int[np.ndarray, "length"]:
+    """Return the tile of each place along a side; those before and beyond the box are its ends'."""
+    return np.clip((np.arange(length) - start) * tiles // max(extent, 1), 0, tiles - 1)
 
 
 @compiled()
@@ -79,36 +101,58 @@ def _bins(image: Array, bins: Array) -> None:
 
 
 @compiled()
-def _table(
+def _count(
     bins: Array,
     within: Array,
     beyond: Array,
     nearest_within: float,
     nearest: float,
     farthest: float,
-    table: Array,
-) -> bool:
-    """Write the logarithm of the ratio for every colour; False where pixels are too few."""
-    counts = np.zeros((2, STEPS, STEPS, STEPS))
-    flat = counts.reshape(2, STEPS**3)
-    inside = outside = 0
+    rows: Array,
+    columns: Array,
+    counts: Array,
+) -> None:
+    """Count the colours of the part and around it in every tile."""
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             if within[v, u] > nearest_within:
-                flat[0, bins[v, u]] += 1.0
-                inside += 1
+                counts[0, rows[v], columns[u], bins[v, u]] += 1.0
             elif nearest < beyond[v, u] <= farthest:
-                flat[1, bins[v, u]] += 1.0
-                outside += 1
-    if inside < FEWEST or outside < FEWEST:
-        return False
-    _blur(counts[0])
-    _blur(counts[1])
-    for i in range(STEPS**3):
-        part = (flat[0, i] + UNSEEN / 64) / (inside + UNSEEN)
-        around = (flat[1, i] + UNSEEN / 64) / (outside + UNSEEN)
-        table[i] = min(max(math.log(part / around), -MOST), MOST)
-    return True
+                counts[1, rows[v], columns[u], bins[v, u]] += 1.0
+
+
+@compiled()
+def _tables(counts: Array, tables: Array) -> None:
+    """Write the logarithm of the ratio for every tile and colour; ``counts`` are blurred."""
+    tiles = counts.shape[1]
+    for side in range(2):
+        for i in range(tiles):
+            for j in range(tiles):
+                _blur(counts[side, i, j].reshape(STEPS, STEPS, STEPS))
+    known = np.full((2, STEPS**3), np.float32(UNSEEN))
+    for i in range(tiles):
+        for j in range(tiles):
+            known += counts[:, i, j]
+    for side in range(2):
+        known[side] *= KNOWN / known[side].sum()
+    near = np.empty_like(known)
+    for i in range(tiles):
+        for j in range(tiles):
+            near[:] = known
+            for a in range(max(0, i - 1), min(tiles, i + 2)):
+                for b in range(max(0, j - 1), min(tiles, j + 2)):
+                    near += np.float32(0.5 ** (abs(a - i) + abs(b - j))) * counts[:, a, b]
+            level = math.log(near[1].sum() / near[0].sum())
+            for k in range(STEPS**3):
+                odds = level + math.log(near[0, k] / near[1, k])
+                tables[i, j, k] = min(max(odds, -MOST), MOST)
+
+
+@compiled()
+def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Array) -> None:
+    for v in range(bins.shape[0]):
+        for u in range(bins.shape[1]):
+            odds[v, u] = tables[rows[v], columns[u], bins[v, u]]
 
 
 @compiled()

@@ -65,12 +65,14 @@ class Stage:
         reach: Of the normals, share of the first reach.
         steps: Gauss–Newton steps.
         points: About so many on the outline.
+        tiles: Along each side of the part, with colours of their own.
     """
 
     longest_px: int
     reach: float
     steps: int
     points: int
+    tiles: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ class Round:
         ring = RING * self.crop.extent
         odds = None
         if silhouette is not None:
-            odds = log_odds(self.crop.bins, silhouette.mask, 0.5 * reach, ring)
+            odds = log_odds(self.crop.bins, silhouette.mask, 0.5 * reach, ring, self.stage.tiles)
         if odds is None:
             raise UndecidedError("too few pixels of the part and around it are on the picture")
         self._odds = self._soft = odds

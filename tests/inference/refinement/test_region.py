@@ -251,11 +251,24 @@ def test_colours_tell_part_from_surroundings() -> None:
     mask[20:60, 20:60] = 1
     image = np.where(mask[..., None] == 1, PART_COLOUR, AROUND_COLOUR).astype(np.uint8)
     image[35:40, 35:40] = image[5:10, 25:30] = (10, 240, 10)  # seen on both sides
-    odds = log_odds(colour_bins(image), mask, 3.0, 20.0)
+    odds = log_odds(colour_bins(image), mask, 3.0, 20.0, 1)
     assert odds is not None
     assert odds[50, 50] > 2 > -2 > odds[70, 50]
     assert abs(odds[37, 37]) < 1.5
-    assert log_odds(colour_bins(image), np.zeros_like(mask), 3.0, 20.0) is None
+    assert log_odds(colour_bins(image), np.zeros_like(mask), 3.0, 20.0, 1) is None
+
+
+def test_tiles_tell_a_part_of_two_colours_before_the_same_two() -> None:
+    mask = np.zeros((120, 120), np.uint8)
+    mask[20:100, 20:100] = 1
+    left = np.arange(120) < 60
+    image = np.where(((mask == 1) == left)[..., None], PART_COLOUR, AROUND_COLOUR).astype(np.uint8)
+    whole, tiled = (log_odds(colour_bins(image), mask, 3.0, 20.0, tiles) for tiles in (1, 3))
+    assert whole is not None
+    assert tiled is not None
+    assert np.abs(whole).max() < 0.5
+    for columns in (slice(0, 45), slice(75, 120)):
+        assert np.where(mask == 1, tiled, -tiled)[:, columns].min() > 0.5
 
 
 def test_descent_without_evidence_returns_to_the_prior() -> None:
