@@ -20,8 +20,9 @@ from jaxtyping import Float, Float32, UInt8
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.contour import Contour
-from dopepp.inference.refinement.solver import Terms
+from dopepp.inference.refinement.solver import DAMPING, Terms
 
 CONFIDENCE: Final = 0.5
 """Exponent of the likelihood of neighbouring pixels, whose colours are not independent."""
@@ -164,15 +165,20 @@ def _terms(
     known = information > LEAST_INFORMATION
     if not known.any():
         return
-    ridge, pull, left = np.zeros((7, 7)), np.zeros(7), np.empty(len(rows))
-    ridge[:6, :6], pull[:6], ridge[6, 6] = prior_H, prior_g, 1.0 / OFFSET_PX**2
+    left, step = np.empty(len(rows)), np.empty(6)
     weights = np.where(known, information, 0.0) * independent
     for _ in range(REWEIGHTINGS):
         H[:], g[:] = 0.0, 0.0
         _add(rows, means, weights, H, g)
-        step = np.linalg.solve(H + ridge, g + pull)
+        own = H[6, 6] + 1.0 / OFFSET_PX**2
+        last = H[6, :6] / own
+        solve_damped(
+            H[:6, :6] + prior_H - np.outer(last, H[6, :6]), last * g[6] - g[:6] - prior_g,
+            DAMPING, step,
+        )  # fmt: skip
+        offset = g[6] / own - (last * step).sum()
         for i in range(len(rows)):
-            rest = means[i] - step[6]
+            rest = means[i] - offset
             for c in range(6):
                 rest -= rows[i, c] * step[c]
             left[i] = rest * rest

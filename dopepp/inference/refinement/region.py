@@ -13,7 +13,9 @@ is that of PWP3D and RBOT, that of probabilistic lines SRT3D's (Stoiber et al. 2
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -27,7 +29,7 @@ from dopepp.inference.refinement.lines import outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
 from dopepp.inference.refinement.rounds import Round, Stage, UndecidedError
 from dopepp.inference.refinement.silhouette import posed
-from dopepp.inference.refinement.solver import Solution, descend, moved
+from dopepp.inference.refinement.solver import Solution, moved
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(longest_px=120, reach=1.0, steps=3, points=100, tiles=1)
@@ -115,8 +117,11 @@ def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6
     return Prior(given, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
 
 
-def _search(rounds: list[Round], prior: Prior) -> tuple[Solution, float]:
+def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     """Descend from the given pose and, where that is doubtful, from the best of several draws.
+
+    Rounds that look farther than the prior asks for are left out: a tracked part needs the last one
+    only.
 
     Returns:
         The end, and the share of the outline that agrees there.
@@ -124,41 +129,42 @@ def _search(rounds: list[Round], prior: Prior) -> tuple[Solution, float]:
     Raises:
         UndecidedError: No descent is to be believed.
     """
-    coarse = rounds[0]
     given = prior.T_cam_obj
-    reach = _first_reach(coarse, prior)
-    coarse.learn(given, reach)
+    reach = _first_reach(rounds[0], prior)
+    while len(rounds) > 1 and rounds[1].farthest(reach) >= reach:
+        rounds = rounds[1:]
+    if len(rounds) == 1:
+        return _refined(rounds, given, prior, reach)
+    rounds[0].learn(given, reach)
     wide = Prior(given, prior.information / WIDENED**2)
     try:
-        end = descend(given, wide, coarse.evidence(reach), COARSE.steps)
-        return _refined(rounds, end, prior, reach)
-    except UndecidedError as first:
-        coarse.learn(given, reach)
-        ends = [descend(start, wide, coarse.evidence(reach), COARSE.steps)
-                for start in _starts(prior)]  # fmt: skip
-        best = max((end for end in ends if end), default=None,
-                   key=lambda end: coarse.log_likelihood(end.T_cam_obj, prior))  # fmt: skip
+        return _refined(rounds[1:], rounds[0].descend(given, wide, reach).T_cam_obj, prior, reach)
+    except UndecidedError as doubt:
+        ends = []
+        for start in _starts(prior):
+            with contextlib.suppress(UndecidedError):
+                ends.append(rounds[0].descend(start, wide, reach).T_cam_obj)
+        if not ends:
+            raise
+        best = max(ends, key=lambda end: rounds[0].log_likelihood(end, prior))
         try:
-            return _refined(rounds, best, prior, reach)
+            return _refined(rounds[1:], best, prior, reach)
         except UndecidedError:
-            raise first from None
+            raise doubt from None
 
 
 def _refined(
-    rounds: list[Round], end: Solution | None, prior: Prior, reach: float
+    rounds: Sequence[Round], start: Transform, prior: Prior, reach: float
 ) -> tuple[Solution, float]:
-    """Go on from the end of a coarse descent, and see whether to believe where it leads.
+    """Descend in one round after the other, and see whether to believe where that leads.
 
     Raises:
         UndecidedError: Not to be believed.
     """
-    for later in rounds[1:]:
-        if end is None:
-            break
-        later.learn(end.T_cam_obj, reach)
-        end = descend(end.T_cam_obj, prior, later.evidence(reach), later.stage.steps)
-    if end is None:
-        raise UndecidedError("the part's outline left the picture")
+    end = Solution(start, prior.information)
+    for one in rounds:
+        one.learn(end.T_cam_obj, reach)
+        end = one.descend(end.T_cam_obj, prior, reach)
     return end, rounds[-1].agreement(end, prior, reach)
 
 

@@ -30,7 +30,7 @@ from dopepp.inference.refinement.lines import (
 )
 from dopepp.inference.refinement.mesh import OutlineMesh
 from dopepp.inference.refinement.silhouette import Posed, filled_mask, posed
-from dopepp.inference.refinement.solver import Evidence, Solution, Terms
+from dopepp.inference.refinement.solver import Evidence, Solution, Terms, descend
 
 RING: Final = 0.2
 """Of the part's extent: width of what counts as its surroundings."""
@@ -135,6 +135,13 @@ class Round:
 
         return [outline]
 
+    def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
+        """Take the stage's steps; an :class:`UndecidedError` where they leave the picture."""
+        end = descend(start, prior, self.evidence(reach), self.stage.steps)
+        if end is None:
+            raise UndecidedError("the part's outline left the picture")
+        return end
+
     def log_likelihood(self, pose: Transform, prior: Prior) -> float:
         """Return the logarithm of a pose's probability, up to a constant."""
         silhouette = self._silhouette(pose)
@@ -176,6 +183,10 @@ class Round:
     def reach(self, reach: float) -> float:
         """Return the stage's share of a reach, in pixels of its crop."""
         return max(EDGE_PX, self.stage.reach * reach * self.crop.scale)
+
+    def farthest(self, reach: float) -> float:
+        """Return the same in pixels of the picture."""
+        return self.reach(reach) / self.crop.scale
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
         reach = self.reach(reach)

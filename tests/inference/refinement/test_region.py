@@ -27,7 +27,8 @@ from dopepp.inference.refinement.lines import (
     region_terms,
 )
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.region import FINE, RegionRefiner
+from dopepp.inference.refinement.rounds import Round
 from dopepp.inference.refinement.silhouette import filled_mask, posed
 from dopepp.inference.refinement.solver import descend, moved
 from dopepp.parts.catalogue import pivconnector, servoholder
@@ -336,6 +337,23 @@ def test_without_a_covariance_a_broad_one_is_taken(refiner: RegionRefiner) -> No
     image = picture(pivconnector())
     for covariance in (None, np.full((6, 6), np.nan)):
         assert max(off(refiner.refine(image, K, started(4), covariance).T_cam_obj)) < 0.5
+
+
+def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
+    # As a tracker's: the outline is two pixels off.
+    deviations = np.repeat([math.radians(0.4), 0.0004], 3)
+    start = moved(TRUE, np.array([1, -1, 1, -1, 1, 1]) * deviations)
+    learned: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        learn = Round.learn
+        patch.setattr(
+            Round, "learn",
+            lambda self, *rest: (learned.append(self.stage.longest_px), learn(self, *rest)),
+        )  # fmt: skip
+        refined = refiner.refine(picture(pivconnector()), K, start, np.diag(deviations**2))
+    assert learned == [FINE.longest_px]
+    assert not refined.reason
+    assert max(off(refined.T_cam_obj)) < 0.3 < max(off(start))
 
 
 def test_large_pictures_are_read_smaller(refiner: RegionRefiner) -> None:
