@@ -33,8 +33,8 @@ from dopepp.inference.refinement.solver import Solution, moved
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(longest_px=120, reach=1.0, steps=3, points=100, tiles=1)
-MIDDLE: Final = Stage(longest_px=200, reach=0.5, steps=2, points=120, tiles=3)
-FINE: Final = Stage(longest_px=400, reach=0.25, steps=3, points=160, tiles=3)
+MIDDLE: Final = Stage(longest_px=200, reach=0.5, steps=2, points=120, tiles=2)
+FINE: Final = Stage(longest_px=300, reach=0.25, steps=3, points=160, tiles=3)
 """The coarse round is every start's, the others only the best one's."""
 
 NUM_DRAWS: Final = 4
