@@ -81,8 +81,10 @@ def measure_and_record(
     for report in reports:
         display.show_report(report, all_measures)
     if refine is not None and not files:
-        share = made_worse(reports[-2], reports[-1])
-        reports[-1].details |= {"unrefined": reports[-2].name, "made_worse": share}
+        network, refined = reports[-2:]
+        share = made_worse(network, refined)
+        rows = {name: row.to_record() for name, row in network.rows.items()}
+        refined.details |= {"unrefined": rows, "made_worse": share}
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
     record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
     if bop_csv:

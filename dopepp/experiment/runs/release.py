@@ -11,7 +11,7 @@ from dopepp.core.files import write_whole
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text, shown_rows
 from dopepp.experiment.runs import record
-from dopepp.metrics.row import COLUMNS
+from dopepp.metrics.row import COLUMNS, PoseRow
 from dopepp.models.checkpoint.released import SUFFIX, write_content
 from dopepp.models.checkpoint.schema import Checkpoint, read
 
@@ -19,8 +19,8 @@ MAX_BYTES: Final = 5_000_000
 """Of a released file: it travels with the package."""
 
 _CARD_FIELDS: Final = (
-    "num_instances", "add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rotation_deg",
-    "median_translation", "miss_rate",
+    "num_instances", "add_01d", "add_005d", "pass_5cm", "pass_10cm", "auc_10cm",
+    "median_rotation_deg", "median_translation", "miss_rate",
 )  # fmt: skip
 
 
@@ -47,12 +47,14 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
 
 
 def _card(name: str, trained: Checkpoint, report: Report) -> str:
+    unrefined = {name: PoseRow(**row) for name, row in report.details.get("unrefined", {}).items()}
     rows = [
         {"object": row.object, "method": row.method}
         | {one.heading: one.text(row) for one in COLUMNS if one.field in _CARD_FIELDS}
-        for rows in [report.rows, *report.references.values()]
+        for rows in [unrefined, report.rows, *report.references.values()]
         for row in shown_rows(rows).values()
     ]
+    refine = " refine=region" if unrefined else ""
     width, height = trained.input_size
     parameters = sum(value.numel() for value in trained.state_dict.values())
     sizes = [f"- {part.name}: {1000 * part.diameter:.0f} mm across" for part in trained.parts]
@@ -63,7 +65,7 @@ Finds, on an RGB image with its camera matrix, the 6D pose of
 
 {parts}
 
-`python evaluate.py ckpt_path=pretrained/{name}` measures it;
+`python evaluate.py ckpt_path=pretrained/{name}{refine}` measures it;
 `PoseEstimator.load("pretrained/{name}")` uses it.
 
 - Network: {trained.data.get("name", "")}, {parameters:,} parameters, {width}×{height} pixels,

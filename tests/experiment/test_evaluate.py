@@ -1,0 +1,31 @@
+import numpy as np
+import pytest
+
+from dopepp.experiment.evaluate import evaluate, made_worse
+from dopepp.experiment.reports.evaluators import Cost
+from dopepp.experiment.reports.report import Report
+from dopepp.experiment.runs.record import METRICS_FILE, read_json
+
+
+def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
+    options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=8")
+    network, refined = evaluate(composed(*options, config="evaluate"), tmp_path)
+    assert (network.name, refined.name) == ("dopepp", "dopepp + region")
+    before, after = network.errors["pivconnector"], refined.errors["pivconnector"]
+    found = np.isfinite(before)
+    assert found.sum() >= 5
+    assert np.median(after[found]) < np.median(before[found]) / 3
+    written = read_json(tmp_path / METRICS_FILE)
+    assert written["name"] == "dopepp + region"
+    assert written["unrefined"]["pivconnector"] == network.rows["pivconnector"].to_record()
+    assert written["made_worse"] == made_worse(network, refined)
+    assert (tmp_path / "compare.csv").is_file()
+
+
+def test_worse_is_by_more_than_a_millimetre():
+    def report(*errors):
+        return Report("x", {}, {}, {"a": np.array(errors), "b": np.array([0.01])}, Cost(), 1)
+
+    network = report(0.002, 0.002, 0.002, np.inf)
+    refined = report(0.0029, 0.0031, 0.0001, np.inf)
+    assert made_worse(network, refined) == pytest.approx(1 / 5)
