@@ -21,7 +21,7 @@ from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports import conditions, evaluators
 from dopepp.experiment.reports.compare import compare_reports
 from dopepp.experiment.reports.protocols import Protocols, record_breakdown
-from dopepp.experiment.reports.report import Report, measure
+from dopepp.experiment.reports.report import REFINED, Report, measure
 from dopepp.experiment.reports.tables import reported_rates
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.images import warn_of_other_images
@@ -51,7 +51,8 @@ def measure_and_record(
     challenge CSVs of other methods. The parts are those that are scored, as the test data have
     them; ``details`` are further plain facts of the last report. ``bop_csv`` writes the poses of
     each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
-    every estimator is measured without and with it.
+    every estimator is measured without and with it; ``metrics.json`` is the network's, with the
+    refined poses' under ``refined``.
 
     Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
     """
@@ -77,16 +78,17 @@ def measure_and_record(
     for file in files.values():
         file.check_used()
     reports = measured.reports
-    reports[-1].details.update(details or {})
+    # Of a network with and without refinement, the network's own result is what is compared.
+    refines = refine is not None and not files
+    main = reports[-2 if refines else -1]
+    main.details.update(details or {})
     for report in reports:
         display.show_report(report, all_measures)
-    if refine is not None and not files:
-        network, refined = reports[-2:]
-        share = made_worse(network, refined)
-        rows = {name: row.to_record() for name, row in network.rows.items()}
-        refined.details |= {"unrefined": rows, "made_worse": share}
+    if refines:
+        share = made_worse(main, reports[-1])
+        main.details |= {REFINED: reports[-1].to_record(), "made_worse": share}
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
-    record.write_json(run_dir / record.METRICS_FILE, reports[-1].to_record())
+    record.write_json(run_dir / record.METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
     curves = {

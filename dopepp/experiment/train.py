@@ -277,7 +277,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
         details=details,
         protocols=config.protocols,
         refine=config.refine,
-    )[-1]
+    )[0]
 
 
 JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {

@@ -16,8 +16,8 @@ def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     assert found.sum() >= 5
     assert np.median(after[found]) < np.median(before[found]) / 3
     written = read_json(tmp_path / METRICS_FILE)
-    assert written["name"] == "dopepp + region"
-    assert written["unrefined"]["pivconnector"] == network.rows["pivconnector"].to_record()
+    assert written["name"] == "dopepp"
+    assert written["refined"] == refined.to_record()
     assert written["made_worse"] == made_worse(network, refined)
     assert (tmp_path / "compare.csv").is_file()
 

@@ -26,6 +26,9 @@ from dopepp.models.spec import build_network
 FULL_SIZE_COST: Final = "full_size_cost"
 """Key of the details that holds what a narrowed network costs at full width and size."""
 
+REFINED: Final = "refined"
+"""Key of the details that holds the record of the same poses refined."""
+
 
 @dataclass
 class Report:
