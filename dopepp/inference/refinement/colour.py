@@ -74,11 +74,11 @@ def log_odds(
     columns = _tile_of(bins.shape[1], left * thinned, width * thinned, tiles)
     rows = _tile_of(bins.shape[0], top * thinned, height * thinned, tiles)
     counts = np.zeros((2, tiles, tiles, STEPS**3), np.float32)
-    _count(
+    counted = _count(
         bins[::thinned, ::thinned], within, beyond, unsure_within, unsure, unsure + ring,
         rows[::thinned], columns[::thinned], counts,
     )  # fmt: skip
-    if counts.sum(axis=(1, 2, 3)).min() < FEWEST:
+    if counted < FEWEST:
         return None
     tables = np.empty((tiles, tiles, STEPS**3), np.float32)
     _tables(counts, tables)
@@ -111,14 +111,18 @@ def _count(
     rows: Array,
     columns: Array,
     counts: Array,
-) -> None:
-    """Count the colours of the part and around it in every tile."""
+) -> int:
+    """Count the colours of the part and around it in every tile; return how many the fewer are."""
+    inside = outside = 0
     for v in range(bins.shape[0]):
         for u in range(bins.shape[1]):
             if within[v, u] > nearest_within:
                 counts[0, rows[v], columns[u], bins[v, u]] += 1.0
+                inside += 1
             elif nearest < beyond[v, u] <= farthest:
                 counts[1, rows[v], columns[u], bins[v, u]] += 1.0
+                outside += 1
+    return min(inside, outside)
 
 
 @compiled()

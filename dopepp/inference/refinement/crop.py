@@ -49,7 +49,7 @@ class Crop:
 def crop_around(
     image: UInt8[np.ndarray, "height width 3"],
     K: CameraMatrix,
-    pixels: Float[np.ndarray, "vertices 2"],
+    corners: Float[np.ndarray, "2 2"],
     longest_px: int,
 ) -> Crop | str:
     """Cut out a posed part and what is around it; where there is too little, say so.
@@ -57,10 +57,10 @@ def crop_around(
     Args:
         image: RGB.
         K: Its camera matrix, pixels.
-        pixels: The part's vertices on it.
+        corners: The upper left and the lower right one of the part's box on it.
         longest_px: About so long is the part on the crop at most.
     """
-    lower, upper = pixels.min(axis=0), pixels.max(axis=0)
+    lower, upper = corners
     extent = float((upper - lower).max())
     if extent < SMALLEST_PX:
         return f"the part is only {extent:.0f} pixels long"

@@ -47,6 +47,10 @@ that agrees with itself too little to overrule the prior, until it has come near
 REACH: Final = (2.5, 0.15)
 """Standard deviations of the outline under the prior; not above such a share of its extent."""
 
+ENOUGH: Final = 0.6
+"""Of the first reach, which is then one and a half standard deviations: a round that looks as far
+needs none before it."""
+
 
 class RegionRefiner:
     """Refines the poses of one part.
@@ -94,9 +98,10 @@ class RegionRefiner:
         at = posed(self._mesh, given, K)
         if at is None:
             return Refinement(given, reason="the part reaches behind the camera")
+        corners = np.stack([at.pixels.min(axis=0), at.pixels.max(axis=0)])
         rounds = []
         for stage in (COARSE, MIDDLE, FINE):
-            crop = crop_around(image, K, at.pixels, stage.longest_px)
+            crop = crop_around(image, K, corners, stage.longest_px)
             if isinstance(crop, str):
                 return Refinement(given, reason=crop)
             rounds.append(Round(self._mesh, crop, stage))
@@ -131,7 +136,7 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     """
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
-    while len(rounds) > 1 and rounds[1].farthest(reach) >= reach:
+    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
     if len(rounds) == 1:
         return _refined(rounds, given, prior, reach)

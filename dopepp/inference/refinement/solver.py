@@ -28,7 +28,7 @@ from."""
 DAMPING: Final = 1e-6
 """Share of each unknown's own information: the prior leaves none of them open."""
 
-ARRIVED: Final = 0.02
+ARRIVED: Final = 0.1
 """Standard deviations; a shorter step ends the descent."""
 
 
