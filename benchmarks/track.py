@@ -32,6 +32,7 @@ from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Scene, SceneObject, make_surface, render
 from dopepp.virtual.scene import Light, Material
+from dopepp.virtual.sensor import capture
 
 SIZE = (640, 480)
 REST = 60
@@ -103,7 +104,8 @@ def sequence(part: Part, seed: int, frames: int) -> Iterator[Frame]:
         rendered = render(
             Scene(base.K, base.background, tuple(objects), lights, base.ambient, sensor=sensor)
         )
-        yield Frame(rendered.image, base.K, T, float(rendered.visible_fractions[0]))
+        image = capture(rendered.image, sensor)
+        yield Frame(image, base.K, T, float(rendered.visible_fractions[0]))
 
 
 def is_right(pose: np.ndarray | None, true: np.ndarray) -> bool:

@@ -1,0 +1,176 @@
+"""Refinement where something is wrong: camera, CAD, material, colour, blur, size of the picture.
+
+    python benchmarks/refine_conditions.py [--checkpoint pretrained/NAME] [--images 60]
+
+Poses are those that the network finds on rendered pictures that it was not trained on, the same
+scenes in every row; they are measured as it gives them and refined.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+
+from dopepp.core.files import write_png
+from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.geometry.camera import project_keypoints, transform
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.part import Mesh, Part
+from dopepp.virtual import PRESETS, Factory, Scene, render
+from dopepp.virtual.scene import Grooves, Material
+from dopepp.virtual.sensor import capture
+
+SEED = 991
+CAD_ERROR = 0.0003
+"""Metres by which the mesh is too thick everywhere."""
+
+
+def on_target(change: Callable[[Material], Material]) -> Callable[[Scene], Scene]:
+    """Return a change of the targets' material."""
+
+    def changed(scene: Scene) -> Scene:
+        objects = tuple(
+            replace(one, material=change(one.material)) if one.is_target else one
+            for one in scene.objects
+        )
+        return replace(scene, objects=objects)
+
+    return changed
+
+
+def camouflaged(scene: Scene) -> Scene:
+    """Give the background the mean colour of the part as it is seen, with its own pattern faint."""
+    rendered = render(scene)
+    colour = rendered.image[rendered.instances == scene.targets[0]].mean(axis=0)
+    faint = colour + 0.1 * (scene.background - scene.background.mean(axis=(0, 1)))
+    return replace(scene, background=np.clip(faint, 0, 255).astype(np.uint8))
+
+
+def blurred(scene: Scene) -> Scene:
+    """Move the picture by 5 pixels during the exposure."""
+    return replace(scene, sensor=replace(scene.sensor, motion_px=(5.0, 0.0)))
+
+
+LAYERS = Grooves(axis=(0.0, 0.0, 1.0), pitch=0.0002, slope=0.4)
+SCENES: dict[str, Callable[[Scene], Scene]] = {
+    "as it is": lambda scene: scene,
+    "printed layers": on_target(lambda one: replace(one, grooves=LAYERS)),
+    "polished metal": on_target(
+        lambda one: replace(one, metallic=1.0, roughness=0.25, colour=(0.75, 0.75, 0.78))
+    ),
+    "background of the part's colour": camouflaged,
+    "motion blur 5 px": blurred,
+}
+"""What is wrong with the picture."""
+
+SIZES = ((640, 480), (1920, 1080))
+
+
+def thicker(part: Part) -> Part:
+    """Move every vertex outward along its normal."""
+    assert part.mesh is not None
+    shape = trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False)
+    moved = part.mesh.vertices + CAD_ERROR * shape.vertex_normals
+    return replace(part, mesh=Mesh(np.asarray(moved), part.mesh.faces))
+
+
+def measure(
+    name: str,
+    estimator: PoseEstimator,
+    part: Part,
+    scenes: list[Scene],
+    focal: float = 1.0,
+) -> tuple[str, list[Tile]]:
+    """Return one row of the table, and pictures: truth green, network blue, refined yellow."""
+    rows, tiles, kept, missed = [], [], 0, 0
+    for scene in scenes:
+        image = capture(render(scene).image, scene.sensor)
+        K = scene.K * np.array([[focal], [focal], [1.0]])
+        K[:2, 2] = scene.K[:2, 2]
+        true = scene.objects[scene.targets[0]].T_cam_obj
+        refiner, estimator.refiner = estimator.refiner, None
+        found = estimator.predict(image, K)[:1]
+        estimator.refiner = refiner
+        if not found:
+            missed += 1
+            continue
+        (refined,) = estimator.refined(found, image, K)
+        kept += bool(refined.kept)
+        pair = []
+        for one in (*found, refined):
+            T = one.T_cam_obj
+            away = transform(T, part.points) - transform(true, part.points)
+            turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
+            pair.append((turn, 1e3 * float(np.linalg.norm(away, axis=1).mean())))
+        rows.append(pair)
+        frames = [Wireframe(project_keypoints(part.cuboid, true, scene.K), GREEN, "true"),
+                  Wireframe(found[0].keypoints, BLUE, "network"),
+                  Wireframe(refined.keypoints, YELLOW, "refined")]  # fmt: skip
+        tiles.append(Tile(overlay(image, frames), f"{name}: {pair[0][1]:.1f} to {pair[1][1]:.1f}"))
+    both = np.array(rows).reshape(-1, 2, 2)
+    arrows = [f"{np.median(both[:, 0, c]):.1f} → {np.median(both[:, 1, c]):.1f}" for c in (0, 1)]
+    shares = [
+        " → ".join(
+            f"{np.sum(both[:, k, 1] < 1e3 * share * part.diameter) / len(scenes):.0%}"
+            for k in (0, 1)
+        )
+        for share in (0.1, 0.05)
+    ]
+    worse = float(np.mean(both[:, 1, 1] > both[:, 0, 1] + 1)) if len(both) else 0.0
+    cells = [name, f"{missed}", *shares, *arrows, f"{worse:.0%}", f"{kept}"]
+    return "| " + " | ".join(cells) + " |", tiles[:3]
+
+
+def main() -> None:
+    """Print a row for everything that may be wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoint", default="pretrained/pivconnector")
+    parser.add_argument("--images", type=int, default=60)
+    parser.add_argument("--preset", default="quickstart")
+    parser.add_argument("--pictures", type=Path, help="write a sheet with three images of each row")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    estimator = PoseEstimator.load(arguments.checkpoint)
+    part = load_part(estimator.parts[0].name)
+    preset = PRESETS[arguments.preset]
+    usual = estimator.refining("region", [part])
+
+    def scenes(size: tuple[int, int] | None = None) -> list[Scene]:
+        sized = preset if size is None else preset.resized(*size)
+        factory = Factory([part], sized, SEED)
+        return [factory.scene(0, index) for index in range(arguments.images)]
+
+    titles = "what is wrong | missed | ADD-0.1d | ADD-0.05d | ° | ADD mm | worse by 1 mm | kept"
+    print(f"| {titles} |\n" + "| --- " * 8 + "|")
+    sheet: list[Tile] = []
+
+    def show(name: str, *what: object, **options: float) -> None:
+        row, tiles = measure(name, *what, **options)  # type: ignore[arg-type]
+        print(row, flush=True)
+        sheet.extend(tiles)
+
+    plain = scenes()
+    for name, change in SCENES.items():
+        show(name, usual, part, [change(scene) for scene in plain])
+    show("focal length 1 % too long", usual, part, plain, focal=1.01)
+    show("CAD 0.3 mm too thick", estimator.refining("region", [thicker(part)]), part, plain)
+    for size in SIZES:
+        show(f"{size[0]}×{size[1]} pixels", usual, part, scenes(size))
+    if arguments.pictures is not None:
+        write_png(arguments.pictures, contact_sheet(sheet, 3))
+
+
+if __name__ == "__main__":
+    main()
