@@ -126,7 +126,7 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     """Descend from the given pose and, where that is doubtful, from the best of several draws.
 
     Rounds that look farther than the prior asks for are left out: a tracked part needs the last one
-    only.
+    only, once.
 
     Returns:
         The end, and the share of the outline that agrees there.
@@ -139,7 +139,9 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
         rounds = rounds[1:]
     if len(rounds) == 1:
-        return _refined(rounds, given, prior, reach)
+        # From where the first time led, the colours are learned better.
+        again = rounds if rounds[0].farthest(reach) < reach else ()
+        return _refined([*rounds, *again], given, prior, reach)
     rounds[0].learn(given, reach)
     wide = Prior(given, prior.information / WIDENED**2)
     try:
