@@ -74,10 +74,11 @@ def crop_around(
     most = min(right - left, bottom - top) // SMALLEST_PX
     few = min(max(1, round(extent / longest_px)), most)
     width, height = (right - left) // few, (bottom - top) // few
-    colours = np.ascontiguousarray(image[top : top + few * height, left : left + few * width])
+    colours = image[top : top + few * height, left : left + few * width]
     own = np.array(K, np.float64)
     own[:2, 2] -= left, top
     if few > 1:
         own = resize_camera(own, 1 / few, 1 / few)
         colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
+    colours = np.ascontiguousarray(colours)
     return Crop(colours, colour_bins(colours), own, extent / few, 1 / few)
