@@ -1,14 +1,16 @@
 """Poses refined on the picture alone: the outline is moved to where the part's colours end.
 
 Colours inside a part's outline and around it are learned at the pose that is to be refined. Along
-the normals of the outline they tell where the part ends (:mod:`~dopepp.inference.refinement.lines`)
-and a few Gauss–Newton steps follow, from coarse to fine, with the given pose and its covariance as
-prior. Several starts drawn from that covariance are ranked by likelihood. Where the picture does
-not decide, the given pose is kept.
+the normals of the outline they and the picture's edges tell where the part ends
+(:mod:`~dopepp.inference.refinement.lines`), and a few Gauss–Newton steps follow, from coarse to
+fine, with the given pose and its covariance as prior. Where that leads nowhere, several starts are
+drawn from that covariance and ranked by likelihood. Where the picture does not decide, the given
+pose is kept.
 
 Errors of neighbouring points are alike, and an offset may be common to all: a covariance that took
-them for independent would let a blurred edge overrule the network's distance. The idea of regions
-is that of PWP3D and RBOT, that of probabilistic lines SRT3D's (Stoiber et al. 2022).
+them for independent would let a blurred edge overrule the network's distance. Edges and creases
+inside the outline were tried and made no pose better. The idea of regions is that of PWP3D and
+RBOT, that of probabilistic lines SRT3D's (Stoiber et al. 2022).
 """
 
 from __future__ import annotations
