@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from dopepp.geometry.camera import (
     project_keypoints,
     transform,
 )
-from dopepp.geometry.rotation import random_rotation
+from dopepp.geometry.rotation import random_rotation, rotation_angle, rotation_vector_to_matrix
 from dopepp.inference import estimator as module
 from dopepp.inference.estimator import letterboxed, parse_recovery
 from dopepp.maps import MapGeometry, encode
@@ -278,14 +279,25 @@ def test_refines_with_depth_where_it_is_given(parts_path):
 
 
 def test_refines_on_the_picture(parts_path):
-    estimator, rendered = seen(parts_path, "region", nearer=0.005)
+    estimator, rendered = seen(parts_path, "region", nearer=0.0)
     found = estimator.predict(rendered.image, K_VGA)[0]
-    # These peaks claim a pixel; an outline may be off by as much, so they are told to be wide.
-    wide = replace(found, covariance=16 * found.covariance)
-    refined = estimator.refiner(wide, rendered.image, K_VGA, None)
-    assert error(refined.T_cam_obj) < 0.002 < 0.004 < error(found.T_cam_obj)
+    turned = rotation_vector_to_matrix(np.array([0.04, 0.04, -0.03])) @ TRUE[:3, :3]
+    off = make_transform(turned, TRUE[:3, 3] + (0.001, 0.002, 0.002))
+    covariance = np.diag(np.square([0.04] * 3 + [0.002, 0.002, 0.005]))
+    given = replace(found, T_cam_obj=off, covariance=covariance)
+    (refined,) = estimator.refined([given], rendered.image, K_VGA)
+    assert refined.kept == ""
+    assert refined.agreement > 0.9
+    assert rotation_angle(off[:3, :3] @ TRUE[:3, :3].T) > math.radians(3.5)
+    assert rotation_angle(refined.T_cam_obj[:3, :3] @ TRUE[:3, :3].T) < math.radians(0.6)
+    assert np.abs(refined.T_cam_obj[:2, 3] - TRUE[:2, 3]).max() < 0.0002
+    assert np.linalg.det(refined.covariance) < 0.01 * np.linalg.det(covariance)
+    assert_array_equal(
+        refined.keypoints, project_keypoints(estimator.cuboids[0], refined.T_cam_obj, K_VGA)
+    )
     alone = estimator.predict(np.full_like(rendered.image, 90), K_VGA)[0]
-    assert alone.kept == "colours inside and around the part are too alike"
+    assert alone.kept
+    assert alone.agreement is None
     assert_array_equal(alone.T_cam_obj, found.T_cam_obj)
 
 
