@@ -211,14 +211,22 @@ def _squared_gap(P: Array, p: Array, x: Array, target: Array, perspective: bool)
 
 
 @compiled()
-def _to_pixels(placed: Array) -> bool:
-    """Divide by the depth; return False as soon as one is not before the camera."""
-    for j in range(len(placed)):
-        depth = placed[j, 2]
-        if not depth > 0.0:
-            return False
-        placed[j, 0] /= depth
-        placed[j, 1] /= depth
+def _set_targets(B: Array, b: Array, points: Array, perspective: bool, targets: Array) -> bool:
+    """Write π(Bx + b) of every point; return False as soon as one is not before the camera.
+
+    In one pass: placed first and divided then, MSPD takes a quarter longer.
+    """
+    for j in range(len(points)):
+        for r in range(3):
+            targets[j, r] = (
+                B[r, 0] * points[j, 0] + B[r, 1] * points[j, 1] + B[r, 2] * points[j, 2] + b[r]
+            )
+        if perspective:
+            depth = targets[j, 2]
+            if not depth > 0.0:
+                return False
+            targets[j, 0] /= depth
+            targets[j, 1] /= depth
     return True
 
 
@@ -241,8 +249,7 @@ def _search(
     floors = np.empty(len(turns))
     for n in range(len(errors)):
         errors[n] = np.inf
-        _place(points, B[n], b[n], targets)
-        if perspective and not _to_pixels(targets):
+        if not _set_targets(B[n], b[n], points, perspective, targets):
             continue
         _place(shifts, A[n], a[n], p)
         for s in range(len(turns)):
