@@ -15,10 +15,9 @@ import time
 import cv2
 import numpy as np
 
-from dopepp.geometry.camera import transform
+from dopepp.geometry.camera import moved, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.refinement.region import RegionRefiner
-from dopepp.inference.refinement.solver import moved
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory
 

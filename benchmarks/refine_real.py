@@ -25,10 +25,9 @@ from dopepp.data.formats.bop.models import bop_parts, parts_by_id
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import read_rgb
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.geometry.camera import make_transform, project_keypoints, transform
+from dopepp.geometry.camera import make_transform, moved, project_keypoints, transform
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.region import RegionRefiner
-from dopepp.inference.refinement.solver import moved
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import squared_distance
 

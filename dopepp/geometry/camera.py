@@ -10,13 +10,21 @@ from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.geometry.rotation import RotationMatrix, Vector
+from dopepp.geometry.rotation import (
+    RotationMatrix,
+    Vector,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+)
 
 Transform = Float[np.ndarray, "4 4"]
 """``T_a_b``, rigid: it maps frame b into frame a, metres."""
 
 CameraMatrix = Float[np.ndarray, "3 3"]
 """K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
+
+Step = Float[np.ndarray, "6"]
+"""A turn about the object's origin (rotation vector) and a shift, camera axes: radians, metres."""
 
 Points = Float[np.ndarray, "*batch 3"]
 Pixels = Float[np.ndarray, "*batch 2"]
@@ -38,6 +46,18 @@ def invert_transform(T_a_b: Transform) -> Transform:
     """Return T_b_a of a rigid transform T_a_b."""
     rotation = T_a_b[:3, :3].T
     return make_transform(rotation, -rotation @ T_a_b[:3, 3])
+
+
+def moved(T_cam_obj: Transform, step: Step) -> Transform:
+    """Turn a pose about the object's origin and shift it."""
+    turn = rotation_vector_to_matrix(step[:3])
+    return make_transform(turn @ T_cam_obj[:3, :3], T_cam_obj[:3, 3] + step[3:])
+
+
+def step_between(before: Transform, after: Transform) -> Step:
+    """Return the step by which :func:`moved` makes one pose of the other."""
+    turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
+    return np.concatenate([turn, after[:3, 3] - before[:3, 3]])
 
 
 def project(points_cam: Points, K: CameraMatrix) -> Pixels:

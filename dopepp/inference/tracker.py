@@ -14,20 +14,22 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
-from dopepp.geometry.rotation import matrix_to_rotation_vector
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Step,
+    Transform,
+    moved,
+    project_keypoints,
+    step_between,
+    transform,
+)
 from dopepp.inference.estimator import PoseEstimator, checked_picture
-from dopepp.inference.refinement.solver import moved
 from dopepp.recovery.detection import Detection
-
-Step = Float[np.ndarray, "6"]
-"""A turn about the object's origin (rotation vector) and a shift, camera axes: radians, metres."""
 
 STILL: Final = (math.radians(0.15), 5e-4)
 """Standard deviations of what a part at rest seems to move by a frame: radians along each axis, and
@@ -182,7 +184,7 @@ class PoseTracker:
                     continue
                 agreement = _agreement(found)
                 if agreement >= max(DOUBTFUL * state.usual, min(TRUSTED, state.usual)):
-                    step = _step(old.T_cam_obj, found.T_cam_obj)
+                    step = step_between(old.T_cam_obj, found.T_cam_obj)
                     velocity = SMOOTHING * step + (1 - SMOOTHING) * velocity
                     state.track = replace(
                         state.track, detection=found, velocity=velocity, detected=False
@@ -243,9 +245,7 @@ class PoseTracker:
     def _apart(self, one: Detection, other: Detection) -> float:
         """Return the mean distance between the cuboids' corners, diameters."""
         cuboid = self._cuboid_of[one.object]
-        first, second = (
-            cuboid @ pose.T_cam_obj[:3, :3].T + pose.T_cam_obj[:3, 3] for pose in (one, other)
-        )
+        first, second = (transform(pose.T_cam_obj, cuboid) for pose in (one, other))
         apart = np.linalg.norm(first - second, axis=1).mean()
         return float(apart / self._diameters[one.object])
 
@@ -265,11 +265,6 @@ def _at(expected: Transform, deviations: tuple[float, float]) -> Step:
     """Return deviations of turn and shift at a part's distance, axis by axis."""
     turn, shift = deviations
     return np.array([turn] * 3 + [shift * float(expected[2, 3])] * 3)
-
-
-def _step(before: Transform, after: Transform) -> Step:
-    turn = matrix_to_rotation_vector(after[:3, :3] @ before[:3, :3].T)
-    return np.concatenate([turn, after[:3, 3] - before[:3, 3]])
 
 
 def _distance(one: Detection, other: Detection) -> float:

@@ -24,9 +24,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import CameraMatrix, Transform, project, project_keypoints, transform
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    Transform,
+    project,
+    project_keypoints,
+    step_between,
+    transform,
+)
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
-from dopepp.geometry.rotation import matrix_to_rotation_vector
 from dopepp.recovery.detection import Detection
 
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
@@ -213,8 +219,7 @@ def squared_distance(
 
     The covariance is that of :class:`~dopepp.recovery.detection.Detection`.
     """
-    turn = matrix_to_rotation_vector(true[:3, :3] @ T_cam_obj[:3, :3].T)
-    away = np.concatenate([turn, true[:3, 3] - T_cam_obj[:3, 3]])
+    away = step_between(T_cam_obj, true)
     return float(away @ np.linalg.solve(covariance, away))
 
 

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
@@ -12,9 +13,11 @@ from dopepp.geometry.camera import (
     check_camera,
     invert_transform,
     make_transform,
+    moved,
     project,
     resize_camera,
     resize_points,
+    step_between,
     transform,
 )
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
@@ -146,3 +149,17 @@ def test_bad_camera(bad, message):
         check_camera(bad, (640, 480), "frame 7")
     assert "frame 7" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_step_between_two_poses_makes_one_of_the_other():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        before, after = (
+            make_transform(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+            for _ in range(2)
+        )
+        step = step_between(before, after)
+        turn = Rotation.from_matrix(after[:3, :3]) * Rotation.from_matrix(before[:3, :3]).inv()
+        assert_allclose(step[:3], turn.as_rotvec(), atol=1e-9)
+        assert_allclose(step[3:], after[:3, 3] - before[:3, 3])
+        assert_allclose(moved(before, step), after, atol=1e-12)

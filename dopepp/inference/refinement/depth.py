@@ -15,11 +15,9 @@ from types import ModuleType
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import require
 from dopepp.geometry import camera
-from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.fit import Fit, Prior, Terms, fit_of, make_prior, outline_terms
 from dopepp.inference.refinement.search import best_shift
 from dopepp.inference.refinement.view import GATE, DepthView, Overlay, lay_over, view_around
@@ -177,7 +175,7 @@ class DepthRefiner:
                         view, overlay, pose[:3, 3], surface.spacing, stage.outline * diameter
                     )
                     information, pull = information + H_outline, pull + g_outline
-                pose = _moved(pose, np.linalg.solve(information, pull))
+                pose = camera.moved(pose, np.linalg.solve(information, pull))
         return pose, information
 
     def _plane_terms(
@@ -209,9 +207,3 @@ class DepthRefiner:
             return H, -weight * to_camera.T @ np.ravel(one.b)
 
         return terms
-
-
-def _moved(pose: camera.Transform, step: Float[np.ndarray, "6"]) -> camera.Transform:
-    """Turn a pose about the object's origin and shift it, both in camera axes."""
-    turn = rotation_vector_to_matrix(step[:3])
-    return camera.make_transform(turn @ pose[:3, :3], pose[:3, 3] + step[3:])

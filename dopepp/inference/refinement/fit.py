@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from dopepp.geometry.camera import Transform
-from dopepp.geometry.rotation import Vector, matrix_to_rotation_vector
+from dopepp.geometry.camera import Transform, step_between
+from dopepp.geometry.rotation import Vector
 from dopepp.inference.refinement.view import COVERED, GATE, DepthView, Overlay, lay_over
 from dopepp.inference.refinement.visible import PoseMatrix, Region, Seen, SurfacePoints
 
@@ -70,8 +70,7 @@ class Prior:
 
     def offset(self, T_cam_obj: Transform) -> Float[np.ndarray, "6"]:
         """Return the turn and the shift from a pose to the prior's."""
-        turn = matrix_to_rotation_vector(self.T_cam_obj[:3, :3] @ T_cam_obj[:3, :3].T)
-        return np.concatenate([turn, self.T_cam_obj[:3, 3] - T_cam_obj[:3, 3]])
+        return step_between(T_cam_obj, self.T_cam_obj)
 
     def doubt(self, T_cam_obj: Transform) -> str:
         """Say why a pose contradicts the image; empty where it does not."""

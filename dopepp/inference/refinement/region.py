@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, moved
 from dopepp.inference.refinement.crop import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import Refinement
 from dopepp.inference.refinement.fit import Prior, make_prior
@@ -31,7 +31,7 @@ from dopepp.inference.refinement.lines import outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
 from dopepp.inference.refinement.rounds import Round, Stage, UndecidedError
 from dopepp.inference.refinement.silhouette import posed
-from dopepp.inference.refinement.solver import Solution, moved
+from dopepp.inference.refinement.solver import Solution
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(longest_px=120, reach=1.0, steps=3, points=100, tiles=1)

@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.camera import Transform, moved
 from dopepp.geometry.refine import solve_damped
-from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.refinement.fit import Prior
 
 Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
@@ -71,10 +70,3 @@ def descend(
         if step @ information @ step < ARRIVED**2:
             break
     return Solution(pose, information)
-
-
-def moved(pose: Transform, step: Float[np.ndarray, "6"]) -> Transform:
-    """Turn a pose about the object's origin and shift it, both in camera axes."""
-    return make_transform(
-        rotation_vector_to_matrix(step[:3]) @ pose[:3, :3], pose[:3, 3] + step[3:]
-    )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import ndimage
 
-from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
+from dopepp.geometry.camera import camera_matrix, make_transform, moved, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.refinement.colour import colour_bins, log_odds
 from dopepp.inference.refinement.contour import Contour, find_contour
@@ -30,7 +30,7 @@ from dopepp.inference.refinement.mesh import make_outline_mesh
 from dopepp.inference.refinement.region import FINE, RegionRefiner
 from dopepp.inference.refinement.rounds import Round
 from dopepp.inference.refinement.silhouette import filled_mask, posed
-from dopepp.inference.refinement.solver import descend, moved
+from dopepp.inference.refinement.solver import descend
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 
