@@ -87,6 +87,7 @@ def thicker(part: Part) -> Part:
 
 def measure(
     name: str,
+    network: PoseEstimator,
     estimator: PoseEstimator,
     part: Part,
     scenes: list[Scene],
@@ -99,9 +100,7 @@ def measure(
         K = scene.K * np.array([[focal], [focal], [1.0]])
         K[:2, 2] = scene.K[:2, 2]
         true = scene.objects[scene.targets[0]].T_cam_obj
-        refiner, estimator.refiner = estimator.refiner, None
-        found = estimator.predict(image, K)[:1]
-        estimator.refiner = refiner
+        found = network.predict(image, K)[:1]
         if not found:
             missed += 1
             continue
@@ -157,7 +156,7 @@ def main() -> None:
     sheet: list[Tile] = []
 
     def show(name: str, *what: object, **options: float) -> None:
-        row, tiles = measure(name, *what, **options)  # type: ignore[arg-type]
+        row, tiles = measure(name, estimator, *what, **options)  # type: ignore[arg-type]
         print(row, flush=True)
         sheet.extend(tiles)
 

@@ -39,7 +39,9 @@ def predict(
     ] = False,
     parts: Annotated[
         list[str] | None,
-        typer.Option("--part", help="for --verify: built-in part, mesh file, or NAME=FILE"),
+        typer.Option(
+            "--part", help="mesh in place of the checkpoint's: built-in part, file, or NAME=FILE"
+        ),
     ] = None,
     unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
     refine: Annotated[

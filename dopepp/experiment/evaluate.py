@@ -49,7 +49,7 @@ def measure_and_record(
 
     Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
     challenge CSVs of other methods. The parts are those that are scored, as the test data have
-    them; ``details`` are further plain facts of the last report. ``bop_csv`` writes the poses of
+    them; ``details`` are further plain facts for ``metrics.json``. ``bop_csv`` writes the poses of
     each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
     every estimator is measured without and with it; ``metrics.json`` is the network's, with the
     refined poses' under ``refined``.
@@ -159,18 +159,26 @@ def _write_results(
 def with_refined(
     estimators: Mapping[str, PoseEstimator], refine: str | None, parts: Parts
 ) -> dict[str, PoseEstimator]:
-    """Return every estimator, and behind it the same one refining: two rows in every table.
+    """Return every estimator, and behind it the same one refining: two rows in every table."""
+    pairs: dict[str, PoseEstimator] = {}
+    for name, one in estimators.items():
+        pairs[name] = one
+        if refine is not None:
+            pairs[f"{name} + {refine}"] = refining(one, refine, parts)
+    return pairs
+
+
+def refining(estimator: PoseEstimator, refine: str | None, parts: Parts) -> PoseEstimator:
+    """Return an estimator that refines, or for None the same one.
 
     A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.
     """
     if refine is None:
-        return dict(estimators)
+        return estimator
     known = {part.name: part for part in parts}
-    pairs: dict[str, PoseEstimator] = {}
-    for name, one in estimators.items():
-        own = [part if part.mesh is not None else known.get(part.name, part) for part in one.parts]
-        pairs |= {name: one, f"{name} + {refine}": one.refining(refine, own)}
-    return pairs
+    own = [part if part.mesh is not None else known.get(part.name, part)
+           for part in estimator.parts]  # fmt: skip
+    return estimator.refining(refine, own)
 
 
 def made_worse(network: Report, refined: Report) -> float:
@@ -261,7 +269,7 @@ def _tune_only(
     if asked.ckpt_path is None or len(loaded) > 1:
         allowed = "one ckpt_path, and no baseline"
         raise UserError("tune=true", allowed, "tune one checkpoint at a time")
-    *_, estimator = with_refined({"": loaded[0]}, asked.refine, parts).values()
+    estimator = refining(loaded[0], asked.refine, parts)
     tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
     display.show_files(run_dir)
 

@@ -31,7 +31,7 @@ from dopepp.experiment.build.system import (
 )
 from dopepp.experiment.config.run import RunConfig, TrainerConfig
 from dopepp.experiment.cost import measure_cost
-from dopepp.experiment.evaluate import measure_and_record, tune_and_record, with_refined
+from dopepp.experiment.evaluate import measure_and_record, refining, tune_and_record
 from dopepp.experiment.lr_finder import find_learning_rate
 from dopepp.experiment.reports.conditions import check_masks
 from dopepp.experiment.reports.paper_table import PaperTable
@@ -255,7 +255,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     if config.tune:
         target = config.false_positives
         try:
-            *_, tuned = with_refined({"": estimator}, config.refine, parts).values()
+            tuned = refining(estimator, config.refine, parts)
             path = tune_and_record(tuned, path, parts, config.data, run_dir, target)
         except UserError as error:  # a network that learned little is measured as it is
             display.console.print(f"not tuned: {error}")

@@ -123,7 +123,7 @@ def tune(
         # Every detection counts here, whatever its score.
         heard = replace(old, min_score=0.0, covariance_factor=1.0)
         before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
-        estimator.recovery = replace(heard, distance_factor=1.0, covariance_factor=1.0)
+        estimator.recovery = replace(heard, distance_factor=1.0)
         factors = fit_factors(matched_poses(estimator, parts, validation))
         heard = replace(heard, distance_factor=factors["distance_factor"])
         chosen = choose(scored(heard, validation), scored(heard, empty), rate)
@@ -132,7 +132,9 @@ def tune(
         heard = replace(new, min_score=0.0)
         if refiner is not None:
             estimator.refiner = refiner
-            heard = replace(new, min_score=min(new.min_score, calibration.CANDIDATE))
+            # Features are of the network's score, which an earlier tuning's would hide.
+            candidate = min(new.min_score, calibration.CANDIDATE)
+            heard = replace(new.unrefined(), min_score=candidate)
             refined = choose(scored(heard, validation), scored(heard, empty), rate, refined=True)
             chosen |= refined
             threshold = refined.pop("refined_min_score")

@@ -114,8 +114,9 @@ class PoseEstimator:
 
         Returns:
             Detections, best score first, in pixels of the given size and metres. A refined one has
-            the refined pose, its keypoints and covariance; score, peaks and reprojection error stay
-            those of the network. Where refinement kept the network's pose, ``kept`` says why.
+            the refined pose, its keypoints and covariance, and the score that tuning has fitted to
+            refined poses; all else stays the network's. Where refinement kept the network's pose,
+            ``kept`` says why.
 
         Raises:
             UserError: The image is no RGB picture, K cannot belong to it, there is no lens model

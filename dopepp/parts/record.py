@@ -20,7 +20,8 @@ MAX_SYMMETRIES: Final = 1000
 """Far above any real part (YCB-Video: 2,621 points); they bound memory for a hostile file."""
 
 MAX_FACES: Final = 4000
-"""Triangles of a record's mesh: two pixels across on a part that is 100 pixels long."""
+"""Triangles of a record's mesh, and of an outline's: their edges are two pixels long on a part of
+100 pixels."""
 
 FARTHEST: Final = 1e6
 """Metres. No part reaches out this far, and squares of such lengths stay finite."""

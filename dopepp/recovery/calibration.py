@@ -17,7 +17,7 @@ and give ``RecoveryOptions`` its weight.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -151,6 +151,11 @@ class RecoveryOptions:
     def refined_weights(self) -> tuple[float, ...]:
         """Weights of the features of a refined pose's score, in their order."""
         return tuple(getattr(self, f"refined_{name}") for name in REFINED_FEATURES)
+
+    def unrefined(self) -> RecoveryOptions:
+        """Return the options with nothing learned about refined poses."""
+        own = {one.name: one.default for one in fields(self) if one.name.startswith("refined_")}
+        return replace(self, **own)  # type: ignore[arg-type]
 
     def of_candidates(self) -> RecoveryOptions:
         """Return the options that let all through which refinement is to judge."""

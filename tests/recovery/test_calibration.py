@@ -127,6 +127,7 @@ def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
         refined_min_score=0.4,
     )  # fmt: skip
     assert fitted.of_candidates().min_score == CANDIDATE
+    assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
     judged = [replace(said[0], agreement=0.9), replace(said[1], agreement=None, kept="no")]
     (only,) = rescored(judged, fitted)
     assert only.agreement == 0.9

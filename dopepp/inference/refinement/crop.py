@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import cv2
@@ -28,14 +29,12 @@ class Crop:
 
     Attributes:
         colours: RGB.
-        bins: The same as one number a pixel.
         K: Its camera matrix, pixels.
         extent: Longer side of the part on it, pixels.
         scale: Its pixels per pixel of the picture: 1 over a whole number.
     """
 
     colours: UInt8[np.ndarray, "height width 3"]
-    bins: Int[np.ndarray, "height width"]
     K: CameraMatrix
     extent: float
     scale: float
@@ -43,7 +42,12 @@ class Crop:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height."""
-        return self.bins.shape[1], self.bins.shape[0]
+        return self.colours.shape[1], self.colours.shape[0]
+
+    @cached_property
+    def bins(self) -> Int[np.ndarray, "height width"]:
+        """The colours as one number a pixel; of rounds that are left out, nobody asks for it."""
+        return colour_bins(self.colours)
 
 
 def crop_around(
@@ -81,4 +85,4 @@ def crop_around(
         own = resize_camera(own, 1 / few, 1 / few)
         colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
     colours = np.ascontiguousarray(colours)
-    return Crop(colours, colour_bins(colours), own, extent / few, 1 / few)
+    return Crop(colours, own, extent / few, 1 / few)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.measure import Faces, Vertices, face_areas, weld
-
-MAX_FACES: Final = 4000
-"""Triangles of an outline's mesh: their edges are two pixels long on a part of 100 pixels."""
+from dopepp.parts.record import MAX_FACES
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +24,6 @@ class OutlineMesh:
         sides: The two triangles at it; the second is −1 where there is one only.
         opposed: 1 where these two run along it in the same direction, else 0.
         is_closed: Whether the triangles that face the camera hide all others.
-        deviation: Largest distance that a vertex was moved by to have fewer triangles, metres.
     """
 
     vertices: Vertices
@@ -37,7 +33,6 @@ class OutlineMesh:
     sides: Int[np.ndarray, "edges 2"]
     opposed: UInt8[np.ndarray, "edges"]
     is_closed: bool
-    deviation: float
 
 
 def make_outline_mesh(vertices: Vertices, faces: Faces, max_faces: int = MAX_FACES) -> OutlineMesh:
@@ -50,9 +45,8 @@ def make_outline_mesh(vertices: Vertices, faces: Faces, max_faces: int = MAX_FAC
     faces = faces[face_areas(vertices, faces) > 0]
     if not len(faces):
         raise ValueError("no triangle with an area")
-    deviation = 0.0
     if len(faces) > max_faces:
-        vertices, faces, _, deviation = decimate(vertices, faces, None, max_faces)
+        vertices, faces, *_ = decimate(vertices, faces, None, max_faces)
         faces = faces[face_areas(vertices, faces) > 0]
     a, b, c = vertices[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
@@ -70,5 +64,4 @@ def make_outline_mesh(vertices: Vertices, faces: Faces, max_faces: int = MAX_FAC
         sides=np.stack([one // 3, np.where(uses > 1, other // 3, -1)], axis=1),
         opposed=opposed.astype(np.uint8),
         is_closed=bool((uses == 2).all() and not opposed.any()),
-        deviation=deviation,
     )  # fmt: skip

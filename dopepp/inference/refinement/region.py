@@ -69,11 +69,6 @@ class RegionRefiner:
         self._mesh = make_outline_mesh(vertices, faces)
         self._diameter = largest_distance(self._mesh.vertices)
 
-    @property
-    def deviation(self) -> float:
-        """How far any vertex was moved to have fewer triangles, metres."""
-        return self._mesh.deviation
-
     def refine(
         self,
         image: UInt8[np.ndarray, "height width 3"],

@@ -78,7 +78,7 @@ def test_an_object_in_no_training_source_is_named(parsed, ycb_root):
     overrides = ("data=ycb_video", f"data.root={ycb_root}", "data.samples_per_epoch=32")
     data = parsed(*overrides, "data.objects=[003_cracker_box,019_pitcher_base]").data
     module = build_datamodule(data, build_parts(data), seed=0)
-    assert {row.source for row in module.summary()} == {"ycb_video/data"}
+    assert {info.name for _, info in module.summary()} == {"ycb_video/data"}
     with pytest.raises(UserError, match="no instance of 019_pitcher_base in the training data"):
         module.check_objects()
 
