@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -25,7 +27,14 @@ from dopepp.data.sample import (
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.parts.part import Part
+from dopepp.parts.seen import Seen, widest
 from dopepp.virtual.backgrounds import Backgrounds
+
+_SEEN_ITEMS: Final = 200
+"""Images on which the range of sizes is measured."""
 
 
 class PoseDataModule(LightningDataModule):
@@ -118,6 +127,25 @@ class PoseDataModule(LightningDataModule):
                 "take the object out, or add a source that shows it (e.g. renders)",
             )
 
+    def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
+        """Return how large and how far away the parts are in the network's input.
+
+        Measured on validation images; for a part that none of them shows, on training images.
+        """
+        views: dict[str, list[Seen]] = {part.name: [] for part in parts}
+        for source in (self.val_source, self.train_source):
+            missing = [part for part in parts if not views[part.name]]
+            for index in range(min(len(source), _SEEN_ITEMS) if missing else 0):
+                sample = source.sample(index)
+                scale = Letterbox.fit(sample.size, self.input_size).scale_x
+                for part in missing:
+                    views[part.name] += [
+                        _view(one.T_cam_obj, part, sample.K, scale)
+                        for one in sample.instances
+                        if one.label == part.name
+                    ]
+        return {name: widest(found) for name, found in views.items() if found}
+
     def summary(self) -> list[tuple[str, SourceInfo]]:
         """Return (split, source) for the start-up print."""
         splits = self._splits().items()
@@ -134,3 +162,10 @@ class PoseDataModule(LightningDataModule):
 
     def _splits(self) -> dict[str, DescribedSource]:
         return {"train": self.train_source, "val": self.val_source, "test": self.test_source}
+
+
+def _view(T_cam_obj: Transform, part: Part, K: CameraMatrix, scale: float) -> Seen:
+    """Return one instance's diameter in pixels of an image resized by a factor, and its depth."""
+    depth = float(transform(T_cam_obj, part.cuboid[CENTROID])[2])
+    pixels = scale * math.sqrt(K[0, 0] * K[1, 1]) * part.diameter / depth
+    return Seen(pixels, pixels, depth, depth)

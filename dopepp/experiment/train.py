@@ -132,7 +132,7 @@ def _train(
     sources = {"train": datamodule.train_source, "val": datamodule.val_source}
     sources["test"] = datamodule.test_source
     images = {split: describe_images(source) for split, source in sources.items()}
-    system = build_system(config, parts, fingerprint, images)
+    system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
     resume_from, changes = _resume_path(config, system)
     # Whatever it refuses, nothing is written yet.
     trainer = build_trainer(config, run_dir, trackers=trackers)

@@ -121,8 +121,14 @@ class Letterbox:
     def fit(cls, image_size: tuple[int, int], input_size: tuple[int, int]) -> Letterbox:
         """Fit an image of (width, height) into an input of (width, height)."""
         scale = min(input_size[0] / image_size[0], input_size[1] / image_size[1])
-        width = min(input_size[0], max(1, round(image_size[0] * scale)))
-        height = min(input_size[1], max(1, round(image_size[1] * scale)))
+        box = cls.scaled(image_size, scale)
+        width, height = min(input_size[0], box.width), min(input_size[1], box.height)
+        return cls(width, height, width / image_size[0], height / image_size[1])
+
+    @classmethod
+    def scaled(cls, image_size: tuple[int, int], scale: float) -> Letterbox:
+        """Resize an image of (width, height) by a factor."""
+        width, height = (max(1, round(side * scale)) for side in image_size)
         return cls(width, height, width / image_size[0], height / image_size[1])
 
     def image(

@@ -20,6 +20,7 @@ from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference.refinement.refiner import make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.scales import Distances, letterboxes, merged
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
@@ -28,6 +29,9 @@ from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 
 Decoded = TypeVar("Decoded")
+
+Region = tuple[int, int, int, int]
+"""x, y, width and height, pixels."""
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -101,8 +105,14 @@ class PoseEstimator:
         K: CameraMatrix,
         distortion: Coefficients | None = None,
         depth: Depth | None = None,
+        distances: Distances | None = None,
+        roi: Region | None = None,
     ) -> list[Detection]:
         """Find all known objects on one image.
+
+        The image is resized until parts have the size that they had in training
+        (:mod:`dopepp.inference.scales`); a checkpoint of an earlier version, which does not know
+        that size, gets it in the size of the training's images.
 
         Args:
             image: RGB, uint8, any size.
@@ -111,6 +121,10 @@ class PoseEstimator:
                 same K, and pixels of the result refer to the undistorted image.
             depth: Metres along z, aligned to the image (and distorted as it is), 0 or NaN where
                 unknown; used where the estimator refines with depth.
+            distances: Nearest and farthest depth at which parts are looked for, metres; None is
+                where training had them, ``any`` wherever the network can see them. The farther
+                apart, the more often it looks.
+            roi: Look in this part of the image only: (x, y, width, height), pixels.
 
         Returns:
             Detections, best score first, in pixels of the given size and metres. A refined one has
@@ -129,10 +143,7 @@ class PoseEstimator:
             coefficients = _checked_distortion(distortion)
             image = cv2.undistort(image, K, coefficients)
             depth = None if depth is None else undistorted_depth(depth, K, coefficients)
-        letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
-        found = self._decode(recover, image, K, letterbox)
-        cuboids = self._cuboid_of
-        detections = [_in_original(one, cuboids[one.object], letterbox, K) for one in found]
+        detections = self._detect(image, K, distances, roi)
         if self.refiner is None:
             return detections
         return rescored(self.refined(detections, image, K, depth), self.recovery)
@@ -170,14 +181,40 @@ class PoseEstimator:
             )  # fmt: skip
         return refined
 
-    def explain(self, image: Picture, K: CameraMatrix) -> list[str]:
+    def explain(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distances: Distances | None = None,
+        roi: Region | None = None,
+    ) -> list[str]:
         """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
 
-        An image or a K that :meth:`predict` refuses is a :class:`UserError`.
+        What :meth:`predict` refuses is a :class:`UserError`.
         """
         image, K = checked_picture(image, K)
-        letterbox = Letterbox.fit((image.shape[1], image.shape[0]), self.checkpoint.input_size)
-        return self._decode(explain, image, K, letterbox)
+        window, K, _ = cut(image, K, roi)
+        boxes = letterboxes(self.checkpoint, K, window, distances)
+        return [line for box in boxes for line in self._decode(explain, window, K, box)]
+
+    def _detect(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        distances: Distances | None,
+        roi: Region | None,
+    ) -> list[Detection]:
+        """Return the network's detections, in the image's pixels."""
+        window, K_window, corner = cut(image, K, roi)
+        return merged(
+            [
+                [
+                    _in_original(one, self._cuboid_of[one.object], box, corner, K)
+                    for one in self._decode(recover, window, K_window, box)
+                ]
+                for box in letterboxes(self.checkpoint, K_window, window, distances)
+            ]
+        )
 
     def _decode(
         self,
@@ -251,13 +288,33 @@ def _checked_distortion(distortion: Coefficients) -> Coefficients:
     return coefficients
 
 
+def cut(
+    image: Picture, K: CameraMatrix, roi: Region | None
+) -> tuple[Picture, CameraMatrix, tuple[int, int]]:
+    """Return a region of an image, its K and its upper left corner, pixels."""
+    if roi is None:
+        return image, K, (0, 0)
+    height, width = image.shape[:2]
+    x, y, columns, rows = (round(one) for one in roi)
+    if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
+        allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
+        raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
+    shifted = K.copy()
+    shifted[:2, 2] -= x, y
+    return np.ascontiguousarray(image[y : y + rows, x : x + columns]), shifted, (x, y)
+
+
 def _in_original(
-    detection: Detection, cuboid: Cuboid, letterbox: Letterbox, K: CameraMatrix
+    detection: Detection,
+    cuboid: Cuboid,
+    letterbox: Letterbox,
+    corner: tuple[int, int],
+    K: CameraMatrix,
 ) -> Detection:
     """Express a detection's pixels in the original image; the pose is the same in both."""
     return replace(
         detection,
         keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
-        peaks=letterbox.original_points(detection.peaks),
+        peaks=letterbox.original_points(detection.peaks) + np.array(corner),
         reprojection_error_px=detection.reprojection_error_px / letterbox.scale_x,
     )

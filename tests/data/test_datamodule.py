@@ -1,3 +1,4 @@
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from dopepp.data.loader import EpochSampler, SampleDataset
 from dopepp.data.sources.rendered import CachedSource
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
+from dopepp.parts.part import make_part
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 
 
@@ -194,6 +196,23 @@ def test_summary_and_fingerprint(build, fake_source):
     assert build().fingerprint() == fingerprint
     assert build(seed=1).fingerprint() != fingerprint
     assert build(val=fake_source(6)).fingerprint() != fingerprint
+
+
+def test_sizes_and_distances_of_a_part_are_those_of_the_validation_images(build, fake_source):
+    part = make_part("box", None, np.array([[0.0, 0, 0], [0.1, 0.1, 0.2]]))
+    can = replace(part, name="can")
+    source = fake_source(5)
+    depths = [
+        (one.T_cam_obj @ [*part.cuboid[8], 1])[2]
+        for index in range(5)
+        for one in source.sample(index).instances
+    ]
+    sample = source.sample(0)
+    focal = math.sqrt(sample.K[0, 0] * sample.K[1, 1]) * 64 / max(sample.size)
+    (name, seen), *rest = build().seen([part, can]).items()
+    assert (name, rest) == ("box", [])
+    lengths = [focal * part.diameter / depth for depth in (max(depths), min(depths))]
+    assert seen == pytest.approx((*lengths, min(depths), max(depths)))
 
 
 def test_an_object_without_any_instance_fails_at_start(build):

@@ -27,6 +27,7 @@ from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
+from dopepp.parts.seen import Seen
 from dopepp.training.callbacks.averaging import AveragedWeights
 from dopepp.training.callbacks.throughput import RunProgress, make_profiler
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
@@ -47,11 +48,16 @@ _BF16_FLAGS: Final = frozenset({"amx_bf16", "avx512_bf16", "bf16"})
 
 
 def build_system(
-    config: RunConfig, parts: list[Part], fingerprint: str, images: Mapping[str, Any] | None = None
+    config: RunConfig,
+    parts: list[Part],
+    fingerprint: str,
+    images: Mapping[str, Any] | None = None,
+    seen: Mapping[str, Seen] | None = None,
 ) -> PoseSystem:
     """Build the network, its loss and its optimiser as the config names them.
 
-    Fingerprint and description of the data's images, by split, are kept in the checkpoint.
+    Fingerprint and description of the data's images, by split, and the sizes in which they show
+    the parts are kept in the checkpoint.
     """
     network, description = build_untrained(config, parts)
     description = replace(
@@ -63,6 +69,7 @@ def build_system(
             **({} if images is None else {"images": images}),
         },
         data_fingerprint=fingerprint,
+        seen=dict(seen or {}),
     )
     if config.init_from is not None:
         _start_from(network, Path(config.init_from))

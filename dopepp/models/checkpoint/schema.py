@@ -23,6 +23,7 @@ from dopepp.models.checkpoint.storage import check_container, read_mapping, writ
 from dopepp.models.network import PoseNetwork
 from dopepp.models.spec import architecture, build_network
 from dopepp.parts.part import Part
+from dopepp.parts.seen import Seen
 
 __all__ = ["Checkpoint", "load_network", "read", "write_atomic"]
 
@@ -59,6 +60,8 @@ class Checkpoint:
         data: The data and camera configuration it was trained on.
         data_fingerprint: Hash that changes whenever the training data would.
         metrics: Validation figures at the time of writing.
+        seen: How large and how far away the network has seen its parts, by name; none where an
+            earlier version has written it.
         format_version: Version of this schema.
     """
 
@@ -72,6 +75,7 @@ class Checkpoint:
     data: dict[str, Any] = field(default_factory=dict)
     data_fingerprint: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
+    seen: dict[str, Seen] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
 
     def to_payload(self) -> dict[str, Any]:
@@ -92,6 +96,7 @@ class Checkpoint:
                 "data": self.data,
                 "data_fingerprint": self.data_fingerprint,
                 "metrics": self.metrics,
+                "seen": self.seen,
             }
         )
         return payload
@@ -161,6 +166,7 @@ def _parse(content: Mapping[str, Any]) -> Checkpoint:
         data=_take(payload, "data", dict),
         data_fingerprint=_take(payload, "data_fingerprint", str),
         metrics=_take_numbers(payload, "metrics"),
+        seen=_parse_seen(payload.get("seen", {})),
         format_version=version,
     )
 
@@ -222,6 +228,12 @@ def _take_numbers(payload: Mapping[str, Any], name: str) -> dict[str, float]:
             got = f"{name} with {key!r:.100}: {value!r:.100}"
             raise UserError(got, "numbers by name", "train again")
     return numbers
+
+
+def _parse_seen(ranges: object) -> dict[str, Seen]:
+    if not isinstance(ranges, dict):
+        raise UserError(f"seen {ranges!r:.100}", "four numbers by name", "train again")
+    return {str(name): Seen.parse(values) for name, values in ranges.items()}
 
 
 def _parse_weights(state_dict: object) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from dopepp.models.checkpoint import storage
 from dopepp.models.checkpoint.schema import Checkpoint, load_network, read, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.part import Mesh, make_part
+from dopepp.parts.seen import Seen
 
 
 @pytest.fixture
@@ -34,6 +35,7 @@ def checkpoint(small_spec, part):
         data={"preset": "paper", "K": [[1.0, 0, 0]], "seed": 3},
         data_fingerprint="abc",
         metrics={"val/add_01d": 0.4},
+        seen={"bracket": Seen(40.0, 90.0, 0.2, 0.5)},
     )
 
 
@@ -52,7 +54,7 @@ def edited(path: Path, edit: Any) -> Path:
 
 def test_round_trip(checkpoint, saved, part):
     network, loaded = load_network(saved)
-    for name in ("spec", "input_size", "stride", "sigma", "recovery", "data", "metrics"):
+    for name in ("spec", "input_size", "stride", "sigma", "recovery", "data", "metrics", "seen"):
         assert getattr(loaded, name) == getattr(checkpoint, name)
     assert loaded.data_fingerprint == "abc"
     assert isinstance(loaded.recovery["max_instances"], int)

@@ -1,0 +1,181 @@
+"""Scales of a picture: what is looked for is shown in sizes that the network has learned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import cv2
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+from dopepp import PoseEstimator
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
+from dopepp.inference.scales import MARGIN, MAX_PIXELS, letterboxes, merged
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.seen import Seen
+from dopepp.virtual import PRESETS, Factory, render
+
+SEEN = Seen(48.0, 98.0, 0.12, 0.25)
+
+
+def picture(width, height):
+    return np.zeros((height, width, 3), np.uint8)
+
+
+def checkpoint(diameter=0.1, seen=SEEN, **others):
+    parts = [SimpleNamespace(name="part", diameter=diameter)]
+    known = {} if seen is None else {"part": seen}
+    return SimpleNamespace(parts=parts, input_size=(128, 128), seen=known, **others)
+
+
+def boxes(size, focal, distances=None, **what):
+    K = camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
+    return letterboxes(checkpoint(**what), K, picture(*size), distances)
+
+
+def test_the_camera_of_training_gets_the_size_of_training():
+    focal = 48.0 * 0.25 / 0.1
+    assert boxes((128, 128), focal) == [Letterbox.fit((128, 128), (128, 128))]
+    assert boxes((256, 256), 2 * focal) == [Letterbox.fit((256, 256), (128, 128))]
+    assert boxes((100, 128), focal) == [Letterbox.fit((100, 128), (128, 128))]
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (2592, 1944)])
+def test_a_camera_with_more_pixels_shows_the_part_as_large(size):
+    focal = 120.0 * min(size) / 128
+    (box,) = boxes(size, focal)
+    assert min(box.width, box.height) == pytest.approx(128, rel=0.03)
+    assert box.width / box.height == pytest.approx(size[0] / size[1], rel=0.02)
+
+
+def test_a_checkpoint_that_does_not_know_sizes_looks_in_that_of_its_images():
+    assert boxes((640, 480), 600.0, seen=None) == [Letterbox.fit((640, 480), (128, 128))]
+
+
+@given(
+    focal=st.floats(100, 3000),
+    near=st.floats(0.05, 2),
+    ratio=st.floats(1, 10),
+    share=st.floats(0, 1),
+)
+def test_every_distance_is_looked_at_in_a_size_that_was_learned(focal, near, ratio, share):
+    far = near * ratio
+    found = boxes((1280, 960), focal, (near, far))
+    native = 0.1 * focal / (near * ratio**share)
+    shown = [native * box.scale_x for box in found]
+    fits = any(48 / MARGIN**2 <= one <= 98 * MARGIN**2 for one in shown)
+    # Farther away than the largest picture shows.
+    too_small = native * np.sqrt(MAX_PIXELS / (1280 * 960)) < 98 * MARGIN**2
+    assert fits or too_small
+    assert all(box.width * box.height <= 1.01 * MAX_PIXELS for box in found)
+
+
+def test_anywhere_reaches_from_a_part_that_fills_the_picture_to_the_smallest():
+    found = boxes((640, 480), 600.0, "any")
+    assert found[0].scale_x * 480 <= 98 * MARGIN
+    assert found[-1].scale_x > 0.6
+    assert all(b.scale_x > a.scale_x for a, b in pairwise(found))
+
+
+@pytest.mark.parametrize("distances", [(0.5, 0.3), (0.0, 1.0), (0.1, np.inf), (0.1, 0.2, 0.3)])
+def test_distances_that_are_no_range_are_refused(distances):
+    with pytest.raises(UserError, match="distances="):
+        boxes((640, 480), 600.0, distances)
+
+
+def detection(x, score, side=20.0, name="part"):
+    corners = np.array([[x + dx, dy] for dx in (0, side) for dy in (0, side)] * 2)
+    return SimpleNamespace(object=name, score=score, keypoints=np.vstack([corners, [x + 10, 10]]))
+
+
+def test_the_best_of_all_scales_is_kept():
+    near, far = detection(0, 0.5), detection(100, 0.4)
+    better, other = detection(4, 0.9), detection(3, 0.8, name="other")
+    assert merged([[near, far], [better, other]]) == [better, other, far]
+
+
+def test_two_of_one_scale_are_two():
+    one, two = detection(0, 0.5), detection(4, 0.4)
+    assert merged([[one, two], []]) == [one, two]
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return PoseEstimator.load("pretrained/pivconnector_wide")
+
+
+@pytest.fixture(scope="module")
+def scenes(estimator):
+    preset = PRESETS["wide"].resized(*estimator.checkpoint.input_size)
+    factory = Factory([load_part("pivconnector")], preset, 771)
+    return [factory.scene(0, index) for index in range(12)]
+
+
+def through(scene, size):
+    """Return a scene as a camera of other size sees it, its shorter side as wide."""
+    scale = min(size) / 128
+    K = resize_camera(scene.K, scale, scale)
+    K[:2, 2] = (np.array(size) - 1) / 2
+    background = cv2.resize(scene.background, (max(size), max(size)))[: size[1], : size[0]]
+    return replace(scene, K=K, background=np.ascontiguousarray(background))
+
+
+def num_right(estimator, scenes):
+    part, passed = estimator.parts[0], 0
+    for scene in scenes:
+        true = scene.objects[scene.targets[0]].T_cam_obj
+        for one in estimator.predict(render(scene).image, scene.K)[:1]:
+            away = transform(one.T_cam_obj, part.points) - transform(true, part.points)
+            passed += np.linalg.norm(away, axis=1).mean() < 0.1 * part.diameter
+    return passed
+
+
+@pytest.mark.parametrize("size", [(320, 240), (480, 853), (1280, 720)])
+def test_other_cameras_find_as_much_as_that_of_training(estimator, scenes, size):
+    usual = num_right(estimator, scenes)
+    assert usual >= 5
+    assert num_right(estimator, [through(one, size) for one in scenes]) >= usual - 2
+
+
+def test_a_part_out_of_reach_is_found_where_one_looks_farther(estimator, scenes):
+    scene = through(scenes[0], (1280, 720))
+    true = scene.objects[scene.targets[0]].T_cam_obj
+    image, K = render(scene).image, scene.K
+    # A lens of a third of the angle: the same pixels are of a part three times as far away.
+    K = K * np.array([[3.0], [3.0], [1.0]])
+    K[:2, 2] = scene.K[:2, 2]
+
+    def found(distances=None):
+        depths = [one.T_cam_obj[2, 3] for one in estimator.predict(image, K, distances=distances)]
+        return bool(depths) and abs(depths[0] / (3 * true[2, 3]) - 1) < 0.15
+
+    assert not found()
+    assert found((0.4, 0.8))
+    assert found("any")
+
+
+def test_a_region_is_looked_at_as_a_picture_of_its_own(estimator, scenes):
+    image, K = render(scenes[0]).image, scenes[0].K
+    canvas = np.full((300, 400, 3), 90, np.uint8)
+    canvas[50:178, 70:198] = image
+    shifted = K.copy()
+    shifted[:2, 2] += 70, 50
+    (alone,), (found,) = (
+        estimator.predict(image, K),
+        estimator.predict(canvas, shifted, roi=(70, 50, 128, 128)),
+    )
+    assert np.allclose(found.T_cam_obj, alone.T_cam_obj)
+    for pixels in ("peaks", "keypoints"):
+        moved = getattr(alone, pixels) + np.array([70, 50])
+        assert np.allclose(getattr(found, pixels), moved, equal_nan=True)
+
+
+@pytest.mark.parametrize("roi", [(-1, 0, 10, 10), (0, 0, 200, 10), (5, 5, 0, 10)])
+def test_a_region_outside_of_the_picture_is_refused(estimator, roi):
+    with pytest.raises(UserError, match="roi"):
+        estimator.predict(picture(128, 128), camera_matrix(110, 110, 63.5, 63.5), roi=roi)
