@@ -22,7 +22,12 @@ from dopepp.models.registry import TARGET, Registry
 from dopepp.training.system import OptimizerFactory, SchedulerFactory
 
 OPTIMIZERS: Registry[Optimizer] = Registry(
-    "optimizer", Optimizer, (f"torch.optim.{name}" for name in ("Adam", "AdamW", "RMSprop", "SGD"))
+    "optimizer",
+    Optimizer,
+    (
+        "dopepp.training.optimizers.Muon",
+        *(f"torch.optim.{name}" for name in ("Adam", "AdamW", "RMSprop", "SGD")),
+    ),
 )
 SCHEDULERS: Registry[LRScheduler] = Registry(
     "scheduler",
