@@ -142,19 +142,25 @@ def measure(
             seen = [Wireframe(one.detection.keypoints, YELLOW, f"{one.identity}") for one in found]
             write_png(pictures / f"{seed}_{number:03d}.png", overlay(frame.image, [true, *seen]))
     # Steps from frame to frame over √2: a slow drift is no trembling.
-    shifts = np.array([after[:3, 3] - before[:3, 3] for before, after in pairwise(resting)])
+    shifts = [float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
+              for before, after in pairwise(resting)]  # fmt: skip
     turns = [float(rotation_angle(after[:3, :3] @ before[:3, :3].T))
              for before, after in pairwise(resting)]  # fmt: skip
     return [
         str(seed),
         f"{np.mean(right):.1%}",
-        f"{1e3 * math.sqrt(float((shifts**2).sum(axis=1).mean()) / 2):.2f}",
-        f"{math.degrees(math.sqrt(float(np.mean(np.square(turns))) / 2)):.2f}",
+        f"{1e3 * _trembling(shifts):.2f}",
+        f"{math.degrees(_trembling(turns)):.2f}",
         "never" if recovery is None else str(recovery),
         f"{1e3 / np.mean(times[1:]):.0f}",
         f"{np.median(times):.1f}",
         f"{np.percentile(times, 95):.1f}",
     ]
+
+
+def _trembling(steps: list[float]) -> float:
+    """Return the root mean square of what one frame adds to a step; NaN where there is none."""
+    return math.sqrt(sum(one**2 for one in steps) / len(steps) / 2) if steps else math.nan
 
 
 def main() -> None:

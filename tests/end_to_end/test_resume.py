@@ -78,7 +78,7 @@ def test_an_interrupted_run_ends_as_a_whole_one(call, find_run, tiny, tmp_path, 
     call("train.py", f"resume={run}", code=0)
     whole, resumed = (rows(folder) for folder in (find_run(tmp_path / "whole"), run))
     assert [row["step"] for row in resumed] == ["0", "1", "2", "3"]
-    for name in ("epoch", "train/loss", "val/loss", "lr-AdamW"):
+    for name in ("epoch", "train/loss", "val/loss", "lr-Muon"):
         values = [[float(row[name] or "nan") for row in table] for table in (whole, resumed)]
         assert values[1] == pytest.approx(values[0], rel=1e-4, nan_ok=True), name
     ends = [json.loads((folder / "metrics.json").read_text())["objects"]

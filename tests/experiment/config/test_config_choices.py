@@ -109,7 +109,7 @@ def test_every_model_choice_trains_one_step(choice, tiny):
     optimizer.step()
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "sgd"])
+@pytest.mark.parametrize("name", ["adam", "adamw", "muon", "sgd"])
 @pytest.mark.parametrize("schedule", ["constant", "cosine", "onecycle"])
 def test_every_optimizer_takes_every_schedule_to_its_end(name, schedule, tiny):
     config = tiny(f"optimizer={name}", f"scheduler={schedule}", "optimizer.lr=0.01")

@@ -155,9 +155,7 @@ def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resume
     assert "init_from=" in error.value.fix
     with pytest.raises(UserError, match="the number of objects"):
         resumed(f"resume_anyway={anyway}", spec="b")
-    with pytest.raises(
-        UserError, match=r"another optimiser \(optimizer\._target_: .*AdamW → .*SGD"
-    ):
+    with pytest.raises(UserError, match=r"another optimiser \(optimizer\._target_: .*Muon → .*SGD"):
         resumed("optimizer=sgd", f"resume_anyway={anyway}")
 
 
