@@ -3,8 +3,8 @@
 import hydra
 from omegaconf import DictConfig
 
-from dopepp.experiment.command_line import entry, run_job
-from dopepp.experiment.reports.protocols import SHORT_NAMES
+from dopepp.experiment.command_line import SHORT_NAMES, entry, run_job
+from dopepp.experiment.reports import protocols
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
@@ -16,4 +16,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    entry(main, open_nodes=["data", "virtual"], short_names=SHORT_NAMES)
+    entry(main, ["data", "virtual"], {**SHORT_NAMES, **protocols.SHORT_NAMES})

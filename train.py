@@ -3,7 +3,7 @@
 import hydra
 from omegaconf import DictConfig
 
-from dopepp.experiment.command_line import entry, run_job
+from dopepp.experiment.command_line import SHORT_NAMES, entry, run_job
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
@@ -15,4 +15,4 @@ def main(config: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
-    entry(main, open_nodes=["virtual.scene"])
+    entry(main, open_nodes=["virtual.scene"], short_names=SHORT_NAMES)

@@ -13,7 +13,8 @@ import typer.main
 import yaml
 
 from dopepp.cli import app
-from dopepp.experiment.reports.protocols import SHORT_NAMES
+from dopepp.experiment.command_line import SHORT_NAMES
+from dopepp.experiment.reports import protocols
 from dopepp.virtual.presets.preset import PRESETS
 
 ROOT: Final = Path(__file__).parents[1]
@@ -155,9 +156,9 @@ def test_options_of_training_and_evaluation_exist(path):
             overrides = [word for word in words if re.match(r"[\w./]+(=|$)", word)]
         else:
             continue
-        if words[1:2] == ["evaluate.py"]:
-            overrides = [re.sub(r"^\w+", lambda key: SHORT_NAMES.get(key[0], key[0]), one)
-                         for one in overrides]  # fmt: skip
+        short = SHORT_NAMES | (protocols.SHORT_NAMES if words[1:2] == ["evaluate.py"] else {})
+        overrides = [re.sub(r"^\w+", lambda key, short=short: short.get(key[0], key[0]), one)
+                     for one in overrides]  # fmt: skip
         problems = [problem for one in overrides if (problem := option_problem(one))]
         # A guide may tell its reader to write the file.
         bad += [problem for problem in problems if f"`{problem.removeprefix('no ')}`" not in text]

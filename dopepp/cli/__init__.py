@@ -56,4 +56,4 @@ def _configure() -> None:
 
 
 for _command in COMMANDS:
-    app.command()(_command)
+    app.command(cls=render.RenderCommand if _command is render.render else None)(_command)

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from dopepp.cli.errors import resumable
+
+
+class RenderCommand(TyperCommand):
+    """Names every preset in its help; they are read only for it."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help."""
+        from dopepp.virtual.presets.preset import PRESETS
+
+        (preset,) = (one for one in self.params if one.name == "preset")
+        preset.help = ", ".join(PRESETS)  # type: ignore[attr-defined]
+        super().format_help(ctx, formatter)
 
 
 def render(
@@ -21,9 +34,20 @@ def render(
     num: Annotated[int | None, typer.Option("-n", help="number of images")] = None,
     unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
     layout: Annotated[str, typer.Option("--format", help="bop, ndds or webdataset")] = "bop",
-    preset: Annotated[str, typer.Option(help="paper, bin, table, quickstart or ycb")] = "paper",
+    preset: Annotated[str, typer.Option(help="what the scenes are like")] = "paper",
     size: Annotated[
-        str | None, typer.Option(help="WIDTHxHEIGHT (or W,H), pixels; the preset's if left out")
+        str | None,
+        typer.Option(
+            help="WIDTHxHEIGHT (or W,H), pixels; the field of view along the shorter side stays, "
+            "and pixels are square; the preset's if left out"
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="file of the camera whose pictures these are (ROS, OpenCV, BOP, …)"),
+    ] = None,
+    working_distance: Annotated[
+        str | None, typer.Option(help="NEAREST,FARTHEST of the parts from --camera, metres")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="processes; all cores of this process if left out")
@@ -62,6 +86,7 @@ def render(
         job = make_job(
             parts, unit=unit, preset=preset, changes=changes or (), size=size, seed=seed,
             backgrounds=backgrounds, negatives=negatives or (), renderer=renderer, layout=layout,
+            camera=camera, working_distance=working_distance,
         )  # fmt: skip
         if preview:
             from dopepp.data.jobs.preview import write_preview  # fonts and drawing take a second

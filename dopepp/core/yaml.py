@@ -1,4 +1,4 @@
-"""Strict YAML: what a run folder holds, which anybody may have written, read within bounds.
+"""Strict YAML: what anybody may have written (a run folder, a camera file), read within bounds.
 
 ``yaml.safe_load`` runs no code, but follows anchors to a list that stands for gigabytes and dies
 of deep nesting; here each of these is a :class:`~dopepp.core.errors.UserError`.
@@ -29,14 +29,20 @@ def read_yaml(path: Path) -> object:
         if path.stat().st_size > MAX_BYTES:
             raise _bad(path, f"of {path.stat().st_size} bytes")
         text = path.read_text(encoding="utf-8")
-        _check_events(text)
-        return yaml.safe_load(text)
     except OSError as error:
         raise _bad(path, f"unreadable: {error.strerror}") from error
-    except UserError:
-        raise
-    except (ValueError, yaml.YAMLError) as error:
+    except UnicodeDecodeError as error:
         raise _bad(path, f"unreadable: {error!s:.200}") from error
+    return parse_yaml(text, path)
+
+
+def parse_yaml(text: str, where: Path | str) -> object:
+    """Parse YAML text of a size its caller bounds; a :class:`UserError` as from `read_yaml`."""
+    try:
+        _check_events(text)
+        return yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError) as error:
+        raise _bad(where, f"unreadable: {error!s:.200}") from error
 
 
 def _check_events(text: str) -> None:
@@ -56,9 +62,9 @@ def _check_events(text: str) -> None:
             raise ValueError(f"the tag {event.tag!r:.80}")
 
 
-def _bad(path: Path, got: str) -> UserError:
+def _bad(where: Path | str, got: str) -> UserError:
     return UserError(
-        f"{path}, {got}",
+        f"{where}, {got}",
         f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags",
-        "use a run folder that you trust, or restore the file",
+        "use a file that you trust, or restore it",
     )

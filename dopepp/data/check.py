@@ -8,17 +8,21 @@ against the images. To add a layout, write ``check_NAME(report)`` in ``check.py`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.bop.check import check_bop, scene_folders
 from dopepp.data.formats.ndds.check import check_ndds
 from dopepp.data.formats.ndds.files import OBJECT_SETTINGS, find_items
 from dopepp.data.formats.problems import CheckReport
 from dopepp.data.formats.webdataset.check import check_webdataset, shard_paths
 from dopepp.data.formats.ycb_video.check import check_ycb
+
+_LISTED: Final = 8
+"""Data sets of a parent folder, at most."""
 
 LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], None]]]] = {
     "YCB-Video": (lambda root: all((root / n).is_dir() for n in ("image_sets", "data")), check_ycb),
@@ -41,9 +45,38 @@ def check_dataset(root: Path) -> CheckReport:
     )
     if not root.is_dir():
         raise UserError(f"{root}, which is no folder", known, "give the data set's folder")
-    for layout, (is_layout, check) in LAYOUTS.items():
-        if is_layout(root):
-            report = CheckReport(root, layout)
-            check(report)
-            return report
-    raise UserError(f"{root}, a folder of no known layout", known, "give the data set's folder")
+    layout = _layout_of(root)
+    if layout in (None, "NDDS"):  # which takes annotations anywhere below
+        _refuse_parent(root, layout)
+    if layout is None:
+        raise UserError(f"{root}, a folder of no known layout", known, "give the data set's folder")
+    report = CheckReport(root, layout)
+    LAYOUTS[layout][1](report)
+    return report
+
+
+def _layout_of(root: Path) -> str | None:
+    return next((name for name, (is_layout, _) in LAYOUTS.items() if is_layout(root)), None)
+
+
+def _refuse_parent(root: Path, layout: str | None) -> None:
+    """Refuse a folder that holds data sets and is none itself.
+
+    FAT's folders of scenes are one data set; those that render jobs wrote are one each.
+    """
+    if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
+        return
+    found = {path.name: name for path in _visible(root) if (name := _layout_of(path)) is not None}
+    own = [name for name in found if found[name] != "NDDS" or (root / name / RECORD_FILE).is_file()]
+    if not own and (layout is not None or not found):
+        return
+    listed = [f"{name} ({found[name]})" for name in sorted(found)]
+    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    raise UserError(
+        f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}",
+        "one data set", f"check one of them, e.g. dopepp check {root / sorted(found)[0]}",
+    )  # fmt: skip
+
+
+def _visible(root: Path) -> Iterator[Path]:
+    return (path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))

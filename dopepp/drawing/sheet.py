@@ -61,16 +61,19 @@ def _draw_tile(tile: Tile, width: int) -> Picture:
     height = max(1, round(tile.image.shape[0] * scale))
     # Averaging is right for shrinking, cubic for enlarging.
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    picture = cv2.resize(tile.image, (width, height), interpolation=method)
-    if not tile.caption:
-        return np.asarray(picture, np.uint8)
+    picture = np.asarray(cv2.resize(tile.image, (width, height), interpolation=method), np.uint8)
+    return np.concatenate([picture, text_line(tile.caption, width)]) if tile.caption else picture
+
+
+def text_line(text: str, width: int) -> Picture:
+    """Return one line of black text on a white strip of a width in pixels, shrunk to fit."""
     # Glyphs are hinted, so their width does not follow the size exactly: try, largest first.
-    lines = (text_coverage(tile.caption, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
-    smallest = text_coverage(tile.caption, _MIN_CAPTION_PX)
+    lines = (text_coverage(text, px) for px in range(_CAPTION_PX, _MIN_CAPTION_PX, -1))
+    smallest = text_coverage(text, _MIN_CAPTION_PX)
     coverage = next((line for line in lines if line.shape[1] <= width), smallest)[:, :width, None]
     strip = np.full((_CAPTION_PX, width, 3), 255, np.uint8)
     strip[: coverage.shape[0], : coverage.shape[1]] = np.rint(255 * (1 - coverage))
-    return np.concatenate([picture, strip])
+    return strip
 
 
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:

@@ -38,6 +38,13 @@ _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
 
+SHORT_NAMES: Final = {
+    "camera": "virtual.camera",
+    "working_distance": "virtual.working_distance",
+    "max_tilt_deg": "virtual.scene.turning.tilt_deg",
+}
+"""What options of how a part is seen are called on the command line, and where they stand."""
+
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
 

@@ -27,6 +27,7 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
+from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
@@ -148,6 +149,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
     torch.manual_seed(config.seed)
     has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
     parts = build_parts(config.data)
+    config = fitted_to_camera(config, parts)
     network, description = build_untrained(config, parts)
     parameters, gmacs = network_cost(network, description.input_size)
     source = held_out_source(config.data, parts, "test")

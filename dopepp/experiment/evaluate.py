@@ -15,7 +15,12 @@ from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, held_out_source
+from dopepp.experiment.build.sources import (
+    build_parts,
+    build_scaled_test_source,
+    held_out_source,
+    share_in_words,
+)
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports import conditions, evaluators
@@ -228,6 +233,9 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     record.write_config(run_dir, asked.plain)
     record.write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
     parts = parts_of(loaded, data)
+    share = share_in_words(data)
+    if share is not None:
+        display.console.print(share)
     if own is not None:
         warn_of_other_images(own, data, parts)
     if asked.tune:

@@ -23,6 +23,7 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
+from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
@@ -73,6 +74,7 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
         )
     seed_everything(config.seed, verbose=False)
     parts = build_parts(config.data)
+    config = fitted_to_camera(config, parts)
     datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
     short = _short_training(config)

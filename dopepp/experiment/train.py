@@ -22,6 +22,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.sources import build_datamodule, build_parts
 from dopepp.experiment.build.system import (
     build_system,
@@ -124,6 +125,7 @@ def _train(
     keep_freed_memory()
     display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
     parts = build_parts(config.data)
+    config = fitted_to_camera(config, parts)
     datamodule = build_datamodule(config.data, parts, config.seed)
     datamodule.check_objects()
     if config.protocols.shading:

@@ -154,6 +154,22 @@ class Letterbox:
         return resize_points(points_px, 1 / self.scale_x, 1 / self.scale_y)
 
 
+def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
+    """Return K as float64; a :class:`UserError` where it is no finite pinhole matrix."""
+    try:
+        matrix = np.array(K, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not _is_pinhole(matrix):
+        raise UserError(
+            f"K {K!r:.200} of {source}",
+            "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
+            "pass the camera's own K",
+        )
+    # What is 0 or 1 but for a file's digits is made exactly so.
+    return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+
+
 def check_camera(K: CameraMatrix, image_size: tuple[int, int], source: str) -> CameraMatrix:
     """Return K as float64 after checking that it can belong to an image of (width, height).
 
@@ -161,15 +177,7 @@ def check_camera(K: CameraMatrix, image_size: tuple[int, int], source: str) -> C
     image, or its focal length gives a field of view outside 5° – 150°.
     """
     width, height = image_size
-    pinhole = "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-    try:
-        matrix = np.array(K, np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not _is_pinhole(matrix):
-        raise UserError(f"K {K!r:.200} of {source}", pinhole, "pass the camera's own K")
-    # What is 0 or 1 but for a file's digits is made exactly so.
-    K = camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    K = pinhole_matrix(K, source)
     fits = 0 <= K[0, 2] < width and 0 <= K[1, 2] < height
     # 5° and 150° of view are focal lengths of 11.5 and 0.13 image widths.
     longest = max(width, height)

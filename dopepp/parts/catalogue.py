@@ -25,6 +25,7 @@ from dopepp.core.errors import UserError
 from dopepp.parts.mesh.measure import weld
 from dopepp.parts.mesh.read import READERS, read_in_unit
 from dopepp.parts.part import Mesh, Part, make_part
+from dopepp.parts.wording import is_plausible, part_in_words
 
 _log = logging.getLogger(__name__)
 
@@ -98,8 +99,9 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
     ``unit`` is the file's; None takes the one it has by its format, or millimetres, which the log
-    says. A built-in part has its size without it, so that one unit can go with a list of files and
-    built-in parts. A UserError: there is no such part or file, or the file cannot be used (see
+    says. It says what size the part has, too, and warns where that is unlikely. A built-in part has
+    its size without it, so that one unit can go with a list of files and built-in parts. A
+    UserError: there is no such part or file, or the file cannot be used (see
     :func:`~dopepp.parts.mesh.read.read_mesh`).
     """
     text = str(path_or_name)
@@ -113,7 +115,9 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
             "check the spelling",
         )
     mesh, taken = read_in_unit(path, unit)
-    return make_part(path.stem, mesh, unit=taken)
+    part = replace(make_part(path.stem, mesh, unit=taken), unit=taken)
+    _log.log(logging.INFO if is_plausible(part) else logging.WARNING, "%s", part_in_words(part))
+    return part
 
 
 def with_meshes(

@@ -77,6 +77,7 @@ class Part:
         symmetries_discrete: BOP-style rigid transforms that map the part onto itself, without the
             identity, shape (S, 4, 4).
         symmetries_continuous: BOP-style axes of rotational symmetry as (axis, offset) pairs.
+        unit: The unit that its own file was read in; empty for all other parts.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Part:
     mesh_hash: str = ""
     symmetries_discrete: Float[np.ndarray, "symmetries 4 4"] | None = None
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = ()
+    unit: str = ""
 
     @cached_property
     def light_mesh(self) -> tuple[Mesh, float] | None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from dopepp.cli import app
 from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
 from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual.presets.preset import PRESETS
 
 K = ["--K", "100", "100", "31.5", "31.5"]
 RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]
@@ -144,6 +146,58 @@ def test_render_writes_goes_on_and_says_so(tmp_path):
     assert done.stdout.startswith("1 of 2 images rendered in ")
     assert "CPU-ms an image" in done.stdout
     assert len(list(tmp_path.glob("0*.json"))) == 2
+
+
+def test_the_help_names_every_preset():
+    text = " ".join(call("render", "--help").stdout.replace("│", " ").split())
+    assert ", ".join(PRESETS) in text
+
+
+CAMERA = """image_width: 1280
+image_height: 720
+camera_matrix: {rows: 3, cols: 3, data: [931.2, 0, 640, 0, 931.2, 360, 0, 0, 1]}
+"""
+
+
+def test_render_shows_a_users_camera(tmp_path, caplog):
+    camera, out = tmp_path / "cam.yaml", tmp_path / "out"
+    camera.write_text(CAMERA)
+    with caplog.at_level(logging.INFO):
+        done = call(
+            "render", "servoholder", "--preset", "wide", "--camera", camera, "--format", "ndds",
+            "--working-distance", "0.4,0.7", "--workers", "1", "-n", "1", "--out", out,
+        )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert cv2.imread(str(out / "000000.png")).shape == (720, 1280, 3)
+    intrinsics = json.loads((out / "000000.json").read_text())["camera_data"]["intrinsics"]
+    assert (intrinsics["fx"], intrinsics["cy"]) == (931.2, 360)
+    assert "cam.yaml: 1280×720 pixels, 69° × 42°, parts at 0.4 – 0.7 m" in caplog.text
+    assert "servoholder: 139 – 244 pixels across; a pixel is 0.43 mm" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--camera", "{camera}"], "got --camera alone; allowed: both"),
+        (["--working-distance", "0.3,0.8"], "got --working-distance alone"),
+        (["--camera", "{camera}", "--working-distance", "0.8,0.3"], "got working_distance=[0.8, 0"),
+        (["--camera", "{camera}", "--working-distance", "near"], "got --working-distance near; al"),
+        (
+            ["--camera", "{camera}", "--working-distance", "0.05,1"],
+            "got working_distance from 0.05",
+        ),
+        (
+            ["--camera", "{camera}", "--working-distance", "0.5,9"],
+            "got working_distance to 9 m, wh",
+        ),
+        (["--camera", "/nowhere", "--working-distance", "0.5,1"], "got camera file /nowhere: No"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_one_line(arguments, message, tmp_path):
+    (tmp_path / "cam.yaml").write_text(CAMERA)
+    given = [text.format(camera=tmp_path / "cam.yaml") for text in arguments]
+    line = refused("render", "servoholder", "--out", tmp_path / "out", "-n", "1", *given)
+    assert line.startswith(message)
 
 
 def test_render_previews_and_stops(tmp_path):

@@ -29,6 +29,10 @@ T = TypeVar("T")
 STAGING: Final = ".items"
 """Folder of staged items; readers pass over hidden names."""
 
+RECORD_FILE: Final = "_dopepp_render.json"
+"""A render job's record in its folder. The underscore is NDDS's mark of a settings file: without
+it, readers of that layout would take the record for an image's annotation."""
+
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,13 +26,16 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned, partial_path, write_whole
 from dopepp.core.interrupts import NO_SPACE, stopped
 from dopepp.core.json import read_json
-from dopepp.data.formats import Writer
+from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.mesh.read import ASSUMED_UNIT
 from dopepp.parts.part import Part, check_name
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import customised_preset
+from dopepp.virtual.presets.preset import Preset, customised_preset
+from dopepp.virtual.presets.view import View, read_lens
+
+_log = logging.getLogger(__name__)
 
 WRITERS: Final = {
     "bop": ("dopepp.data.formats.bop.writer", "BopWriter"),
@@ -80,6 +84,8 @@ def make_job(
     negatives: Sequence[str] = (),
     renderer: str = "raster",
     layout: str = "bop",
+    camera: str | Path | None = None,
+    working_distance: str | None = None,
 ) -> Job:
     """Make a job from what a user writes; a UserError tells what of it cannot be used.
 
@@ -88,18 +94,24 @@ def make_job(
         unit: The mesh files' unit; None for the assumed one.
         preset: Name of a preset.
         changes: ``field.field=value``, the value as YAML.
-        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels; None for the preset's own.
+        size: ``WIDTHxHEIGHT`` or ``WIDTH,HEIGHT`` in pixels, as :meth:`Preset.reframed` takes it;
+            None for the preset's own.
         seed: Of the whole job.
         backgrounds: As :func:`~dopepp.virtual.backgrounds.find_backgrounds` takes it.
         negatives: Parts among the distractors, written as ``parts``.
         renderer: Name of a renderer.
         layout: Key of :data:`WRITERS`.
+        camera: File of the camera whose pictures are rendered; None for the preset's own camera.
+        working_distance: ``NEAREST,FARTHEST`` of the parts from this camera, metres.
     """
     _find_writer(layout)
     scenes = customised_preset(preset, _nested(changes))
+    targets = [named_part(text, unit) for text in parts]
+    if camera is not None or working_distance is not None:
+        scenes = _in_camera(scenes, targets, camera, working_distance)
     factory = Factory(
-        [named_part(text, unit) for text in parts],
-        scenes if size is None else scenes.resized(*_sides(size)),
+        targets,
+        scenes if size is None else scenes.reframed(*_sides(size)),
         seed,
         find_backgrounds(backgrounds),
         renderer=renderer,
@@ -136,6 +148,27 @@ def named_part(text: str, unit: str | None) -> Part:
     if match is None:
         return load_part(text, unit)
     return replace(load_part(match[2], unit), name=check_name(match[1]))
+
+
+def _in_camera(
+    scenes: Preset, parts: Sequence[Part], path: str | Path | None, distance: str | None
+) -> Preset:
+    """Return the scenes in a camera's whole pictures, and tell how large the parts are there."""
+    if path is None or distance is None:
+        missing = "--camera FILE" if path is None else "--working-distance 0.3,0.8"
+        given = "--working-distance" if path is None else "--camera"
+        raise UserError(f"{given} alone", "both, or none of the two", f"add {missing}")
+    try:
+        nearest, farthest = (float(end) for end in distance.strip("[]").split(","))
+    except ValueError as error:
+        allowed = "NEAREST,FARTHEST in metres, e.g. 0.3,0.8"
+        fix = "change --working-distance"
+        raise UserError(f"--working-distance {distance:.100}", allowed, fix) from error
+    view = View(*read_lens(path), (nearest, farthest), str(path))
+    view.check(parts)
+    for line in view.in_words(parts):
+        _log.info("%s", line)
+    return view.whole(scenes, view.scale_for(parts))
 
 
 def _sides(size: str) -> tuple[int, int]:
@@ -193,10 +226,6 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     return value
 
-
-RECORD_FILE: Final = "_dopepp_render.json"
-"""The underscore is NDDS's mark of a settings file: without it, readers of that layout would take
-the record for an image's annotation."""
 
 _MAX_RECORD_BYTES: Final = 4_000_000
 """Some 10,000 parts."""

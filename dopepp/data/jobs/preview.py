@@ -16,8 +16,17 @@ from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import COLOURS, Tile, contact_sheet, depth_panel, draw_axes, mask_panel
+from dopepp.drawing.sheet import (
+    COLOURS,
+    Tile,
+    contact_sheet,
+    depth_panel,
+    draw_axes,
+    mask_panel,
+    text_line,
+)
 from dopepp.geometry.camera import project, resize_points, transform
+from dopepp.parts.wording import part_in_words
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 
@@ -50,11 +59,16 @@ def write_preview(job: Job, out: Path) -> Path:
 
 
 def preview_sheet(factory: Factory, num_scenes: int = NUM_SCENES) -> Picture:
-    """Render a job's first images and draw, in a row each, the image and its labels."""
+    """Render a job's first images and draw, in a row each, the image and its labels.
+
+    Above them stands what each part is: its size and how many bodies it has.
+    """
     tiles: list[Tile] = []
     for index in range(num_scenes):
         tiles += scene_tiles(factory.render(0, index), f"image {index}")
-    return contact_sheet(tiles, columns=_PANELS)
+    sheet = contact_sheet(tiles, columns=_PANELS)
+    lines = [text_line(part_in_words(part), sheet.shape[1]) for part in factory.parts]
+    return np.concatenate([*lines, sheet])
 
 
 def scene_tiles(rendered: Rendered, name: str) -> Iterator[Tile]:

@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats import Writer
-from dopepp.data.jobs.job import RECORD_FILE, Job, is_begun
+from dopepp.data.formats import RECORD_FILE, Writer
+from dopepp.data.jobs.job import Job, is_begun
 from dopepp.data.sources.rendered import rendered_sample
 from dopepp.virtual.factory import Factory
 

@@ -82,8 +82,13 @@ class RenderedSource:
             "parts": {part.name: part.mesh_hash for part in self.factory.parts},
             "negatives": {part.name: part.mesh_hash for part in self.factory.negatives},
         }
-        if self.scale != 1:  # what was rendered before there were scales keeps its identity
+        # What was rendered before there were these keeps its identity.
+        if self.scale != 1:
             identity["scale"] = self.scale
+        for name in ("window", "depths"):
+            value = getattr(self.factory.preset, name)
+            if value is not None:
+                identity[name] = list(value)
         return [SourceInfo(self.name, self._num_items, identity)]
 
 

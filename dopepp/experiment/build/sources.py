@@ -95,10 +95,10 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
     backgrounds = find_backgrounds(data.virtual.backgrounds)
     return PoseDataModule(
         train=_train_source(data, parts, seed, backgrounds),
-        val=held_out_source(data, parts, "val"),
+        val=_validation_source(data, parts),
         test=held_out_source(data, parts, "test"),
         object_names=[part.name for part in parts],
-        input_size=data.input_size,
+        input_size=data.network_input,
         batch_size=data.batch_size,
         num_workers=available_cores() if data.num_workers is None else data.num_workers,
         seed=seed,
@@ -106,6 +106,17 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
         augment=build_optional(AUGMENTATIONS, data.augment),
         backgrounds=backgrounds,
     )
+
+
+def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
+    """Build the validation images as the network sees them while it trains.
+
+    In a camera of its own, these are windows; all others who measure take the whole pictures.
+    """
+    if data.virtual.view is None or not data.is_rendered("val"):
+        return held_out_source(data, parts, "val")
+    factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
+    return RenderedSource(factory, data.num_val, "val")
 
 
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
@@ -145,7 +156,9 @@ def _train_source(
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
-        real = kept(labelled_images(data, parts, seed, "train"), data, data.cache, data.input_size)
+        real = kept(
+            labelled_images(data, parts, seed, "train"), data, data.cache, data.network_input
+        )
     elif data.real_fraction > 0:
         if data.real_fraction == 1:
             raise UserError(
@@ -239,12 +252,26 @@ FORMATS: Final[dict[str, Opener]] = {
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
     """Render at the size the network sees, which costs a fraction of the native one."""
-    preset = choose_preset(data)
-    box = Letterbox.fit((preset.width, preset.height), data.input_size)
-    small = preset.resized(box.width, box.height)
-    factory = _factory(data, parts, small, seed, data.virtual.renderer)
+    factory = _factory(data, parts, seen_preset(data), seed, data.virtual.renderer)
     source = RenderedSource(factory, data.samples_per_epoch)
-    return kept(source, data, data.cache, data.input_size)
+    return kept(source, data, data.cache, data.network_input)
+
+
+def share_in_words(data: DataConfig) -> str | None:
+    """Say it where the test is only a share of the images in its folder; None where it is all."""
+    if data.is_rendered("test") or data.format == "ycb_video":
+        return None
+    first, last = share_of(data.image_sets, "test")
+    if last - first == 1:
+        return None
+    folder = data.image_sets["test"]
+    sharing = [name for name in ("train", "val") if data.image_sets[name] == folder]
+    all_of_it = " ".join(f"data.image_sets.{name}=none" for name in sharing)
+    return (
+        f"measured is the last {last - first:.0%} of the images in {folder}, because "
+        f"data.image_sets names it for {' and '.join(sharing)} as well: {all_of_it} measures all "
+        "of it, training images included, and data.image_sets.test=FOLDER another one"
+    )
 
 
 def held_out_renders(
@@ -273,7 +300,21 @@ def kept(
 
 
 def choose_preset(data: DataConfig) -> Preset:
-    """Return the preset with the config's changes."""
+    """Return the preset with the config's changes, at the size of a camera's whole pictures."""
+    preset, view = _customised(data), data.virtual.view
+    return preset if view is None else view.whole(preset, data.virtual.camera_scale or 1.0)
+
+
+def seen_preset(data: DataConfig) -> Preset:
+    """Return the same scenes as the network sees them: resized, or in windows of such pictures."""
+    preset, view = _customised(data), data.virtual.view
+    if view is not None:
+        return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
+    box = Letterbox.fit((preset.width, preset.height), data.network_input)
+    return preset.resized(box.width, box.height)
+
+
+def _customised(data: DataConfig) -> Preset:
     name = data.virtual.preset or ("paper" if data.root is None else "ycb")
     return customised_preset(name, data.virtual.scene or {})
 

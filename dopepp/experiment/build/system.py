@@ -103,7 +103,7 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
     network = build_network(spec)
     sigma = config.maps.sigma
     recovery = vars(parse_recovery({"sigma": sigma, **config.recovery}))
-    size = config.data.input_size
+    size = config.data.network_input
     return network, Checkpoint(spec, {}, parts, size, network.stride, sigma, recovery)
 
 

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Final, Literal
 from dopepp.core.errors import UserError
 from dopepp.data.sources.rendered import MAX_ITEMS, Split
 from dopepp.experiment.config.parse import Node, Range, Seed, Share, parse
+from dopepp.geometry.camera import camera_matrix
+from dopepp.virtual.presets.view import View, read_lens
 
 Cache = Literal["none", "memory", "disk"]
 Count = Annotated[int, Range(1, MAX_ITEMS)]
@@ -27,6 +29,21 @@ _CLOSED: Final = ("data.masking", "data.augment", "data.image_sets")
 """Nodes of an evaluation's data in which every option that can be changed is there already."""
 
 
+Side = Annotated[int, Range(8, 16384)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensConfig:
+    """A camera's picture size and camera matrix, pixels, as its file states them."""
+
+    width: Side
+    height: Side
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class VirtualConfig:
     """How renders are made: the node ``virtual``.
@@ -38,6 +55,10 @@ class VirtualConfig:
         backgrounds: Folder of photos, ``skimage`` for its own photos; None for procedural pictures.
         negatives: Parts that are shown but must not be found: built-in names or mesh files.
         renderer: ``raster``, or ``photoreal``.
+        camera: That the parts are to be found with; a file is read once, and its numbers stand in
+            its place. None takes the preset's.
+        working_distance: Of the parts from this camera, nearest and farthest, metres.
+        camera_scale: By how much the network sees its pictures scaled; None chooses.
     """
 
     preset: str | None = None
@@ -45,6 +66,25 @@ class VirtualConfig:
     backgrounds: str | None = None
     negatives: tuple[str, ...] = ()
     renderer: str = "raster"
+    camera: LensConfig | None = None
+    working_distance: tuple[float, ...] | None = None
+    camera_scale: Annotated[float, Range(0.01, 1.0)] | None = None
+
+    @property
+    def view(self) -> View | None:
+        """The camera at its working distance; None where the preset's camera is taken.
+
+        A :class:`UserError`: one of the two is missing, or wrong.
+        """
+        if self.camera is None and self.working_distance is None:
+            return None
+        if self.camera is None or self.working_distance is None:
+            missing = "camera=FILE" if self.camera is None else "working_distance=[0.3,0.8]"
+            given = "working_distance" if self.camera is None else "camera"
+            raise UserError(f"{given} alone", "both, or none of the two", f"add {missing}")
+        lens = self.camera
+        K = camera_matrix(lens.fx, lens.fy, lens.cx, lens.cy)
+        return View((lens.width, lens.height), K, self.working_distance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +133,8 @@ class DataConfig:
         num_test: Rendered test images.
         eval_seed: Of validation and test renders and of shading's patches, so that trainings of
             several seeds are measured on the same images.
-        input_size: The network's input (width, height), pixels, multiples of 32.
+        input_size: The network's input (width, height), pixels, multiples of 32; None chooses it
+            for ``virtual.camera``.
         batch_size: Images in a step, of each process.
         num_workers: Processes that load; None takes one a core.
     """
@@ -122,7 +163,7 @@ class DataConfig:
     num_val: Count
     num_test: Count
     eval_seed: Seed
-    input_size: tuple[int, int]
+    input_size: tuple[int, int] | None
     batch_size: Count
     num_workers: Annotated[int, Range(0, MAX_WORKERS)] | None
 
@@ -136,7 +177,19 @@ class DataConfig:
         if isinstance(data, Mapping):
             _check_size(data.get("input_size"))
             data = _without_copy(data, virtual)
-        return parse(cls, data, "data", virtual=parse(VirtualConfig, virtual or {}, "virtual"))
+        how = parse(VirtualConfig, with_lens(virtual or {}), "virtual")
+        return parse(cls, data, "data", virtual=how)
+
+    @property
+    def network_input(self) -> tuple[int, int]:
+        """``input_size``, a :class:`UserError` where it is not known."""
+        if self.input_size is None:
+            raise UserError(
+                "no data.input_size and no camera to choose it for",
+                "camera=FILE working_distance=[0.3,0.8], or data.input_size=[width,height]",
+                "add the camera's file and the distances at which it will see the part, metres",
+            )
+        return self.input_size
 
     def is_rendered(self, split: Split) -> bool:
         """Tell whether a held-out split's images are renders."""
@@ -183,7 +236,19 @@ def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
     return {"eval_seed": description.get("seed", 0), **config}
 
 
+def with_lens(virtual: object) -> object:
+    """Return the node ``virtual`` with the numbers of its camera's file in place of the path."""
+    if not isinstance(virtual, Mapping) or not isinstance(virtual.get("camera"), str):
+        return virtual
+    (width, height), K = read_lens(virtual["camera"])
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    lens = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    return {**virtual, "camera": lens}
+
+
 def _check_size(size: object) -> None:
+    if size is None:
+        return
     sides = size if isinstance(size, list) and len(size) == 2 else [0]
     if not all(type(side) is int and side > 0 and side % _MULTIPLE == 0 for side in sides):
         raise UserError(
@@ -208,8 +273,8 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
             raise UserError(
                 f"{source}, which does not say how to render", "virtual=default", "add it"
             )
-        return parse(VirtualConfig, _changed(stored, given, "virtual"), "virtual")
-    return parse(VirtualConfig, given, "virtual")
+        given = _changed(stored, given, "virtual")
+    return parse(VirtualConfig, with_lens(given), "virtual")
 
 
 def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.data import DataConfig, with_lens
 from dopepp.experiment.config.parse import Node, Range, Seed, parse, with_present_names
 from dopepp.experiment.reports.protocols import Protocols
 from dopepp.experiment.tuning import FalsePositiveTarget
@@ -233,6 +233,7 @@ class RunConfig(MeasurementConfig):
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
         """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
         plain = with_present_names(config)
+        plain["virtual"] = with_lens(plain.get("virtual"))
         nodes = {
             "data": DataConfig.of(plain.get("data"), plain.get("virtual")),
             "trainer": TrainerConfig.of(plain.get("trainer") or {}),

@@ -34,7 +34,7 @@ class Composition:
 
     def __init__(self, preset: Preset, rng: Generator, negatives: Sequence[Body]) -> None:
         self.preset, self.rng, self.negatives = preset, rng, negatives
-        self.K, self.size = preset.K, (preset.width, preset.height)
+        self.K, self.size = preset.draw_camera(rng)
         self._alike = rng.random() < preset.materials.alike_share
         self._materials: dict[str, Material] = {}
         self.clear()
@@ -70,11 +70,15 @@ class Composition:
         return True
 
     def _is_well_placed(self, item: SceneObject, extremes: Float[np.ndarray, "hull 3"]) -> bool:
-        """Tell whether a target is neither tiny nor has its centre outside of the frame."""
+        """Tell whether a target is not tiny, its centre in the frame and at a wanted depth."""
         if item.part is None:
             return True
+        middle = transform(item.T_cam_obj, item.part.cuboid[CENTROID])
+        nearest, farthest = self.preset.depths or (0.0, np.inf)
+        if not nearest <= middle[2] <= farthest:
+            return False
         if self.preset.centroid_inside:
-            centre = project(transform(item.T_cam_obj, item.part.cuboid[CENTROID]), self.K)
+            centre = project(middle, self.K)
             if not ((centre >= -0.5) & (centre < np.array(self.size) - 0.5)).all():
                 return False
         # No camera shows a target whose image is smaller both ways.

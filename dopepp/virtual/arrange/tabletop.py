@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32
 
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import Transform, make_transform
-from dopepp.geometry.rotation import RotationMatrix
+from dopepp.geometry.rotation import RotationMatrix, rotation_vector_to_matrix
 from dopepp.parts.mesh.measure import Faces
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.body import Body
@@ -65,6 +65,8 @@ class _Setting:
     def __init__(self, composition: Composition, table: Table, targets: Sequence[Body]) -> None:
         self.composition, self.table, self.rng = composition, table, composition.rng
         self.T_cam_table = table.draw_view(self.rng)
+        if composition.preset.window is not None:
+            self.T_cam_table = _in_the_middle(self.T_cam_table, composition)
         distance = float(self.T_cam_table[2, 3])
         diameter = max((2 * body.surface.radius for body in targets), default=0.3 * distance)
         self._radius = diameter * self.rng.uniform(*table.heap_radius)
@@ -128,6 +130,17 @@ class _Setting:
         point = np.linalg.solve(self.composition.K, pixel) / inverse_depth
         x, y, _ = self.T_cam_table[:3, :3].T @ (point - self.T_cam_table[:3, 3])
         return float(x), float(y)
+
+
+def _in_the_middle(T_cam_table: Transform, composition: Composition) -> Transform:
+    """Turn the camera so that the middle of a window, not of the picture, looks at the table."""
+    middle = np.array([*(np.array(composition.size) / 2 - 0.5), 1.0])
+    ray = np.linalg.solve(composition.K, middle)
+    aside = np.array([-ray[1], ray[0], 0.0])  # z × ray: about it, by the angle between them
+    length = float(np.linalg.norm(aside))
+    angle = math.atan(length)
+    turned = rotation_vector_to_matrix(aside * (angle / length if length else 0.0))
+    return make_transform(turned @ T_cam_table[:3, :3], turned @ T_cam_table[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)

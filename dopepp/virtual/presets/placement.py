@@ -194,6 +194,34 @@ class FillPlacement(Placement):
         return np.asarray(depth * ray - centre)
 
 
+@dataclass(frozen=True)
+class WorkingPlacement(Placement):
+    """Uniform in the depth of the part's middle and, across, wherever the part fits in the picture.
+
+    The middle is that of the turned part's extent along each axis, wherever its file has the
+    origin. A part that is larger than the picture is in its middle.
+
+    Attributes:
+        nearest: Smallest depth of the middle, metres.
+    """
+
+    nearest: float
+    farthest: float
+
+    def __post_init__(self) -> None:
+        _check_ends(self, "nearest", "farthest", 1e-6, _FARTHEST, "metres", "in metres")
+
+    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
+        """Return the object's origin in the camera frame, metres."""
+        depth, place = rng.uniform(self.nearest, self.farthest), rng.uniform(-0.5, 0.5, 2)
+        lower, upper = rotated_hull.min(axis=0), rotated_hull.max(axis=0)
+        # What is nearer than the middle is as much larger.
+        front = depth - (upper[2] - lower[2]) / 2
+        extent = (upper - lower)[:2] * K[[0, 1], [0, 1]] / max(front, 1e-6)
+        pixel = np.array(size) / 2 - 0.5 + place * np.maximum(size - extent, 0.0)
+        return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]) - (lower + upper) / 2)
+
+
 def _check_ends(
     of: object, first: str, last: str, lowest: float, highest: float, unit: str, units: str
 ) -> None:

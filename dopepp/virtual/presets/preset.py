@@ -1,8 +1,8 @@
 """Named, typed descriptions of random scenes; every range has its unit in its name or docstring.
 
-To change one, use :func:`dataclasses.replace` (and :meth:`Preset.resized` for the image size), or
-:func:`customised_preset` with plain values, as a config gives them. To add one, put a
-:class:`Preset` into :data:`PRESETS`.
+To change one, use :func:`dataclasses.replace` (:meth:`Preset.resized` and :meth:`Preset.reframed`
+for the size), or :func:`customised_preset` with plain values, as a config gives them. To add one,
+put a :class:`Preset` into :data:`PRESETS`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,12 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
+from numpy.random import Generator
+
 from dopepp.core.checks import check_number, check_range
 from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera, resize_camera
 from dopepp.virtual.presets.distractors import Distractors
 from dopepp.virtual.presets.looks import Lighting, Materials
@@ -52,6 +56,9 @@ class Preset:
         centroid_inside: Whether the image of every target's cuboid centre must lie inside the
             frame.
         materials: Distribution of what targets and distractors are made of.
+        window: Width and height of the part of the picture that is rendered, around a random point
+            of it, pixels; None renders all of it.
+        depths: Smallest and largest depth of the targets' cuboids' centres, metres; None for any.
     """
 
     name: str
@@ -69,11 +76,18 @@ class Preset:
     materials: Materials = field(default_factory=Materials)
     distractors: Distractors = field(default_factory=Distractors)
     sensors: Sensors = field(default_factory=Sensors)
+    # Without these two, what describes a preset is as it was before there were any.
+    window: tuple[int, int] | None = field(default=None, repr=False)
+    depths: tuple[float, float] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_range("targets_per_image", self.targets_per_image, 0, 100, "a count", of=self)
         for name in ("width", "height"):
             check_number(name, getattr(self, name), 8, 16384, "pixels", of=self)
+        for side in self.window or ():
+            check_number("window", side, 8, 16384, "pixels", of=self)
+        if self.depths is not None:
+            check_range("depths", self.depths, 0.0, 1000.0, "metres", of=self)
         check_number("min_visible_fraction", self.min_visible_fraction, 0.0, 0.95, "share", of=self)
         check_number("horizontal_fov_deg", self.horizontal_fov_deg, 5.0, 150.0, "degrees", of=self)
         check_camera(self.K, (self.width, self.height), f"preset {self.name}")
@@ -87,6 +101,20 @@ class Preset:
         # Pixel centres are integers, so the image's middle is at (width − 1)/2.
         return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
+    def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
+        """Return K and (width, height) of what is rendered: all of the picture, or a window of it.
+
+        A window lies around a point that is uniform over the picture, moved into it; where it is
+        larger than the picture, it is in its middle. Its principal point may be outside of it.
+        """
+        K, size = self.K, (self.width, self.height)
+        if self.window is None:
+            return K, size
+        spare = np.array(size) - self.window
+        corner = rng.uniform(0, 1, 2) * size - np.array(self.window) / 2
+        K[:2, 2] -= np.floor(np.where(spare > 0, np.clip(corner, 0, spare), spare / 2))
+        return K, self.window
+
     def resized(self, width: int, height: int) -> Preset:
         """Return the same scenes in another image size: the camera follows the resize rule.
 
@@ -94,11 +122,27 @@ class Preset:
         is resized.
         """
         K = resize_camera(self.K, width / self.width, height / self.height)
-        intrinsics_px = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        sensors = self.sensors.resized(width / self.width)
+        return self._seen_by(K, width, height, width / self.width)
+
+    def reframed(self, width: int, height: int) -> Preset:
+        """Return the same scenes in a picture of another size and shape, with pixels as square.
+
+        The field of view along the shorter side stays; along the longer one the picture is cut or
+        shows more, alike at both ends. Of the same shape, it is :meth:`resized`.
+        """
+        side, new_side = min(self.width, self.height), min(width, height)
+        scale = new_side / side
+        K = resize_camera(self.K, scale, scale)
+        K[0, 2] += (width * side - new_side * self.width) / (2 * side)
+        K[1, 2] += (height * side - new_side * self.height) / (2 * side)
+        return self._seen_by(K, width, height, scale)
+
+    def _seen_by(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
+        """Return the same scenes in another camera, with pixels ``scale`` times as fine."""
         return replace(
-            self, width=width, height=height, intrinsics_px=intrinsics_px, sensors=sensors
-        )
+            self, width=width, height=height, sensors=self.sensors.resized(scale),
+            intrinsics_px=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])),
+        )  # fmt: skip
 
 
 _MILD_LIGHT: Final = Lighting((1, 2), temperature_k=(5000.0, 8000.0))
@@ -178,7 +222,8 @@ def _changed(described: T, changes: Any, where: str) -> T:
     values = {}
     for key, value in changes.items():
         if key not in hints:
-            raise UserError(f"{key!r} in {where}", ", ".join(hints), "correct the field's name")
+            allowed = ", ".join(hints) or "no field"
+            raise UserError(f"{key!r} in {where}", allowed, "correct the field's name")
         values[key] = _converted(value, hints[key], getattr(described, key), f"{key} of {where}")
     return replace(described, **values)  # type: ignore[type-var]
 

@@ -15,6 +15,8 @@ SMALL = ("width=96", "height=72")
 def test_a_sheet_has_four_panels_a_scene_and_shows_the_jobs_first_images():
     factory = make_job(["servoholder", "pivconnector"], changes=SMALL).factory
     sheet = preview_sheet(factory, num_scenes=2)
+    lines, sheet = sheet[: 2 * 18], sheet[2 * 18 :]
+    assert (lines < 128).any(axis=(1, 2)).reshape(2, 18).any(axis=1).all()  # one for each part
     assert sheet.shape == (2 * (240 + 18) + 3 * 6, 4 * 320 + 5 * 6, 3)
     image = factory.render(0, 1).image
     shown = sheet[6 + 258 + 6 :][:240, 6 : 6 + 320]

@@ -19,8 +19,9 @@ from rich.console import Console
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
+from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.jobs.job import RECORD_FILE, WRITERS, make_job, named_part
+from dopepp.data.jobs.job import WRITERS, make_job, named_part
 from dopepp.data.jobs.pools import Pool
 from dopepp.data.jobs.render_dataset import ProgressDisplay, RenderReport, render_dataset
 from dopepp.data.jobs.work import Outcome, Shard, Task, Worker, plan

@@ -11,6 +11,7 @@ from dopepp.experiment.build.sources import (
     build_datamodule,
     build_parts,
     held_out_source,
+    share_in_words,
 )
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
@@ -152,3 +153,25 @@ def test_preset_changes_reach_the_renders(tiny):
     ]
     assert fx[1] == pytest.approx(64 / np.tan(np.radians(10)), rel=1e-6)
     assert fx[0] < fx[1]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("data=bop",), "the last 10% of the images in train_pbr, because data.image_sets names it "
+         "for train and val as well: data.image_sets.train=none data.image_sets.val=none measures"),
+        (("data=bop", "data.image_sets.val=other"), "the last 20% of the images in train_pbr, "
+         "because data.image_sets names it for train as well: data.image_sets.train=none measures"),
+        (("data=ndds",), "the last 10% of the images in ., because"),
+        (("data=bop", "data.image_sets.test=test"), None),
+        (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
+        (("data=bop", "data/test=photoreal"), None),
+        (("data=ycb_video",), None),
+        (("data=virtual",), None),
+    ],
+)  # fmt: skip
+def test_a_share_of_a_folder_is_said_with_what_changes_it(overrides, words, tiny):
+    root = () if "data=virtual" in overrides else ("data.root=somewhere",)
+    said = share_in_words(tiny(*overrides, *root).data)
+    assert (said is None) == (words is None)
+    assert words is None or words in said

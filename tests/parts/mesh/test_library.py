@@ -191,7 +191,7 @@ def test_a_glb_file_is_in_metres_and_another_unit_is_said(write, caplog):
     with caplog.at_level(logging.INFO):
         np.testing.assert_allclose(np.ptp(read_mesh(path).vertices, axis=0), [0.01, 0.02, 0.03])
         assert load_part(path).diameter == pytest.approx(np.sqrt(1400) / 1000)
-        assert not caplog.records
+        assert caplog.messages == ["box: 30 × 20 × 10 mm, read in m"]
     assert np.ptp(read_mesh(path, "cm").vertices) == pytest.approx(0.0003)
     assert f"{path} is in m by its format: taken as cm, as asked" in caplog.text
     with pytest.raises(UserError, match=r"37\.42 m, its file read with unit=m; .*unit=mm"):

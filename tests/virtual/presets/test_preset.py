@@ -13,7 +13,12 @@ from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
-from dopepp.virtual.presets.placement import DistancePlacement, FillPlacement, OffsetPlacement
+from dopepp.virtual.presets.placement import (
+    DistancePlacement,
+    FillPlacement,
+    OffsetPlacement,
+    WorkingPlacement,
+)
 from dopepp.virtual.presets.preset import customised_preset
 
 
@@ -136,6 +141,91 @@ def test_resized_draws_the_same_poses(box_part):
         np.testing.assert_allclose(large.T_cam_obj, small.T_cam_obj, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("size", [(416, 416), (1280, 720), (720, 1280), (320, 240), (100, 333)])
+def test_another_shape_keeps_pixels_square_and_the_view_along_the_shorter_side(name, size):
+    preset = PRESETS[name]
+    sized = preset.reframed(*size)
+    assert (sized.width, sized.height) == size
+    before, after = preset.K, sized.K
+    assert after[1, 1] / after[0, 0] == pytest.approx(before[1, 1] / before[0, 0], rel=1e-12)
+    scale = min(size) / min(preset.width, preset.height)
+    assert after[0, 0] == pytest.approx(scale * before[0, 0], rel=1e-12)
+    # The principal point is as far from the middle as it was.
+    aside = before[:2, 2] - (np.array([preset.width, preset.height]) - 1) / 2
+    np.testing.assert_allclose(after[:2, 2] - (np.array(size) - 1) / 2, scale * aside, atol=1e-9)
+    np.testing.assert_allclose(sized.sensors.blur_px, scale * np.array(preset.sensors.blur_px))
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+@pytest.mark.parametrize("factor", [0.25, 3 / 8, 2.0])
+def test_the_same_shape_is_the_same_camera_to_the_last_bit(preset, factor):
+    size = round(factor * preset.width), round(factor * preset.height)
+    assert preset.reframed(*size) == preset.resized(*size)
+
+
+def test_what_describes_a_preset_is_as_it_was():
+    """Kept renders, fingerprints and checkpoints name presets so."""
+    for preset in PRESETS.values():
+        assert "window" not in repr(preset)
+        assert "depths" not in repr(preset)
+
+
+def test_windows_lie_in_the_picture_all_over_it():
+    preset = replace(PRESETS["ycb"], window=(224, 160))
+    rng = np.random.default_rng(3)
+    corners = []
+    for _ in range(2000):
+        K, size = preset.draw_camera(rng)
+        assert size == (224, 160)
+        np.testing.assert_array_equal(K[:2, :2], preset.K[:2, :2])
+        corners.append(preset.K[:2, 2] - K[:2, 2])
+    corners = np.array(corners)
+    assert corners.min() == 0
+    np.testing.assert_array_equal(corners.max(axis=0), [640 - 224, 480 - 160])
+    # A point of the window is anywhere in the picture, at its borders half as often.
+    points = corners + rng.uniform(0, 1, corners.shape) * (224, 160)
+    shares = np.histogram(points[:, 0], 8, (0, 640))[0] / 2000
+    assert 0.06 < shares.min() < shares.max() < 0.2
+
+
+def test_a_window_larger_than_the_picture_has_it_in_its_middle():
+    K, size = replace(PRESETS["quickstart"], window=(160, 96)).draw_camera(np.random.default_rng(0))
+    assert size == (160, 96)
+    assert K[0, 2] == PRESETS["quickstart"].K[0, 2] + 16
+    assert 0 <= PRESETS["quickstart"].K[1, 2] - K[1, 2] <= 32
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    seed=st.integers(0, 10_000),
+    origin=st.floats(-3, 3),
+    nearest=st.floats(0.5, 2.0),
+    width=st.integers(200, 800),
+)
+def test_parts_at_work_stand_at_their_distance_and_fit(seed, origin, nearest, width):
+    rng = np.random.default_rng(seed)
+    hull = rng.uniform(-0.05, 0.05, (30, 3)) + origin  # wherever the file has its origin
+    K = np.array([[width, 0, 0.4 * width], [0, 1.1 * width, 100], [0, 0, 1]])
+    place = WorkingPlacement(nearest, 2 * nearest).draw(rng, K, (width, 200), hull)
+    there = hull + place
+    middle = (there[:, 2].min() + there[:, 2].max()) / 2
+    assert nearest - 1e-9 <= middle <= 2 * nearest + 1e-9
+    pixels = project(there, K)
+    assert pixels.min() > -0.5 - 1e-6
+    assert (pixels < np.array([width, 200]) - 0.5 + 1e-6).all()
+
+
+def test_depths_hold(parts):
+    preset = replace(PRESETS["table"].resized(160, 120), depths=(0.4, 0.42))
+    factory = Factory(parts, preset, seed=2)
+    for index in range(5):
+        scene = factory.scene(0, index)
+        for number in scene.targets:
+            middle = transform(scene.objects[number].T_cam_obj, scene.objects[number].part.cuboid)
+            assert 0.4 <= middle[8, 2] <= 0.42
+
+
 def test_field_of_view_follows_the_width():
     wide = replace(PRESETS["paper"], width=320, height=240)
     assert wide.K[0, 0] == pytest.approx(160.0)
@@ -171,6 +261,8 @@ def test_fill_placement_reaches_its_share(seed, share, width, height, focal):
         ({"min_visible_fraction": float("nan")}, "min_visible_fraction=nan.* from 0 to 0.95"),
         ({"horizontal_fov_deg": 179.0}, r"from 5 to 150 \(degrees\)"),
         ({"intrinsics_px": (300.0, 300.0, 900.0, 20.0)}, "principal point inside"),
+        ({"window": (0, 64)}, "window=0 of quickstart; allowed: a number from 8"),
+        ({"depths": (2.0, 1.0)}, r"depths=\(2.0, 1.0\) of quickstart"),
     ],
 )
 def test_wrong_presets_are_refused(change, message):

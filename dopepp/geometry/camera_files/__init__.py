@@ -1,0 +1,1 @@
+"""The families of camera files: named fields, numbers alone; each module reads one."""

@@ -1,0 +1,341 @@
+from __future__ import annotations
+
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import camera_matrix
+from dopepp.geometry.camera_file import Camera, read_camera
+
+K = camera_matrix(601.25, 602.5, 318.75, 242.5)
+LENS = (-0.125, 0.0625, 0.001, -0.002, 0.03125)
+
+ROS = """
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [601.25, 0.0, 318.75, 0.0, 602.5, 242.5, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.125, 0.0625, 1e-3, -2e-03, 0.03125]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [590, 0, 318, 0, 0, 598, 242, 0, 0, 0, 1, 0]
+"""
+ECHOED = """header:
+  seq: 7
+  stamp:
+    secs: 1700000000
+    nsecs: 250
+  frame_id: "camera_color_optical_frame"
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.125, 0.0625, 0.001, -0.002, 0.03125]
+K: [601.25, 0.0, 318.75, 0.0, 602.5, 242.5, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+P: [590.0, 0.0, 318.0, 0.0, 0.0, 598.0, 242.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+roi:
+  x_offset: 0
+  do_rectify: False
+---
+"""
+ROS2 = """header:
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- -0.125
+- 0.0625
+- 0.001
+- -0.002
+- 0.03125
+k:
+- 601.25
+- 0.0
+- 318.75
+- 0.0
+- 602.5
+- 242.5
+- 0.0
+- 0.0
+- 1.0
+---
+"""
+OPENCV_2 = """%YAML:1.0
+---
+calibration_time: "Thu 04 Jan 2018 15:01:25"
+nframes: 13
+image_Width: 640
+image_Height: 480
+flags: 6
+fisheye_model: 0
+Camera_Matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 6.0125e+02, 0., 3.1875e+02, 0., 6.025e+02, 2.425e+02, 0., 0., 1. ]
+Distortion_Coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -1.25e-01, 6.25e-02, 1.0e-03, -2.0e-03, 3.125e-02 ]
+"""
+OPENCV_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<!-- a calibration -->
+<image_size>
+  640 480</image_size>
+<cameraMatrix type_id="opencv-matrix">
+  <rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>601.25 0. 318.75 0. 602.5 242.5 0. 0. 1.</data></cameraMatrix>
+<distCoeffs type_id="opencv-matrix">
+  <rows>1</rows><cols>5</cols><dt>d</dt>
+  <data>-0.125 0.0625 1e-3 -2e-3 0.03125</data></distCoeffs>
+</opencv_storage>
+"""
+BOP = json.dumps(
+    {"cx": 318.75, "cy": 242.5, "depth_scale": 0.1, "fx": 601.25, "fy": 602.5, "height": 480,
+     "width": 640}
+)  # fmt: skip
+NDDS = json.dumps(
+    {
+        "camera_settings": [
+            {
+                "name": "camera",
+                "intrinsic_settings": {
+                    "fx": 601.25,
+                    "fy": 602.5,
+                    "cx": 318.75,
+                    "cy": 242.5,
+                    "s": 0,
+                },
+                "captured_image_size": {"width": 640, "height": 480},
+            }
+        ]
+    }
+)
+# Of COLMAP, (0.5, 0.5) is the centre of the top-left pixel.
+COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n1 {}\n"
+ROWS = "601.25 0 318.75\n0 602.5 242.5\n0 0 1\n"
+ANY = (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("text", "size", "lens"),
+    [
+        (ROS, ANY, LENS),
+        (ROS.replace("plumb_bob", "rational_polynomial").replace("cols: 5", "cols: 8")
+         .replace("0.03125]", "0.03125, 0.5, 0.25, 0.125]"), ANY, (*LENS, 0.5, 0.25, 0.125)),
+        (ECHOED, ANY, LENS),
+        (ROS2, ANY, LENS),
+        (OPENCV_2, ANY, LENS),
+        (OPENCV_XML, ANY, LENS),
+        (BOP, ANY, ()),
+        (NDDS, ANY, ()),
+        (COLMAP.format("PINHOLE 640 480 601.25 602.5 319.25 243"), ANY, ()),
+        (COLMAP.format("OPENCV 640 480 601.25 602.5 319.25 243 -0.125 0.0625 0.001 -0.002"), ANY,
+         LENS[:4]),
+        (ROWS, None, ()),
+        ("# K\n[[601.25, 0.0, 318.75],\n [0, 602.5, 242.5], [0, 0, 1]]", None, ()),
+        ("601.25 602.5 318.75 242.5", None, ()),
+        ("\ufeff601.25, 602.5,\r\n 318.75, 242.5\r\n", None, ()),
+        ("K: [[601.25, 0, 318.75], [0, 602.5, 242.5], [0, 0, 1]]\nD: [0, 0, 0, 0]", None, ()),
+    ],
+)  # fmt: skip
+def test_every_format_says_the_same(text, size, lens, tmp_path):
+    path = tmp_path / "camera.dat"
+    path.write_text(text, encoding="utf-8")
+    camera = read_camera(path)
+    assert_array_equal(camera.K, K)
+    assert (camera.size, camera.distortion) == (size, lens)
+    assert camera.source == str(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "focal", "lens"),
+    [
+        ("SIMPLE_PINHOLE 640 480 600 320 240", 600, ()),
+        ("SIMPLE_RADIAL 640 480 600 320 240 0.1", 600, (0.1, 0, 0, 0)),
+        ("RADIAL 640 480 600 320 240 0.1 -0.2", 600, (0.1, -0.2, 0, 0)),
+        ("FULL_OPENCV 640 480 600 600 320 240 1 2 3 4 5 6 7 8", 600, (1, 2, 3, 4, 5, 6, 7, 8)),
+    ],
+)
+def test_colmap_models_of_one_focal_length(line, focal, lens, tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text(COLMAP.format(line))
+    camera = read_camera(path)
+    assert_array_equal(camera.K, camera_matrix(focal, focal, 319.5, 239.5))
+    assert camera.distortion == lens
+
+
+NUMBERS = st.floats(-1e6, 1e6).map(lambda one: 0.0 if abs(one) < 1e-300 else one)
+
+
+@settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.sampled_from(["yaml", "yml", "xml", "json"]),
+    st.tuples(st.floats(1e-3, 1e6), st.floats(1e-3, 1e6), NUMBERS, NUMBERS),
+    st.sampled_from([0, 4, 5, 8, 12, 14]).flatmap(
+        lambda n: st.lists(NUMBERS, min_size=n, max_size=n)
+    ),
+    st.booleans(),
+)
+def test_reads_what_opencv_writes_to_the_last_bit(tmp_path, suffix, four, lens, is_column):
+    path, matrix = tmp_path / f"camera.{suffix}", camera_matrix(*four)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Thu: 4 # of January")
+    storage.write("image_width", 1280)
+    storage.write("image_height", 720)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", np.array([lens]).T if is_column else np.array([lens]))
+    storage.write("image_points", np.random.default_rng(0).normal(size=(3, 4, 2)))
+    storage.release()
+    camera = read_camera(path)
+    stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert_array_equal(camera.K, stored.getNode("camera_matrix").mat())
+    assert_array_equal(camera.K, matrix)
+    assert camera.size == (1280, 720)
+    assert camera.distortion == (tuple(lens) if any(lens) else ())
+
+
+def test_its_lens_projects_as_opencvs(tmp_path):
+    """COLMAP's and OpenCV's lens models are one: a point through either is the same pixel."""
+    path = tmp_path / "cameras.txt"
+    path.write_text(COLMAP.format("OPENCV 640 480 600 610 320 240 -0.1 0.05 0.001 -0.002"))
+    camera, (x, y) = read_camera(path), (0.2, -0.15)
+    r2 = x * x + y * y
+    radial = 1 - 0.1 * r2 + 0.05 * r2 * r2
+    u = x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x * x)
+    v = y * radial + 0.001 * (r2 + 2 * y * y) - 2 * 0.002 * x * y
+    expected = [600 * u + 320 - 0.5, 610 * v + 240 - 0.5]
+    lens = np.array(camera.distortion)
+    pixel = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), camera.K, lens)[0]
+    assert_allclose(pixel[0, 0], expected, atol=1e-9)
+
+
+def test_reads_what_dopepp_writes(tmp_path):
+    from dopepp.data.formats.ndds.writer import camera_settings
+
+    four = {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5}
+    content = camera_settings({"width": 640, "height": 480, "intrinsics": four})
+    path = tmp_path / "_camera_settings.json"
+    path.write_text(json.dumps(content))
+    assert_array_equal(read_camera(path).K, K)
+    assert read_camera(path).size == ANY
+
+
+BAD = {
+    "empty": ("", "without any fields"),
+    "text": ("The camera is on the left.", "without any fields"),
+    "a picture": ("\x89PNG\r\n", "is no UTF-8"),
+    "seven numbers": ("1 2 3 4 5 6 7", "7 numbers; allowed: nine"),
+    "no pinhole": ("601 5 318 0 602 242 0 0 1", "3×3 pinhole"),
+    "transposed": ("601 0 0 0 602 0 318 242 1", "3×3 pinhole"),
+    "never calibrated": (ECHOED.replace("601.25", "0.0").replace("602.5", "0.0"), "calibrate the"),
+    "fisheye in ROS": (ROS.replace("plumb_bob", "equidistant"), "undistort the pictures"),
+    "fisheye in OpenCV": (OPENCV_2.replace("model: 0", "model: 1"), "fisheye_model=1"),
+    "fisheye in COLMAP": (COLMAP.format("FOV 640 480 600 600 320 240 1"), "camera model FOV"),
+    "two cameras": (COLMAP.format("PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1"),
+                    "2 cameras (1, 2)"),
+    "too few": (COLMAP.format("PINHOLE 640 480 600 320 240"), "4 numbers behind PINHOLE"),
+    "stereo": ("M1: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nM2: [1]", "without camera_matrix (it has M1, M2)"),
+    "two messages": (ECHOED + ECHOED, "single document"),
+    "no height": (ROS.replace("image_height: 480", ""), "without image_height"),
+    "no pixels": (ROS.replace("480", "0"), "image_height=0"),
+    "half a pixel": (ROS.replace("480", "480.5"), "image_height=480.5"),
+    "three coefficients": ("K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]", "3 distortion"),
+    "not as many": (ROS.replace("cols: 5", "cols: 4"), "distortion_coefficients of 1×4 with 5"),
+    "not finite": (OPENCV_2.replace("6.0125e+02", ".Nan"), "Camera_Matrix.data='.Nan'"),
+    "base64": (OPENCV_2.replace("[ -1.25e-01, 6.25e-02, 1.0e-03, -2.0e-03, 3.125e-02 ]",
+                                '"$base64$ZAAAAA"'), "without base64"),
+    "a word": (ROS.replace("318.75", "wide"), "camera_matrix.data='wide'"),
+    "a truth": (BOP.replace("601.25", "true"), "fx=True"),
+    "endless": (f"K: 0x{'f' * 9000}", "K=int"),
+    "endless in JSON": (f'{{"fx": {"9" * 9000}}}', "digit"),
+    "code": ("K: !!python/object/apply:os.system [id]", "the tag"),
+    "an alias": ("a: &a [1]\nK: *a", "aliases"),
+    "deep": ("K: " + "[" * 9000, "nested more than"),
+    "deep in JSON": ('{"K": ' + "[" * 9000, "nested more than"),
+    "deep in XML": ("<opencv_storage>" + "<a>" * 9000 + "</a>" * 9000 + "</opencv_storage>",
+                    "without camera_matrix"),
+    "entities": ('<!DOCTYPE a [<!ENTITY b "b">]><opencv_storage><K>&b;</K></opencv_storage>',
+                 "with DOCTYPE"),
+    "an entity": ("<opencv_storage><K>&b;</K></opencv_storage>", "undefined entity"),
+    "other XML": ("<svg/>", "<svg>"),
+    "no XML": ("<opencv_storage><K>", "unreadable"),
+    "cameras of NDDS": ('{"camera_settings": [{}, {}]}', "camera_settings of 2 cameras"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_one_line(name, tmp_path):
+    text, message = BAD[name]
+    path = tmp_path / "camera.yaml"
+    path.write_bytes(text.encode("latin-1" if name == "a picture" else "utf-8"))
+    start = time.perf_counter()
+    with pytest.raises(UserError) as caught:
+        read_camera(path)
+    assert time.perf_counter() - start < 2
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value)) < 1000
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("missing", "No such file"), ("", "Is a directory"), ("large", "more than 250 kB"),
+     ("nul\0", "null")],
+)  # fmt: skip
+def test_a_file_that_is_none(name, message, tmp_path):
+    (tmp_path / "large").write_bytes(b"1 " * 600_000)
+    with pytest.raises(UserError, match=message):
+        read_camera(tmp_path / name)
+
+
+SAMPLES = [ROS, ECHOED, OPENCV_2, OPENCV_XML, BOP, NDDS, COLMAP.format("PINHOLE 9 9 1 1 1 1"), ROWS]
+MARKS = [b"[", b"{", b"-", b": ", b"&a ", b"!!", b"<", b"1e999", b"\n"]
+
+
+@settings(
+    deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
+    """Bytes replaced, inserted and cut out: nothing but a camera or one line comes of it."""
+    content = bytearray(data.draw(st.sampled_from(SAMPLES)).encode())
+    for _ in range(data.draw(st.integers(1, 4))):
+        start = data.draw(st.integers(0, len(content)))
+        new = data.draw(st.one_of(st.binary(max_size=4), st.sampled_from(MARKS)))
+        content[start : start + data.draw(st.integers(0, 6))] = new
+    path = tmp_path / "camera.yaml"
+    path.write_bytes(bytes(content))
+    try:
+        camera = read_camera(path)
+    except UserError:
+        return
+    assert isinstance(camera, Camera)
+    assert np.isfinite(camera.K).all()
+    assert np.isfinite(camera.distortion).all()

@@ -1,0 +1,104 @@
+"""What a part is in words: its size, its unit, its bodies."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh.exchange.stl import export_stl
+
+from dopepp.parts import load_part, servoholder
+from dopepp.parts.mesh.measure import body_extents
+from dopepp.parts.wording import part_in_words, size_in_words
+
+
+def box(*extents: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at))
+
+
+def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.invert()
+    return mesh
+
+
+BRACKET = box(62, 31, 40)
+
+
+@pytest.mark.parametrize(
+    ("meshes", "sizes"),
+    [
+        ([BRACKET], [(62, 31, 40)]),
+        ([BRACKET, box(5, 5, 8, at=(100, 0, 0))], [(62, 31, 40), (5, 5, 8)]),
+        ([box(1, 1, 1, at=(9, 0, 0)), box(2, 2, 2), box(3, 3, 3, at=(0, 9, 0))],
+         [(3, 3, 3), (2, 2, 2), (1, 1, 1)]),
+        ([BRACKET, inverted(box(10, 10, 10))], [(62, 31, 40)]),  # a cavity
+        ([BRACKET, inverted(box(10, 10, 10)), box(4, 4, 4)], [(62, 31, 40), (4, 4, 4)]),
+        ([BRACKET, box(31, 31, 31, at=(46.5, 0, 0))], [(62, 31, 40), (31, 31, 31)]),  # only touch
+    ],
+)  # fmt: skip
+def test_bodies_are_counted_without_cavities(meshes, sizes):
+    whole = trimesh.util.concatenate(meshes)
+    found = body_extents(np.array(whole.vertices), np.array(whole.faces))
+    np.testing.assert_allclose(found, sizes)
+
+
+def test_an_open_surface_is_a_body():
+    for cut in (BRACKET.faces[:-1], BRACKET.faces[:-1, ::-1]):
+        assert len(body_extents(np.array(BRACKET.vertices), np.array(cut))) == 1
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(*meshes: trimesh.Trimesh) -> str:
+        path = tmp_path / "bracket.stl"
+        path.write_bytes(export_stl(trimesh.util.concatenate(meshes)))
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("unit", "level", "words"),
+    [
+        ("mm", logging.INFO, "bracket: 62 × 40 × 31 mm, read in mm"),
+        ("cm", logging.INFO, "bracket: 620 × 400 × 310 mm, read in cm"),
+        (
+            "inch",
+            logging.WARNING,
+            "bracket: 1575 × 1016 × 787 mm, read in inch (unlikely: most parts measure 0.01 – 2 m; "
+            "is the unit right?)",
+        ),
+    ],
+)
+def test_the_log_says_the_size_and_the_unit_taken(unit, level, words, written, caplog):
+    with caplog.at_level(logging.INFO):
+        load_part(written(BRACKET), unit)
+    assert (caplog.records[-1].levelno, caplog.records[-1].getMessage()) == (level, words)
+
+
+@pytest.mark.parametrize(("side", "unit"), [(40, "inch"), (100, "cm"), (0.3, "cm")])
+def test_an_unlikely_size_is_a_warning(side, unit, written, caplog):
+    with caplog.at_level(logging.WARNING):
+        load_part(written(box(2 * side, side, side)), unit)
+    (record,) = [one for one in caplog.records if one.levelno == logging.WARNING]
+    assert "is the unit right?" in record.getMessage()
+
+
+def test_several_bodies_are_said_once(written, caplog):
+    with caplog.at_level(logging.INFO):
+        load_part(written(BRACKET, box(5, 5, 8, at=(100, 0, 0))), "mm")
+    lines = [one.getMessage() for one in caplog.records if "bodies" in one.getMessage()]
+    assert lines == [
+        "bracket: 134 × 40 × 31 mm, read in mm; 2 bodies (62 × 40 × 31 mm, 8.0 × 5.0 × 5.0 mm), "
+        "which are rendered and found as one part"
+    ]
+    many = [box(1 + n / 9, 1, 1, at=(5 * n, 0, 0)) for n in range(5)]
+    words = part_in_words(load_part(written(*many), "cm"))
+    assert "; 5 bodies (the largest 14 × 10 × 10 mm), which" in words
+
+
+def test_a_built_in_part_and_a_checkpoints_have_no_unit():
+    assert part_in_words(servoholder()) == "servoholder: 77 × 77 × 7.0 mm"
+    assert part_in_words(replace(servoholder(), mesh=None)) == "servoholder: 77 × 77 × 7.0 mm"
+    assert size_in_words(np.array([0.0031, 0.2, 0.04])) == "200 × 40 × 3.1 mm"
