@@ -55,13 +55,13 @@ class Muon(AdamW):
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.ndim > 1 and weight.grad is not None:
-                    self._step_matrix(weight, group)
+                    self._step_matrix(weight, weight.grad, group)
+                    weight.grad = None  # so that AdamW leaves it alone
         super().step()
         return loss
 
-    def _step_matrix(self, weight: nn.Parameter, group: dict[str, Any]) -> None:
-        """Take the step of one matrix; AdamW then finds no gradient there."""
-        gradient, weight.grad = weight.grad, None
+    def _step_matrix(self, weight: nn.Parameter, gradient: Tensor, group: dict[str, Any]) -> None:
+        """Take the step of one matrix."""
         state = self.state[weight]
         if not state:  # under AdamW's names, which it looks for when a run is resumed
             state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(weight)}
