@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -14,8 +15,12 @@ from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
     from dopepp.drawing.overlay import Wireframe
+    from dopepp.drawing.pictures import Picture
     from dopepp.geometry.camera import CameraMatrix
+    from dopepp.geometry.camera_file import Camera, Crop
     from dopepp.inference.estimator import PoseEstimator
+    from dopepp.inference.refinement.view import Depth32
+    from dopepp.parts.part import Part
     from dopepp.recovery.detection import Detection
 
 FRAMES: Final = (".png", ".jpg", ".jpeg")
@@ -25,13 +30,35 @@ FRAMES: Final = (".png", ".jpg", ".jpeg")
 def predict(
     checkpoint: Annotated[Path, typer.Argument(help="best.ckpt of a run")],
     image: Annotated[
-        Path, typer.Argument(help="a picture (PNG, JPEG); with --track, a folder of frames")
+        Path, typer.Argument(help="a picture (PNG, JPEG, TIFF); with --track, a folder of frames")
     ],
     intrinsics: Annotated[
-        tuple[float, float, float, float], typer.Option("--K", help="fx fy cx cy, pixels")
-    ],
+        tuple[float, float, float, float] | None,
+        typer.Option("--K", help="fx fy cx cy, pixels; or --camera"),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="camera file: ROS, OpenCV, BOP, COLMAP, or text with 3×3 numbers"),
+    ] = None,
+    K_size: Annotated[
+        tuple[int, int] | None,
+        typer.Option("--K-size", help="width height that K is of, if the picture was resized"),
+    ] = None,
+    crop: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(help="x y width height, if the picture was cut out of the calibrated one"),
+    ] = None,
+    distance: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="nearest and farthest part, metres; else those of training, then any"),
+    ] = None,
+    roi: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(help="x y width height: look at this part of the picture only"),
+    ] = None,
     overlay: Annotated[
-        Path | None, typer.Option(help="write the picture with wireframes; with --track, a folder")
+        Path | None,
+        typer.Option(help="write the picture with wireframes (.png, .jpg); with --track, a folder"),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
     verify: Annotated[
@@ -62,45 +89,33 @@ def predict(
 
     Where nothing is found on a picture, it is said why.
     """
-    from dopepp.core.files import write_png
+    from dopepp.core.files import write_picture
     from dopepp.drawing.overlay import overlay as draw
-    from dopepp.drawing.pictures import read_rgb
-    from dopepp.geometry.camera import camera_matrix
-    from dopepp.inference.estimator import PoseEstimator
-    from dopepp.inference.refinement.view import read_depth
-    from dopepp.parts.catalogue import with_meshes
-    from dopepp.virtual.agreement import agreement
-    from dopepp.virtual.surface import make_surface
+    from dopepp.recovery.silence import explained
 
     with report_errors():
-        K = camera_matrix(*intrinsics)
-        if (refine == "depth") != (depth is not None):
-            raise UserError(
-                "--depth without --refine depth" if depth else "--refine depth without --depth",
-                "both or none of them",
-                "add --refine depth" if depth else "add --depth FILE",
-            )
-        if track and (verify or depth is not None):
-            raise UserError("--track with --verify or --depth", "--track alone", "leave it out")
+        _check_options(refine, depth, track, verify, distance or roi)
+        _check_overlay(overlay, track)
+        lens = _Lens(_camera(intrinsics, camera), K_size, crop)
         refine = "region" if track else refine
-        estimator = PoseEstimator.load(checkpoint, device, max_ms=max_ms)
-        known = estimator.parts
-        if verify or refine == "region":
-            known = with_meshes(known, parts or (), unit)
-        if refine is not None:
-            estimator = estimator.refining(refine, known)
+        estimator, known = _estimator(checkpoint, device, refine, verify, parts, unit, max_ms)
         if track:
-            _track(estimator, image, K, overlay)
+            _track(estimator, image, lens, overlay)
             return
-        picture = read_rgb(image)
-        metres = None if depth is None else read_depth(depth, depth_scale)
-        found = estimator.predict(picture, K, depth=metres)
-        agreements: list[float] = []
-        if verify:
-            meshes = {part.name: make_surface(part.mesh) for part in known if part.mesh}
-            agreements = [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
+        picture, K = lens.picture(image)
+        metres = None if depth is None else lens.depth(depth, depth_scale, K)
+        where: dict[str, Any] = {"depth": metres, "roi": roi, "cropped": crop is not None}
+        found = estimator.predict(picture, K, distances=distance, **where)
+        if not found and distance is None:
+            found = estimator.predict(picture, K, distances="any", **where)
+            if found:
+                typer.echo(
+                    "nothing where training had the parts; found at another distance", err=True
+                )
+        agreements = _agreements(picture, K, found, known) if verify else []
+        why = "" if found else explained(estimator.explain(picture, K, distances=distance, **where))
     if not found:
-        typer.echo("nothing found: " + "; ".join(estimator.explain(picture, K)), err=True)
+        typer.echo(f"nothing found: {why}", err=True)
     for number, one in enumerate(found):
         record = _record(one)
         if refine is not None:
@@ -109,14 +124,109 @@ def predict(
             record["agreement"] = agreements[number]
         typer.echo(json.dumps(record))
     if overlay is not None:
-        write_png(overlay, draw(picture, _wireframes(found)))
+        write_picture(overlay, draw(picture, _wireframes(found)))
 
 
-def _track(estimator: PoseEstimator, folder: Path, K: CameraMatrix, overlay: Path | None) -> None:
+@dataclass(frozen=True)
+class _Lens:
+    """What the options say of the camera, and how the pictures came about."""
+
+    camera: Camera
+    K_size: tuple[int, int] | None
+    crop: Crop | None
+
+    def picture(self, path: Path) -> tuple[Picture, CameraMatrix]:
+        """Return a picture without distortion and its K."""
+        from dopepp.drawing.pictures import read_photo
+
+        picture = read_photo(path)
+        size = (picture.shape[1], picture.shape[0])
+        camera = self.camera.for_picture(size, self.K_size, self.crop)
+        return camera.undistorted(picture), camera.K
+
+    def depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
+        """Return a depth image without distortion, metres."""
+        from dopepp.inference.refinement.view import read_depth, undistorted_depth
+
+        metres, lens = read_depth(path, scale), self.camera.coefficients
+        return metres if lens is None else undistorted_depth(metres, K, lens)
+
+
+def _camera(intrinsics: tuple[float, float, float, float] | None, path: Path | None) -> Camera:
+    """Return the camera of the one of two options that is given."""
+    from dopepp.geometry.camera import camera_matrix
+    from dopepp.geometry.camera_file import Camera, read_camera
+
+    if (intrinsics is None) == (path is None):
+        got = "--K and --camera" if path else "neither --K nor --camera"
+        fix = "pass --K fx fy cx cy (pixels of this picture) or --camera FILE"
+        raise UserError(got, "one of the two", fix)
+    if path is not None:
+        return read_camera(path)
+    assert intrinsics is not None
+    return Camera(None, camera_matrix(*intrinsics), (), "--K")
+
+
+def _check_options(
+    refine: str | None, depth: Path | None, track: bool, verify: bool, where: object
+) -> None:
+    """Refuse options that do not go together."""
+    if (refine == "depth") != (depth is not None):
+        raise UserError(
+            "--depth without --refine depth" if depth else "--refine depth without --depth",
+            "both or none of them",
+            "add --refine depth" if depth else "add --depth FILE",
+        )
+    if track and (verify or depth is not None or where):
+        got = "--track with --verify, --depth, --distance or --roi"
+        raise UserError(got, "--track alone", "leave it out")
+
+
+def _check_overlay(overlay: Path | None, track: bool) -> None:
+    """Refuse a place where no picture can be written, before the work is done for it."""
+    from dopepp.core.files import PICTURES, check_target
+
+    if overlay is not None and track:
+        check_target(overlay / "frame.png")
+    elif overlay is not None:
+        check_target(overlay, PICTURES)
+
+
+def _estimator(
+    checkpoint: Path,
+    device: str,
+    refine: str | None,
+    verify: bool,
+    parts: Sequence[str] | None,
+    unit: str | None,
+    max_ms: float | None,
+) -> tuple[PoseEstimator, Sequence[Part]]:
+    """Return what is to look at the picture, and its parts, with meshes where these are needed."""
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.parts.catalogue import with_meshes
+
+    estimator = PoseEstimator.load(checkpoint, device, max_ms=max_ms)
+    known = estimator.parts
+    if verify or refine == "region":
+        known = with_meshes(known, parts or (), unit)
+    return (estimator if refine is None else estimator.refining(refine, known)), known
+
+
+def _agreements(
+    picture: Picture, K: CameraMatrix, found: Sequence[Detection], known: Sequence[Part]
+) -> list[float]:
+    """Return how well the picture agrees with every part, drawn at its pose."""
+    from dopepp.virtual.agreement import agreement
+    from dopepp.virtual.surface import make_surface
+
+    meshes = {part.name: make_surface(part.mesh) for part in known if part.mesh}
+    return [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
+
+
+def _track(estimator: PoseEstimator, folder: Path, lens: _Lens, overlay: Path | None) -> None:
     """Print the parts on every frame of a folder, in the order of the frames' names."""
     from dopepp.core.files import write_png
     from dopepp.drawing.overlay import overlay as draw
-    from dopepp.drawing.pictures import read_rgb
     from dopepp.inference.tracker import PoseTracker
 
     frames = [path for path in sorted(folder.glob("*")) if path.suffix.lower() in FRAMES]
@@ -125,8 +235,8 @@ def _track(estimator: PoseEstimator, folder: Path, K: CameraMatrix, overlay: Pat
         raise UserError(f"--track of {folder}", allowed, "pass the folder of a sequence")
     tracker = PoseTracker(estimator)
     for frame in frames:
-        picture = read_rgb(frame)
-        tracks = tracker.track(picture, K)
+        picture, K = lens.picture(frame)
+        tracks = tracker.track(picture, K, cropped=lens.crop is not None)
         for one in tracks:
             record = {"frame": frame.name, "identity": one.identity, **_record(one.detection)}
             typer.echo(json.dumps(record))

@@ -1,4 +1,4 @@
-"""Files that are there completely or not at all, also PNG and CSV, and the user's cache folder.
+"""Files that are there completely or not at all, also pictures and CSV; the user's cache.
 
 A file is written beside its place under a name of :func:`partial_path` and renamed when it is
 whole. What a killed process leaves is such a partial file, which :func:`is_abandoned` recognises.
@@ -9,6 +9,7 @@ after.
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import io
 import os
@@ -23,6 +24,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from dopepp.core.errors import UserError
+
+PICTURES: Final = (".png", ".jpg", ".jpeg")
+"""Suffixes of the pictures that :func:`write_picture` writes."""
+
 
 def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB image; a ValueError, where it is not uint8 (H, W, 3), or empty."""
@@ -30,6 +36,31 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     write_whole(path, encoded.tobytes())
+
+
+def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write an RGB image as its suffix says, one of :data:`PICTURES`."""
+    encoded = cv2.imencode(path.suffix.lower(), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    write_whole(path, encoded.tobytes())
+
+
+def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
+    """Check that a file can be written, and make its folder, before the work is done for it.
+
+    A :class:`UserError`: it has none of the suffixes, is a folder, or may not be written.
+    """
+    if suffixes and path.suffix.lower() not in suffixes:
+        got = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
+        raise UserError(got, f"a file with one of the suffixes {', '.join(suffixes)}", "name it so")
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial_path(path).touch()
+        partial_path(path).unlink()
+    except OSError as error:
+        allowed = "a file that can be written"
+        raise UserError(f"{path}: {error.strerror}", allowed, "choose another place") from error
 
 
 def write_csv(

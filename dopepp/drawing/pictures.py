@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from dopepp.core.errors import UserError
 
@@ -50,6 +50,9 @@ MAX_PIXELS: Final = 64_000_000
 
 MAX_BYTES: Final = 256_000_000
 """Of a picture's file: as many pixels as :data:`MAX_SIDE` allows, without compression."""
+
+DARKEST: Final = 16
+"""Brightest value, of 255, of 16-bit pixels that hold no more than 12 bits."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8"
@@ -146,6 +149,40 @@ def read_rgb(path: Path) -> Picture:
     return np.ascontiguousarray(image[..., :3])
 
 
+def read_photo(path: Path) -> Picture:
+    """Read what a camera or a person has saved as RGB, upright: as OpenCV reads it, and no less.
+
+    The format is one of :data:`FORMATS`. An EXIF orientation is applied, an alpha channel dropped;
+    grey becomes three channels. Of 16 bits the upper eight are taken.
+
+    A UserError: the file is missing, damaged or too large, none of the formats or one of several
+    pages, its values are not 8 or 16 bits, or its 16 bits hold so little that nothing is left.
+    """
+    allowed = "a picture (PNG, JPEG, TIFF, BMP, WEBP) of 8 or 16 bits a channel"
+    save = f"save it as PNG, e.g. with ImageMagick: magick {path.name} picture.png"
+    content = read_content(path)
+    try:
+        image = whole_picture(content)
+        is_grey16 = image.mode.startswith("I") and _is_deep(image, content)
+        if getattr(image, "n_frames", 1) > 1 or (image.mode[0] in "IF" and not is_grey16):
+            raise ValueError(f"of mode {image.mode}, {getattr(image, 'n_frames', 1)} pages")
+        is_deep = _is_deep(image, content)
+        image = ImageOps.exif_transpose(image)
+    except Exception as error:  # PIL raises a different type for every way to be damaged
+        raise UserError(f"image {path}: {_reason(error)}", allowed, save) from error
+    if is_grey16:
+        picture = np.repeat((np.asarray(image, np.uint16) >> 8)[..., None], 3, 2).astype(np.uint8)
+    else:  # of 16-bit colours, Pillow has taken the upper eight itself
+        picture = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    if is_deep and picture[..., :3].max() < DARKEST:
+        raise UserError(
+            f"image {path} of 16 bits, the brightest of which is {picture[..., :3].max()} of 255",
+            "16 bits that are used, not 10 or 12 of a sensor's",
+            f"stretch it: magick {path.name} -auto-level -depth 8 picture.png",
+        )
+    return np.ascontiguousarray(picture[..., :3])
+
+
 def _content(path: Path) -> bytes:
     with path.open("rb") as file:
         content = file.read(MAX_BYTES + 1)
@@ -197,6 +234,12 @@ def _is_deep_colour(content: bytes) -> bool:
     """Tell whether a PNG's header (behind signature, length, type and size) says 16-bit colour."""
     depth, colour = content[24:26]
     return content.startswith(_PNG) and depth == 16 and colour != 0
+
+
+def _is_deep(image: Image.Image, content: bytes) -> bool:
+    """Tell whether a picture has 16 bits a channel, by a PNG's header or a TIFF's entry."""
+    bits = getattr(image, "tag_v2", {}).get(ExifTags.Base.BitsPerSample, (8,))
+    return max(bits) == 16 or (content.startswith(_PNG) and content[24] == 16)
 
 
 def _reason(error: Exception) -> str:

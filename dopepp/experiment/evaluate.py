@@ -13,6 +13,7 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_png
 from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
+from dopepp.data.sample import Source
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.build.sources import (
@@ -34,6 +35,7 @@ from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Part, Parts
+from dopepp.recovery.silence import summary
 
 
 def measure_and_record(
@@ -89,6 +91,7 @@ def measure_and_record(
     main.details.update(details or {})
     for report in reports:
         display.show_report(report, all_measures)
+    _show_silence(methods, measured.silent, source)
     if refines:
         share = made_worse(main, reports[-1])
         main.details |= {REFINED: reports[-1].to_record(), "made_worse": share}
@@ -119,6 +122,18 @@ def measure_and_record(
         conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
     display.show_files(run_dir)
     return reports
+
+
+def _show_silence(
+    methods: Mapping[str, evaluators.Method], silent: Mapping[str, Sequence[int]], source: Source
+) -> None:
+    """Print of every estimator on how many images it found nothing, and why."""
+    for name, numbers in silent.items():
+        method = methods[name]
+        if numbers and isinstance(method, evaluators.EstimatorMethod):
+            reasons = [method.silence(source.sample(number, 0)) for number in numbers]
+            line = summary([one for one in reasons if one is not None], len(source))
+            display.console.print(f"{name}: {line}")
 
 
 def tune_and_record(

@@ -246,7 +246,7 @@ def _by_object(
     """Run an estimator over a source; for every image and part what was found and what is there."""
     for number in range(len(source)):
         sample = source.sample(number, 0)
-        found = estimator.predict(sample.image, sample.K)
+        found = estimator.predict(sample.image, sample.K, cropped=True)
         for part in parts:
             own = [one for one in found if one.object == part.name]
             true = [one for one in sample.instances if one.label == part.name]

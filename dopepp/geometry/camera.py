@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -170,25 +172,60 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
     return camera_matrix(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
 
-def check_camera(K: CameraMatrix, image_size: tuple[int, int], source: str) -> CameraMatrix:
+LEAST_VIEW_DEG: Final = 5.0
+MOST_VIEW_DEG: Final = 150.0
+"""Of a whole picture's longer side."""
+
+WHOLE: Final = 0.2
+"""How far off its middle the principal point of a whole picture may be, share of a side: lenses'
+are within a tenth, and that of a picture half or one and a half times as large is a quarter off."""
+
+INSIDE: Final = 0.5
+"""Idem of a picture that may have been cut out of a larger one, as some data sets' are."""
+
+ANYWHERE: Final = math.inf
+"""Idem of a picture that is known to have been cut out."""
+
+
+def check_camera(
+    K: CameraMatrix, image_size: tuple[int, int], source: str, off_centre: float = INSIDE
+) -> CameraMatrix:
     """Return K as float64 after checking that it can belong to an image of (width, height).
 
-    A :class:`UserError`: K is not a finite pinhole matrix, its principal point lies outside the
-    image, or its focal length gives a field of view outside 5° – 150°.
+    A :class:`UserError`: K is not a finite pinhole matrix, its principal point is farther than
+    ``off_centre`` (a share of the side) from the image's middle, or its focal length gives a field
+    of view outside 5° – 150°. What was cut out (``ANYWHERE``) may see less than 5°.
     """
     width, height = image_size
     K = pinhole_matrix(K, source)
-    fits = 0 <= K[0, 2] < width and 0 <= K[1, 2] < height
-    # 5° and 150° of view are focal lengths of 11.5 and 0.13 image widths.
     longest = max(width, height)
-    if not fits or not all(0.13 * longest <= f <= 11.5 * longest for f in (K[0, 0], K[1, 1])):
-        raise UserError(
-            f"K with fx={K[0, 0]:.6g}, fy={K[1, 1]:.6g}, cx={K[0, 2]:.6g}, cy={K[1, 2]:.6g} "
-            f"for the {width}×{height} image of {source}",
-            "a principal point inside the image and a field of view of 5° – 150°",
-            "pass the K of this image size (K scales with the image)",
-        )
-    return K
+    at = np.array([(K[0, 2] + 0.5) / width, (K[1, 2] + 0.5) / height])
+    views = np.degrees(2 * np.arctan2(longest / 2, K.diagonal()[:2])).round(1)
+    narrowest = LEAST_VIEW_DEG if off_centre < ANYWHERE else 0.0
+    is_central = np.abs(at - 0.5).max() <= off_centre
+    if is_central and narrowest <= views.min() and views.max() <= MOST_VIEW_DEG:
+        return K
+    middle = f"within {0.5 - off_centre:.0%} – {0.5 + off_centre:.0%} of width and height"
+    middle = "inside the image" if off_centre == INSIDE else middle
+    raise UserError(
+        f"K with fx={K[0, 0]:.6g}, fy={K[1, 1]:.6g}, cx={K[0, 2]:.6g}, cy={K[1, 2]:.6g} "
+        f"for the {width}×{height} image of {source}: principal point at {at[0]:.0%} of its width "
+        f"and {at[1]:.0%} of its height, field of view {views.max():.3g}°",
+        ("" if off_centre == ANYWHERE else f"a principal point {middle} and ")
+        + f"a field of view of {narrowest:g}° – {MOST_VIEW_DEG:g}°",
+        "pass the K of this image's size (K scales with the image)"
+        + _likely_size(K, at, off_centre),
+    )
+
+
+def _likely_size(K: CameraMatrix, at: Float[np.ndarray, "2"], off_centre: float) -> str:
+    """Say of which image's size K looks, where it is off: twice its principal point."""
+    if off_centre != WHOLE or np.abs(at - 0.5).max() <= WHOLE or (at <= 0).any():
+        return ""
+    size = f"{2 * K[0, 2] + 1:.0f}×{2 * K[1, 2] + 1:.0f}"
+    return (
+        f": this one is likely of {size} (--K-size); of an image that was cut out, say so (--crop)"
+    )
 
 
 def _is_pinhole(K: CameraMatrix) -> bool:

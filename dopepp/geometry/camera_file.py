@@ -10,15 +10,29 @@ To read a further format, see the modules of :mod:`dopepp.geometry.camera_files`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import CameraMatrix, pinhole_matrix
+from dopepp.geometry.camera import (
+    ANYWHERE,
+    WHOLE,
+    CameraMatrix,
+    check_camera,
+    pinhole_matrix,
+    resize_camera,
+)
 from dopepp.geometry.camera_files.fields import read_fields
 from dopepp.geometry.camera_files.numbers import read_lines
 from dopepp.geometry.camera_files.values import FORMATS, Size
+
+Crop = tuple[int, int, int, int]
+"""x and y of the upper left pixel, width and height, pixels."""
 
 MAX_BYTES: Final = 250_000
 """A calibration with all the points it was made of takes less; YAML of this size takes 10 s."""
@@ -42,6 +56,64 @@ class Camera:
     K: CameraMatrix
     distortion: tuple[float, ...]
     source: str
+
+    @property
+    def coefficients(self) -> Float[np.ndarray, "coefficients"] | None:
+        """The distortion as OpenCV and ``PoseEstimator.predict`` take it, None where is none."""
+        return np.array(self.distortion) if self.distortion else None
+
+    def undistorted(
+        self, picture: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Return a picture of this camera as a lens without distortion takes it, K the same."""
+        if self.coefficients is None:
+            return picture
+        return np.asarray(cv2.undistort(picture, self.K, self.coefficients))
+
+    def for_picture(
+        self, size: Size, K_size: Size | None = None, crop: Crop | None = None
+    ) -> Camera:
+        """Return the camera of a picture of (width, height), its K checked against that size.
+
+        Args:
+            size: The picture's.
+            K_size: The size that K belongs to, where the picture is the whole one, resized.
+            crop: What of the calibrated picture this one is, where it was cut out of it.
+
+        Raises:
+            UserError: K belongs to another size and it is not said how the picture came about, or
+                what is said cannot be.
+        """
+        own = self._own_size(K_size, crop)
+        if own is not None:
+            check_camera(self.K, own, self.source, WHOLE)
+        if crop is not None:
+            K = check_camera(_cut(self.K, own, size, crop), size, self.source, ANYWHERE)
+        elif own is None or own == size:
+            K = check_camera(self.K, size, self.source, WHOLE)
+        elif K_size is None or not _one_shape(size, own):
+            raise UserError(
+                f"{self.source}, whose K is of {_by(own)}, for a picture of {_by(size)}",
+                "K of the picture's size, or how the picture was made of one of the other",
+                _fix(size, own),
+            )
+        else:
+            K = resize_camera(self.K, size[0] / own[0], size[1] / own[1])
+        return replace(self, size=size, K=K)
+
+    def _own_size(self, said: Size | None, crop: Crop | None) -> Size | None:
+        """Return the size that K belongs to, by the file or by what is said."""
+        if said is not None and crop is not None:
+            got, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
+            raise UserError(got, "one of the two", fix)
+        if said is not None and min(said) < 1:
+            raise UserError(
+                f"--K-size {said[0]} {said[1]}", "width and height above 0", "correct it"
+            )
+        if said is not None and self.size is not None and said != self.size:
+            got = f"--K-size {said[0]} {said[1]} with {self.source}"
+            raise UserError(got, f"the file's own size, {_by(self.size)}", "correct it")
+        return said or self.size
 
 
 def read_camera(path: Path | str) -> Camera:
@@ -94,3 +166,45 @@ def _text(path: Path) -> str:
         got = f"camera file {path}: byte {error.start} is no UTF-8"
         raise UserError(got, allowed, "pass the camera's file") from error
     return text.strip()
+
+
+def _cut(K: CameraMatrix, own: Size | None, size: Size, crop: Crop) -> CameraMatrix:
+    """Return the K of what was cut out of a picture."""
+    x, y, width, height = crop
+    said = "--crop " + " ".join(map(str, crop))
+    if (width, height) != size:
+        got = f"{said} with a picture of {_by(size)}"
+        raise UserError(got, "the picture's width and height behind x and y", "correct it")
+    beyond = own is not None and (x + width > own[0] or y + height > own[1])
+    if min(x, y) < 0 or beyond:
+        inside = f"inside the calibrated picture{f' of {_by(own)}' if own else ''}"
+        raise UserError(said, f"x y width height {inside}", "correct it")
+    K = K.copy()
+    K[:2, 2] -= x, y
+    return K
+
+
+def _one_shape(one: Size, other: Size) -> bool:
+    """Tell whether one size is the other resized, but for rounding to whole pixels."""
+    return (
+        min(abs(one[0] - one[1] * other[0] / other[1]), abs(one[1] - one[0] * other[1] / other[0]))
+        <= 1
+    )
+
+
+def _fix(size: Size, own: Size) -> str:
+    """Say what to do where a picture's size is not the one that K belongs to."""
+    cut = (
+        ""
+        if size[0] > own[0] or size[1] > own[1]
+        else (f"--crop X Y {size[0]} {size[1]} if it was cut out")
+    )
+    if _one_shape(size, own):
+        return f"--K-size {own[0]} {own[1]} if the picture was resized" + (cut and f", {cut}")
+    if size == own[::-1]:
+        return "turn the picture back, or calibrate the turned one (EXIF orientation is applied)"
+    return cut or f"calibrate the camera at {_by(size)}"
+
+
+def _by(size: Size) -> str:
+    return f"{size[0]}×{size[1]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
@@ -15,7 +16,14 @@ from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Letterbox, check_camera, project_keypoints
+from dopepp.geometry.camera import (
+    ANYWHERE,
+    WHOLE,
+    CameraMatrix,
+    Letterbox,
+    check_camera,
+    project_keypoints,
+)
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference.refinement.refiner import make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
@@ -27,6 +35,7 @@ from dopepp.parts.part import Part
 from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
+from dopepp.recovery.silence import Reason, rejected_refined
 
 Decoded = TypeVar("Decoded")
 
@@ -68,7 +77,7 @@ class PoseEstimator:
         self.checkpoint = checkpoint
         self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
-        self.device = torch.device(device)
+        self.device = checked_device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
@@ -107,6 +116,7 @@ class PoseEstimator:
         depth: Depth | None = None,
         distances: Distances | None = None,
         roi: Region | None = None,
+        cropped: bool = False,
     ) -> list[Detection]:
         """Find all known objects on one image.
 
@@ -125,6 +135,8 @@ class PoseEstimator:
                 where training had them, ``any`` wherever the network can see them. The farther
                 apart, the more often it looks.
             roi: Look in this part of the image only: (x, y, width, height), pixels.
+            cropped: The image may be cut out of the camera's, so that the principal point may lie
+                anywhere; elsewhere a K that is off the middle is taken for another size's.
 
         Returns:
             Detections, best score first, in pixels of the given size and metres. A refined one has
@@ -136,7 +148,7 @@ class PoseEstimator:
             UserError: The image is no RGB picture, K cannot belong to it, there is no lens model
                 with so many coefficients, or the depth is not aligned or not in metres.
         """
-        image, K = checked_picture(image, K)
+        image, K = checked_picture(image, K, cropped)
         if depth is not None:
             depth = checked_depth(depth, (image.shape[1], image.shape[0]))
         if distortion is not None:
@@ -185,17 +197,26 @@ class PoseEstimator:
         self,
         image: Picture,
         K: CameraMatrix,
+        depth: Depth | None = None,
         distances: Distances | None = None,
         roi: Region | None = None,
-    ) -> list[str]:
-        """Say what :meth:`predict` leaves out of an image and why, one line an object or centroid.
+        cropped: bool = False,
+    ) -> list[Reason]:
+        """Say what :meth:`predict` leaves out of an image and why, for each object or centroid.
 
-        What :meth:`predict` refuses is a :class:`UserError`.
+        The image is without distortion. What :meth:`predict` refuses is a :class:`UserError`.
         """
-        image, K = checked_picture(image, K)
-        window, K, _ = cut(image, K, roi)
-        boxes = letterboxes(self.checkpoint, K, window, distances)
-        return [line for box in boxes for line in self._decode(explain, window, K, box)]
+        image, K = checked_picture(image, K, cropped)
+        window, K_window, _ = cut(image, K, roi)
+        boxes = letterboxes(self.checkpoint, K_window, window, distances)
+        reasons = [one for box in boxes for one in self._decode(explain, window, K_window, box)]
+        least = self.recovery.refined_min_score
+        if self.refiner is None or least == 0:
+            return reasons
+        lenient = copy.copy(self)
+        lenient.recovery = replace(self.recovery, refined_min_score=0.0)
+        judged = lenient.predict(image, K, None, depth, distances, roi, cropped)
+        return reasons + [rejected_refined(one, least) for one in judged if one.score < least]
 
     def _detect(
         self,
@@ -238,6 +259,18 @@ class PoseEstimator:
         return belief[0].float(), field[0].float()
 
 
+def checked_device(device: str | torch.device) -> torch.device:
+    """Return a device that can compute; a :class:`UserError` where there is none of this name."""
+    try:
+        chosen = torch.device(device)
+        torch.zeros(1, device=chosen).item()  # asks the driver
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        there = "cpu or cuda" if torch.cuda.is_available() else "cpu (this PyTorch has no cuda)"
+        reason = str(error).partition("\n")[0]
+        raise UserError(f"device {device} ({reason:.100})", there, "pass one of these") from error
+    return chosen
+
+
 def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
     """Turn the thresholds of a config or a checkpoint into options.
 
@@ -263,8 +296,13 @@ def letterboxed(
     return np.pad(image, ((0, rows), (0, columns), (0, 0)))
 
 
-def checked_picture(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMatrix]:
-    """Check that the arguments are an RGB image and its camera matrix; a UserError if not."""
+def checked_picture(
+    image: Picture, K: CameraMatrix, cropped: bool = False
+) -> tuple[Picture, CameraMatrix]:
+    """Check that the arguments are an RGB image and its camera matrix; a UserError if not.
+
+    The principal point of one that was ``cropped`` may lie anywhere.
+    """
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise UserError(
@@ -273,7 +311,8 @@ def checked_picture(image: Picture, K: CameraMatrix) -> tuple[Picture, CameraMat
             "convert the image, e.g. cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)",
         )
     # Flipped views, as of bgr[..., ::-1], have strides that OpenCV and torch do not take.
-    return np.ascontiguousarray(image), check_camera(K, (image.shape[1], image.shape[0]), "predict")
+    size, off_centre = (image.shape[1], image.shape[0]), ANYWHERE if cropped else WHOLE
+    return np.ascontiguousarray(image), check_camera(K, size, "predict", off_centre)
 
 
 def _checked_distortion(distortion: Coefficients) -> Coefficients:

@@ -145,12 +145,13 @@ class PoseTracker:
         self._frame = 0
         self._identities = 0
 
-    def track(self, image: Picture, K: CameraMatrix) -> list[Track]:
+    def track(self, image: Picture, K: CameraMatrix, cropped: bool = False) -> list[Track]:
         """Find the parts on the next frame.
 
         Args:
             image: RGB, uint8, without lens distortion.
             K: Camera matrix, pixels.
+            cropped: As :meth:`PoseEstimator.predict` takes it.
 
         Returns:
             The parts that were found, in the order of their identities.
@@ -158,7 +159,7 @@ class PoseTracker:
         Raises:
             UserError: The image is no RGB picture, or K cannot belong to it.
         """
-        image, K = checked_picture(image, K)
+        image, K = checked_picture(image, K, cropped)
         for state in self._states:
             self._follow(state, image, K)
         due = self._frame % self.detect_every == 0
@@ -203,7 +204,8 @@ class PoseTracker:
 
     def _look(self, image: Picture, K: CameraMatrix) -> None:
         """Let the network look, and tell known parts from new ones."""
-        found = [one for one in self._estimator.predict(image, K) if not one.kept]
+        found = self._estimator.predict(image, K, cropped=True)  # checked before
+        found = [one for one in found if not one.kept]
         for state, one in self._matched(found):
             if state is None:
                 track = Track(self._identities, one, np.zeros(6), detected=True)

@@ -2,5 +2,6 @@
 
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover, recover_batch
+from dopepp.recovery.silence import Reason
 
-__all__ = ["Detection", "RecoveryOptions", "explain", "recover", "recover_batch"]
+__all__ = ["Detection", "Reason", "RecoveryOptions", "explain", "recover", "recover_batch"]

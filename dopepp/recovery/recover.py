@@ -15,6 +15,7 @@ from dopepp.maps.peaks import find_peaks
 from dopepp.recovery.association import ObjectPeaks
 from dopepp.recovery.calibration import RecoveryOptions, calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
+from dopepp.recovery.silence import Reason, low_score, no_centroid, no_pose
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
@@ -52,18 +53,18 @@ def recover_batch(
     K: Cameras,
     stride: int = 8,
     names: Sequence[str] | None = None,
-    reasons: list[str] | None = None,
+    reasons: list[Reason] | None = None,
     **options: float,
 ) -> list[list[Detection]]:
     """Recover the poses on every image of a batch; see :func:`recover`.
 
-    Peaks are found and read on the maps' device; only they come to the host. ``reasons`` takes a
-    line for each object or centroid that is left out. A ``ValueError``: the channels do not match
+    Peaks are found and read on the maps' device; only they come to the host. ``reasons`` takes one
+    for each object or centroid that is left out. A ``ValueError``: the channels do not match
     the number of cuboids, maps differ in size or have no cells, or there are not as many cameras as
     images or names as objects. A :class:`UserError`: an option is out of range.
     """
     chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
-    reasons = [] if reasons is None else reasons
+    left_out: list[Reason] = [] if reasons is None else reasons
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
     _check_shapes(belief, field, len(cuboids), K)
     labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
@@ -80,7 +81,10 @@ def recover_batch(
         detections: list[Detection] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
             own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, reasons)
+            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, left_out)
+            if reasons is not None and not len(own.centroid):
+                beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
+                reasons.append(no_centroid(beliefs, name, chosen))
         batch.append(sorted(detections, key=lambda one: -one.score))
     return batch
 
@@ -93,9 +97,9 @@ def explain(
     stride: int = 8,
     names: Sequence[str] | None = None,
     **options: float,
-) -> list[str]:
-    """Say what :func:`recover` leaves out of these maps and why, one line an object or centroid."""
-    reasons: list[str] = []
+) -> list[Reason]:
+    """Say what :func:`recover` leaves out of these maps and why, for each object or centroid."""
+    reasons: list[Reason] = []
     image = np.asarray(K)[None]
     recover_batch(belief[None], field[None], cuboids, image, stride, names, reasons, **options)
     return reasons
@@ -109,21 +113,19 @@ def _recover_object(
     options: RecoveryOptions,
     stride: int,
     size: str,
-    reasons: list[str],
+    reasons: list[Reason],
 ) -> Iterator[Detection]:
     """Yield all instances of one object, and add a reason for each that is none."""
-    if not len(peaks.centroid):
-        reasons.append(f"{name}: no centroid's belief reaches {options.centroid_threshold:g}")
     for group, result in pose_instances(peaks, cuboid, K, options.max_angle_deg, float(stride)):
         detection = make_detection(group, result, cuboid, K, name)
         x, y = group.position[CENTROID]
-        where = f"{name} at pixel ({x:.0f}, {y:.0f}) of {size}"
+        where = f"at pixel ({x:.0f}, {y:.0f}) of {size}"
         if detection is None:
-            reasons.append(f"{where}: {result.reason}")
+            reasons.append(no_pose(group, result.reason, name, where, stride))
             continue
         detection = calibrated(detection, cuboid, K, options)
         if detection.score < options.min_score:
-            reasons.append(f"{where}: score {detection.score:.3f} below {options.min_score:g}")
+            reasons.append(low_score(detection, options.min_score, where, stride))
         else:
             yield detection
 

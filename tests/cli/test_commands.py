@@ -72,7 +72,8 @@ def test_predict_prints_json_lines_and_draws(checkpoint, picture, tmp_path):
 def test_predict_says_in_one_line_why_there_is_nothing(write_checkpoint, picture):
     done = call("predict", write_checkpoint(centroid_threshold=1.0), picture, *K)
     assert (done.exit_code, done.stdout) == (0, "")
-    assert "pivconnector: no centroid" in done.stderr
+    assert done.stderr.startswith("nothing found: pivconnector: ")
+    assert "belief" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

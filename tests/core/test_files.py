@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dopepp.core.files import write_png, write_whole
+from dopepp.core.errors import UserError
+from dopepp.core.files import PICTURES, check_target, write_picture, write_png, write_whole
 
 
 def test_a_png_keeps_its_pixels_in_rgb(tmp_path):
@@ -39,3 +40,31 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
         write_whole(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("name", "head"), [("a.png", b"\x89PNG"), ("b.JPG", b"\xff\xd8")])
+def test_a_pictures_suffix_decides_its_format(name, head, tmp_path):
+    check_target(tmp_path / "new" / name, PICTURES)
+    assert list((tmp_path / "new").iterdir()) == []
+    write_picture(tmp_path / "new" / name, np.full((4, 6, 3), (200, 100, 50), np.uint8))
+    assert (tmp_path / "new" / name).read_bytes().startswith(head)
+    back = cv2.imread(str(tmp_path / "new" / name))[..., ::-1]
+    assert np.abs(back.astype(int) - (200, 100, 50)).max() < 4
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.gif", r"suffixes \.png, \.jpg, \.jpeg"),
+        ("a", "to write; allowed"),
+        (".", "which is a folder; allowed"),
+        ("folder.png", "Is a directory"),
+        ("file/a.png", "File exists|Not a directory"),
+        ("/proc/none/a.png", "No such file"),
+    ],
+)
+def test_where_nothing_can_be_written(name, message, tmp_path):
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=message):
+        check_target(tmp_path / name, PICTURES)

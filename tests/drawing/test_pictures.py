@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import read_image, read_rgb
+from dopepp.drawing.pictures import read_image, read_photo, read_rgb
 
 
 @pytest.fixture
@@ -88,3 +88,50 @@ def test_bombs_and_huge_files_are_not_decoded(tmp_path):
         file.truncate(10**10)
     with pytest.raises(UserError, match=r"more than 256 MB; allowed: at most 256 MB"):
         read_image(path)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_is_turned_as_opencv_turns_it(tmp_path, image, orientation):
+    path, exif = tmp_path / "photo.jpg", Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(image).save(path, exif=exif, quality=95)
+    expected = cv2.imread(str(path))[..., ::-1]
+    assert read_photo(path).shape == expected.shape
+    np.testing.assert_allclose(read_photo(path).astype(int), expected.astype(int), atol=4)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_photos_of_8_and_16_bits(tmp_path, image, suffix, channels, kind):
+    if (suffix, channels > 1, kind) == (".tiff", True, np.uint16):
+        pytest.skip("Pillow reads no 16-bit colours from TIFF")
+    wide = np.dstack([image, image[..., :1]])[..., :channels].astype(kind)
+    if kind == np.uint16:
+        wide = 256 * wide + 200  # as a 16-bit value, cut off to what it was
+    path = tmp_path / f"photo{suffix}"
+    cv2.imwrite(str(path), wide[..., [2, 1, 0, 3][:channels]] if channels > 2 else wide)
+    expected = image if channels > 1 else image[..., [0, 0, 0]]
+    np.testing.assert_array_equal(read_photo(path), expected)
+
+
+def test_photos_that_are_refused_say_what_to_do(tmp_path, image):
+    def refused(name, fix):
+        with pytest.raises(UserError, match=fix) as caught:
+            read_photo(tmp_path / name)
+        assert name in str(caught.value)
+
+    for name in ("photo.gif", "several.tiff"):
+        pages = [Image.fromarray(image), Image.fromarray(image[::-1])]
+        pages[0].save(tmp_path / name, save_all=True, append_images=pages[1:])
+        refused(name, f"fix: save it as PNG, e.g. with ImageMagick: magick {name} picture.png")
+    Image.fromarray(image[..., 0].astype(np.float32)).save(tmp_path / "float.tiff")
+    refused("float.tiff", "of mode F")
+    # A sensor's 12 bits in 16: the upper eight of them are next to black.
+    cv2.imwrite(str(tmp_path / "raw.png"), 16 * image[..., 0].astype(np.uint16))
+    refused("raw.png", "-auto-level")
+    cv2.imwrite(str(tmp_path / "colours.png"), 16 * image.astype(np.uint16))
+    refused("colours.png", "-auto-level")
+    (tmp_path / "text.png").write_text("no picture")
+    refused("text.png", "save it as PNG")
+    refused("missing.png", "restore it")

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -5,6 +8,7 @@ from dopepp.experiment.evaluate import evaluate, made_worse
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.runs.record import METRICS_FILE, read_json
+from dopepp.models.checkpoint.schema import read, write_atomic
 
 
 def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
@@ -29,3 +33,14 @@ def test_worse_is_by_more_than_a_millimetre():
     network = report(0.002, 0.002, 0.002, np.inf)
     refined = report(0.0029, 0.0031, 0.0001, np.inf)
     assert made_worse(network, refined) == pytest.approx(1 / 5)
+
+
+def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
+    released = read(Path("pretrained/pivconnector"))
+    strict = replace(released, recovery={**released.recovery, "min_score": 1.0})
+    write_atomic(strict.to_file(), tmp_path / "strict.ckpt")
+    options = (f"ckpt_path={tmp_path / 'strict.ckpt'}", "+data.num_test=3")
+    evaluate(composed(*options, config="evaluate"), tmp_path / "run")
+    (line,) = [one for one in capsys.readouterr().out.splitlines() if "images silent:" in one]
+    assert line.startswith("dopepp: 3 of 3 images silent: ")
+    assert "below the threshold (best score 0." in line

@@ -8,6 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
+    ANYWHERE,
+    INSIDE,
+    WHOLE,
     Letterbox,
     camera_matrix,
     check_camera,
@@ -149,6 +152,53 @@ def test_bad_camera(bad, message):
         check_camera(bad, (640, 480), "frame 7")
     assert "frame 7" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("off_centre", "principal", "good"),
+    [
+        (WHOLE, (0.5, 0.5), True),
+        (WHOLE, (0.31, 0.69), True),
+        (WHOLE, (0.29, 0.5), False),
+        (WHOLE, (0.5, 0.71), False),
+        (INSIDE, (0.01, 0.99), True),
+        (INSIDE, (-0.01, 0.5), False),
+        (ANYWHERE, (-7.0, 30.0), True),
+    ],
+)
+def test_how_far_off_the_middle_the_principal_point_may_be(off_centre, principal, good):
+    x, y = np.array([640, 480]) * principal - 0.5
+    there = camera_matrix(600, 600, x, y)
+    if good:
+        assert_array_equal(check_camera(there, (640, 480), "test", off_centre), there)
+        return
+    with pytest.raises(UserError, match=f"at {principal[0]:.0%} of its width"):
+        check_camera(there, (640, 480), "test", off_centre)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 1.5, 2.0])
+def test_the_k_of_another_resolution_is_told_with_its_likely_size(scale):
+    """A lens like real ones', its picture a quarter to twice as large as that of its K."""
+    own = camera_matrix(600, 610, 310.5, 245.25)
+    size = (round(640 / scale), round(480 / scale))
+    with pytest.raises(UserError) as caught:
+        check_camera(own, size, "p.png", WHOLE)
+    assert "likely of 622×492" in str(caught.value)
+    assert f"{size[0]}×{size[1]} image of p.png" in str(caught.value)
+    assert "field of view" in str(caught.value)
+
+
+@pytest.mark.parametrize(("degrees", "good"), [(4.8, False), (5, True), (150, True), (151, False)])
+def test_a_picture_sees_5_to_150_degrees(degrees, good):
+    focal = 320 / np.tan(np.radians(degrees) / 2)
+    K = camera_matrix(focal, focal, 319.5, 239.5)
+    if good:
+        check_camera(K, (640, 480), "test", WHOLE)
+        return
+    with pytest.raises(UserError, match=f"field of view {degrees:g}°"):
+        check_camera(K, (640, 480), "test", WHOLE)
+    if degrees < 5:  # what was cut out of a picture may see as little as that
+        check_camera(K, (640, 480), "test", ANYWHERE)
 
 
 def test_a_step_between_two_poses_makes_one_of_the_other():

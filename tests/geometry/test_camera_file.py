@@ -339,3 +339,68 @@ def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
     assert isinstance(camera, Camera)
     assert np.isfinite(camera.K).all()
     assert np.isfinite(camera.distortion).all()
+
+
+def seen(points: np.ndarray, camera: Camera) -> np.ndarray:
+    lens = np.array(camera.distortion) if camera.distortion else None
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, lens)[0][:, 0]
+
+
+POINTS = np.random.default_rng(0).uniform([-0.2, -0.15, 0.8], [0.2, 0.15, 1.2], (20, 3))
+CAMERA = Camera((640, 480), K, LENS, "lens.yaml")
+UNSAID = Camera(None, K, (), "--K")
+
+
+@pytest.mark.parametrize("camera", [CAMERA, UNSAID])
+def test_the_camera_of_a_picture(camera):
+    """As a picture is resized or cut, so is where its camera sees a point, lens and all."""
+    whole = seen(POINTS, camera)
+    assert_array_equal(camera.for_picture((640, 480)).K, K)
+    half = camera.for_picture((320, 240), K_size=(640, 480))
+    assert (half.size, half.distortion) == ((320, 240), camera.distortion)
+    assert_allclose(seen(POINTS, half), (whole + 0.5) / 2 - 0.5, atol=1e-9)
+    odd = camera.for_picture((213, 160), K_size=(640, 480))  # 213⅓: rounded to whole pixels
+    assert_allclose(seen(POINTS, odd), (whole + 0.5) * [213 / 640, 1 / 3] - 0.5, atol=1e-9)
+    corner = camera.for_picture((100, 60), crop=(500, 400, 100, 60))
+    assert_allclose(seen(POINTS, corner), whole - [500, 400], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("camera", "size", "options", "message"),
+    [
+        (CAMERA, (320, 240), {}, "K is of 640×480, for a picture of 320×240"),
+        (CAMERA, (320, 240), {}, "--K-size 640 480 if the picture was resized, --crop X Y 320 240"),
+        (CAMERA, (1280, 960), {}, "fix: --K-size 640 480 if the picture was resized$"),
+        (CAMERA, (640, 360), {}, "fix: --crop X Y 640 360 if it was cut out"),
+        (CAMERA, (480, 640), {}, "fix: turn the picture back"),
+        (CAMERA, (1280, 720), {}, "fix: calibrate the camera at 1280×720"),
+        (CAMERA, (1280, 720), {"K_size": (640, 480)}, "fix: calibrate the camera at 1280×720"),
+        (CAMERA, (320, 240), {"K_size": (1280, 960)}, "--K-size 1280 960 with lens.yaml"),
+        (UNSAID, (320, 240), {"K_size": (1280, 960)}, "1280×960 image of --K.*likely of 638×486"),
+        (UNSAID, (320, 240), {"K_size": (0, 5)}, "--K-size 0 5; allowed: width and height above"),
+        (UNSAID, (1280, 960), {}, "1280×960 image of --K: principal point at 25% of its width"),
+        (CAMERA, (9, 9), {"K_size": (640, 480), "crop": (0, 0, 9, 9)}, "--K-size with --crop"),
+        (CAMERA, (9, 9), {"crop": (0, 0, 10, 9)}, "--crop 0 0 10 9 with a picture of 9×9"),
+        (CAMERA, (9, 9), {"crop": (632, 0, 9, 9)}, "inside the calibrated picture of 640×480"),
+        (UNSAID, (9, 9), {"crop": (-1, 0, 9, 9)}, "--crop -1 0 9 9; allowed"),
+        (Camera((64, 48), K, (), "x"), (64, 48), {}, "64×48 image of x: principal point at 499%"),
+    ],
+)
+def test_a_k_of_another_picture_is_refused(camera, size, options, message):
+    with pytest.raises(UserError, match=message):
+        camera.for_picture(size, **options)
+
+
+def test_the_lens_is_taken_out_of_a_picture():
+    """A dot where the lens puts a point comes to lie where the pinhole puts it."""
+    point = np.array([[0.45, -0.3, 1.0]])
+    picture = np.zeros((480, 640, 3), np.uint8)
+    x, y = seen(point, CAMERA)[0]
+    cv2.circle(picture, (round(x * 16), round(y * 16)), 4 * 16, (255, 255, 255), -1, shift=4)
+    straight = CAMERA.undistorted(picture)[..., 0].astype(float)
+    rows, columns = np.mgrid[:480, :640]
+    found = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
+    expected = seen(point, UNSAID)[0]
+    assert_allclose(found, expected, atol=0.3)
+    assert np.linalg.norm(expected - (x, y)) > 5
+    assert UNSAID.undistorted(picture) is picture

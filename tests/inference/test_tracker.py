@@ -33,7 +33,7 @@ class Stage:
         pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
         self.actors[name] = part.name, pose
 
-    def predict(self, image, K):
+    def predict(self, image, K, cropped=False):
         self.looks += 1
         return [
             replace(self._detection(part, pose), agreement=self.network_agreement)
@@ -157,7 +157,9 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     tracker.track(IMAGE, K)
     true = stage.predict
     turned = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, 0.3]))
-    stage.predict = lambda *given: [replace(one, T_cam_obj=turned) for one in true(*given)]
+    stage.predict = lambda *given, **options: [
+        replace(one, T_cam_obj=turned) for one in true(*given, **options)
+    ]
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
     # Frame 5 disagrees, so frame 6 looks again.
     assert detected == [False] * 5 + [True]

@@ -87,7 +87,7 @@ def decode(case: dict[str, Any]) -> list[Detection]:
     K = camera_matrix(case["focal"], case["focal"], case["principal"], case["principal"])
     found = recover(belief, field, cuboids, K)
     reasons = explain(belief, field, cuboids, K)
-    assert all("\n" not in reason for reason in reasons)
+    assert all("\n" not in str(reason) for reason in reasons)
     return found
 
 

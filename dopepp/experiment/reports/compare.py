@@ -312,7 +312,7 @@ def _tile(model: _Model, sample: Sample, colour: tuple[int, int, int]) -> Tile:
     if model.estimator is None:
         return Tile(message_picture(width * factor, height * factor, model.reason), model.name)
     try:
-        found = model.estimator.predict(sample.image, sample.K, depth=sample.depth)
+        found = model.estimator.predict(sample.image, sample.K, depth=sample.depth, cropped=True)
     except UserError as error:
         return Tile(message_picture(width * factor, height * factor, str(error)), model.name)
     known = {part.name for part in model.estimator.parts}

@@ -28,6 +28,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.parts.part import Parts
+from dopepp.recovery.silence import Reason, furthest
 
 _log = logging.getLogger(__name__)
 
@@ -99,9 +100,16 @@ class EstimatorMethod:
     def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
         """Run it; what it finds of objects that are not measured is left out."""
         start = time.perf_counter()
-        detections = self.estimator.predict(sample.image, sample.K, depth=sample.depth)
+        detections = self.estimator.predict(
+            sample.image, sample.K, depth=sample.depth, cropped=True
+        )
         seconds = time.perf_counter() - start
         return [one for one in detections if one.object in self._names], seconds
+
+    def silence(self, sample: Sample) -> Reason | None:
+        """Return why it finds nothing on an image: how its best candidate ended, if one did."""
+        found = furthest(self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True))
+        return next((one for one in reversed(found) if one.object in self._names), None)
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""

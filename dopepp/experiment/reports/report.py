@@ -152,13 +152,15 @@ def _unlisted(
 class Measured:
     """What came out of measuring methods: a report each, and pictures of the first images.
 
-    ``poses`` is every pose of each method, ``metrics`` the accumulator of each.
+    ``poses`` is every pose of each method, ``metrics`` the accumulator of each; ``silent`` are the
+    numbers of the images with instances on which each found nothing.
     """
 
     reports: list[Report]
     tiles: list[Tile]
     poses: dict[str, list[MeasuredPose]]
     metrics: dict[str, PoseMetrics]
+    silent: dict[str, list[int]]
 
 
 def measure(
@@ -171,7 +173,8 @@ def measure(
     """
     metrics = accumulators(methods)
     seconds: dict[str, list[float]] = {name: [] for name in methods}
-    measured = Measured([], [], {name: [] for name in methods}, metrics)
+    poses_of: dict[str, list[MeasuredPose]] = {name: [] for name in methods}
+    measured = Measured([], [], poses_of, metrics, {name: [] for name in methods})
     num_images = 0
     parts = {part.name: part for method in methods.values() for part in method.parts}
     seen = Fingerprint(list(parts.values()))
@@ -184,6 +187,8 @@ def measure(
             poses, taken = method.detect(sample, image)
             seconds[name] += [] if taken is None else [taken]
             metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            if sample.instances and not poses:
+                measured.silent[name].append(index)
             measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
             colour = BLUE if number < len(methods) - 1 else YELLOW
             wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]

@@ -122,13 +122,10 @@ class View:
         return float(f"{min(scale, 1.0):.3g}")
 
     def window_for(self, parts: Sequence[Part], scale: float) -> Size:
-        """Choose the window's size: the camera's shape, with room for the largest part."""
+        """Choose the window's size: a square with room for the largest part."""
         width, height = (_multiple(scale * side) for side in self.size)
-        short = _multiple(_ROOM * self.sizes_px(parts, scale)[1])
-        aspect = max(self.size) / min(self.size)
-        long = max(short, _MULTIPLE * round(aspect * short / _MULTIPLE))
-        wanted = (long, short) if self.size[0] >= self.size[1] else (short, long)
-        return min(wanted[0], width), min(wanted[1], height)
+        side = _multiple(_ROOM * self.sizes_px(parts, scale)[1])
+        return min(side, width), min(side, height)
 
     def window(self, preset: Preset, scale: float, size: Size) -> Preset:
         """Return a preset's scenes as the network sees this camera's pictures, in windows.

@@ -50,11 +50,11 @@ def my_part(parsed, camera):
 def test_what_was_chosen_stands_in_the_config_and_in_the_checkpoint(my_part, camera, caplog):
     with caplog.at_level(logging.INFO):
         config = my_part()
-    assert config.data.network_input == (224, 128)
+    assert config.data.network_input == (128, 128)
     scale = config.data.virtual.camera_scale
     assert scale == pytest.approx(70 * math.sqrt(0.4 * 0.7) / FOCAL / DIAMETER, rel=0.01)
     assert "the network sees its pictures scaled by" in caplog.text
-    assert "windows of 224×128 pixels" in caplog.text
+    assert "windows of 128×128 pixels" in caplog.text
     stored = config.stored_data()
     lens = {"width": 1280, "height": 720, "fx": FOCAL, "fy": FOCAL, "cx": 640.0, "cy": 360.0}
     assert stored["virtual"]["camera"] == lens
@@ -68,7 +68,7 @@ def test_training_sees_windows_and_who_measures_whole_pictures(my_part):
     parts = build_parts(data)
     module = build_datamodule(data, parts, 0)
     for sample in (module.train_item(0, 0), module.val_item(0, 0)):
-        assert sample.size == (224, 128)
+        assert sample.size == (128, 128)
         assert sample.K[0, 0] == pytest.approx(FOCAL * data.virtual.camera_scale)
     for split in ("val", "test"):
         sample = held_out_source(data, parts, split).sample(0)

@@ -1,0 +1,219 @@
+"""``dopepp predict`` as somebody with a camera of their own calls it, with a released network."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.parts.catalogue import pivconnector
+
+RELEASED = "pretrained/pivconnector"
+LENS = np.array([-0.25, 0.1, 0.001, -0.002, 0.0])
+
+
+def predict(*arguments: object, checkpoint: object = RELEASED) -> Result:
+    return CliRunner().invoke(app, ["predict", *map(str, (checkpoint, *arguments))])
+
+
+def poses(*arguments: object) -> list[np.ndarray]:
+    done = predict(*arguments)
+    assert done.exit_code == 0, done.output
+    return [np.array(json.loads(line)["T_cam_obj"]) for line in done.stdout.splitlines()]
+
+
+def line(done: Result, code: int) -> str:
+    """Return the one line that is all a command had to say."""
+    assert done.exit_code == code, done.output
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    from dopepp.virtual import PRESETS, Factory
+
+    return Factory([pivconnector()], PRESETS["quickstart"].resized(640, 480), 2).render(0, 5)
+
+
+@pytest.fixture(scope="module")
+def K(rendered):  # noqa: N802
+    return rendered.scene.K
+
+
+@pytest.fixture(scope="module")
+def four(K):
+    return ("--K", *K[[0, 1, 0, 1], [0, 1, 2, 2]])
+
+
+@pytest.fixture(scope="module")
+def folder(rendered, K, tmp_path_factory):
+    """Pictures of one part, each spoilt or taken in another way, and files of their cameras."""
+    folder = tmp_path_factory.mktemp("pictures")
+    picture = rendered.image[..., ::-1]
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels, K, LENS, P=K).reshape(480, 640, 2)
+    written = {
+        "whole.png": picture,
+        "deep.png": 257 * picture.astype(np.uint16),
+        "raw.png": 16 * picture.astype(np.uint16),
+        "lens.png": cv2.remap(picture, straight.astype(np.float32), None, cv2.INTER_LINEAR),
+        "half.png": cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA),
+        "cut.png": picture[:400, 8:],
+        "grey.png": cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY),
+        "4k.png": cv2.resize(picture, (3840, 2160)),
+        "dot.png": picture[:1, :1],
+        "empty.png": np.full_like(picture, 90),
+        "corner.png": picture[400:, :200],
+    }
+    for name, content in written.items():
+        cv2.imwrite(str(folder / name), content)
+    cv2.imwrite(str(folder / "anim.gif"), picture)
+    storage = cv2.FileStorage(str(folder / "lens.yaml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", LENS)
+    storage.release()
+    np.savetxt(folder / "K.txt", K)
+    (folder / "plain.json").write_text(
+        json.dumps({"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": 640,
+                    "height": 480, "depth_scale": 1.0})
+    )  # fmt: skip
+    return folder
+
+
+def test_a_camera_file_says_what_k_says(folder, four):
+    (expected,) = poses(folder / "whole.png", *four)
+    for name in ("K.txt", "plain.json"):
+        (found,) = poses(folder / "whole.png", "--camera", folder / name)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    (deep,) = poses(folder / "deep.png", *four)
+    np.testing.assert_allclose(deep, expected, atol=1e-9)
+
+
+def test_resized_and_cut_pictures_give_the_whole_ones_pose(folder, four, rendered):
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
+    plain = ("--camera", folder / "plain.json", "--refine", "region")
+    for name, said in (
+        ("half.png", ("--K-size", 640, 480)),
+        ("cut.png", ("--crop", 8, 0, 632, 400)),
+    ):
+        (found,) = poses(folder / name, *plain, *said)
+        assert np.linalg.norm(found[:3, 3] - true) < 0.001
+
+
+def test_the_lens_counts(folder, rendered, tmp_path):
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
+    picture, refine = folder / "lens.png", ("--refine", "region")
+    lens = ("--camera", folder / "lens.yaml", *refine, "--overlay", tmp_path / "drawn.jpg")
+    (found,) = poses(picture, *lens)
+    assert np.linalg.norm(found[:3, 3] - true) < 0.0005
+    without = poses(picture, "--camera", folder / "K.txt", *refine)
+    assert all(np.linalg.norm(one[:3, 3] - true) > 0.001 for one in without)
+    drawn = tmp_path / "drawn.jpg"
+    assert drawn.read_bytes().startswith(b"\xff\xd8")
+    # Drawn on the picture as a pinhole sees it, which is the rendered one.
+    shown = cv2.imread(str(drawn))[200:450, 20:300, ::-1].astype(float)
+    assert np.abs(shown - rendered.image[200:450, 20:300]).mean() < 12
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("whole.png", [], "neither --K nor --camera"),
+        ("whole.png", ["--camera", "K.txt", "--K", "9", "9", "9", "9"], "--K and --camera"),
+        ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
+        ("whole.png", ["--camera", "whole.png"], "more than 250 kB"),
+        ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
+        ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the picture was resized"),
+        ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cut out"),
+        ("4k.png", ["--camera", "plain.json"], "calibrate the camera at 3840×2160"),
+        ("4k.png", ["--camera", "K.txt"], "likely of 640×480"),
+        ("whole.png", ["--K", "100", "100", "63.5", "63.5"], "likely of 128×128"),
+        ("whole.png", ["--K", "nan", "100", "319.5", "239.5"], "3×3 pinhole"),
+        ("whole.png", ["--K", "0.1", "0.1", "319.5", "239.5"], "field of view of 5° – 150°"),
+        ("anim.gif", ["--camera", "K.txt"], "magick anim.gif picture.png"),
+        ("raw.png", ["--camera", "K.txt"], "magick raw.png -auto-level"),
+        ("whole.png", ["--camera", "K.txt", "--device", "nope"], "device nope ("),
+    ],
+)
+def test_what_cannot_be_is_one_line(folder, name, options, message, monkeypatch):
+    monkeypatch.chdir(folder)
+    said = line(predict(name, *options), 2)
+    assert said.startswith("got ")
+    assert message in said
+
+
+def test_a_device_that_is_not_there(folder, four):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    assert "device cuda (" in line(predict(folder / "whole.png", *four, "--device", "cuda"), 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "message"),
+    [
+        ("o.gif", (), ".png, .jpg, .jpeg"),
+        ("", (), "which is a folder"),
+        ("/proc/none/o.png", (), "No such file"),
+        ("file", ("--track",), "file"),
+    ],
+)
+def test_a_place_for_the_overlay_is_checked_before_the_work(
+    folder, four, name, more, message, tmp_path, monkeypatch
+):
+    def load(*_: object, **__: object) -> None:
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr("dopepp.inference.estimator.PoseEstimator.load", load)
+    (tmp_path / "file").touch()
+    done = predict(folder / "whole.png", *four, "--overlay", tmp_path / name, *more)
+    assert message in line(done, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "camera", "silent"),
+    [
+        ("grey.png", (554, 416, 319.5, 239.5), False),
+        ("empty.png", (554, 416, 319.5, 239.5), True),
+        ("corner.png", (554, 416, 99.5, 39.5), False),
+        ("4k.png", (3326, 1871, 1919.5, 1079.5), False),
+        ("dot.png", (1, 1, 0, 0), True),
+        ("whole.png", (1108, 832, 319.5, 239.5), False),
+        ("whole.png", (277, 208, 319.5, 239.5), False),
+    ],
+)
+def test_any_picture_has_an_answer_in_time(folder, name, camera, silent):
+    """With refinement: poses, or why there are none; ``silent`` where there is no part."""
+    start = time.process_time()
+    done = predict(folder / name, "--K", *camera, "--refine", "region")
+    assert time.process_time() - start < 60
+    assert done.exit_code == 0, done.output
+    assert not (silent and done.stdout)
+    if not done.stdout:
+        why = line(done, 0)
+        assert why.startswith("nothing found: pivconnector: ")
+        assert any(word in why for word in ("belief", "score", "points", "pose"))
+
+
+def test_an_old_checkpoint_without_meshes_names_the_option(folder, four, tmp_path):
+    from dopepp.models.checkpoint.schema import read, write_atomic
+
+    own = read(Path(RELEASED))
+    bare = replace(own, parts=[replace(own.parts[0], name="bracket", mesh=None)])
+    path = tmp_path / "old.ckpt"
+    write_atomic(bare.to_file(), path)
+    done = predict(folder / "whole.png", *four, "--refine", "region", checkpoint=path)
+    assert "no mesh of bracket" in line(done, 2)
+    assert "--part bracket=FILE" in line(done, 2)
