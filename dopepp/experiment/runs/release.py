@@ -15,7 +15,7 @@ from dopepp.metrics.row import COLUMNS
 from dopepp.models.checkpoint.released import SUFFIX, write_content
 from dopepp.models.checkpoint.schema import Checkpoint, read
 
-MAX_BYTES: Final = 5_000_000
+MAX_BYTES: Final = 8_000_000
 """Of a released file: it travels with the package."""
 
 _CARD_FIELDS: Final = (
