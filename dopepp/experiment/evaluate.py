@@ -27,7 +27,7 @@ from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports import conditions, evaluators
 from dopepp.experiment.reports.compare import compare_reports
 from dopepp.experiment.reports.protocols import Protocols, record_breakdown
-from dopepp.experiment.reports.report import REFINED, Report, measure
+from dopepp.experiment.reports.report import Report, measure
 from dopepp.experiment.reports.tables import reported_rates
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.images import warn_of_other_images
@@ -93,8 +93,8 @@ def measure_and_record(
         display.show_report(report, all_measures)
     _show_silence(methods, measured.silent, source)
     if refines:
-        share = made_worse(main, reports[-1])
-        main.details |= {REFINED: reports[-1].to_record(), "made_worse": share}
+        main.refined, share = reports[-1], made_worse(main, reports[-1])
+        main.details["made_worse"] = share
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
     record.write_json(run_dir / record.METRICS_FILE, main.to_record())
     if bop_csv:

@@ -31,7 +31,15 @@ from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_picture
 from dopepp.experiment.build.sources import build_parts, held_out_source
 from dopepp.experiment.config.data import chosen_data, trained_on
 from dopepp.experiment.reports.differences import figures, full, headline, notes
-from dopepp.experiment.reports.entries import BASELINE, Entry, Run, find_runs, group, ordered
+from dopepp.experiment.reports.entries import (
+    BASELINE,
+    Entry,
+    Run,
+    find_runs,
+    group,
+    ordered,
+    with_refined,
+)
 from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import Row, markdown_text, read_csv
@@ -131,31 +139,33 @@ def compare_runs(
 ) -> list[Entry]:
     """Print and write a comparison of runs into a folder; returns its methods.
 
-    The table is written first, so that it is there whatever befalls curves and pictures. A
-    :class:`UserError`: the baseline is none of the methods.
+    A method measured refined as well is two, its network and behind it the same refined; pictures
+    and curves of training are the networks'. The table is written first, so that it is there
+    whatever befalls curves and pictures. A :class:`UserError`: the baseline is none of the methods.
     """
     entries = group(runs)
     names = [entry.name for entry in entries]
     if baseline is not None and baseline not in names:
         raise UserError(f"baseline {baseline!r}", ", ".join(names), "choose one of them")
-    entries = ordered(entries, baseline or BASELINE)
+    networks = ordered(entries, baseline or BASELINE)
+    entries = with_refined(networks)
     text = write_comparison(entries, folder)
     panels = _panels(entries, folder)
-    shown = num_pictures if any(entry.reports for entry in entries) else 0
-    tiles, note = picture_tiles(entries, shown) if shown else ([], "")
+    shown = num_pictures if any(entry.reports for entry in networks) else 0
+    tiles, note = picture_tiles(networks, shown) if shown else ([], "")
     if tiles:
-        write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(entries)))
+        write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
         width = 2 * max([one.shape[1] for one in panels], default=_PANEL_PX)
-        columns = max(_MIN_COLUMNS, len(entries))
+        columns = max(_MIN_COLUMNS, len(networks))
         panels = [*([grid(panels, 2)] if panels else []),
-                  contact_sheet(tiles, len(entries), width // columns - _GAP_PX)]  # fmt: skip
+                  contact_sheet(tiles, len(networks), width // columns - _GAP_PX)]  # fmt: skip
     if panels:
         write_png(folder / PANELS_FILE, grid(panels, 1 if tiles else 2))
         text += f"\n![training, accuracy and pictures]({PANELS_FILE})\n"
     if note:
         display.console.print(note)
         text += f"\n{note}\n"
-    text += f"\n{markdown_text(_origins(entries))}"
+    text += f"\n{markdown_text(_origins(networks))}"
     write_whole(folder / TEXT_FILE, text.encode())
     return entries
 
@@ -204,7 +214,7 @@ def training_lines(
     have logged. Colours go by method; ``scale`` is a factor of the values.
     """
     lines = []
-    for entry in entries:
+    for entry in (one for one in entries if not one.refine):
         series = [one for run in entry.runs if (one := logged(run.folder / LOG_FILE, column))]
         steps = sorted(set(series[0]).intersection(*series[1:])) if series else []
         if steps:
@@ -287,7 +297,7 @@ def _load(entry: Entry, parts: tuple[str, ...]) -> _Model:
     if run.checkpoint is None or not run.checkpoint.is_file():
         return _Model(entry.name, run, reason=entry.failure or f"no file {run.checkpoint}")
     try:
-        estimator = PoseEstimator.load(run.checkpoint, refine=run.config.get("refine"))
+        estimator = PoseEstimator.load(run.checkpoint)
     except UserError as error:
         return _Model(entry.name, run, reason=str(error))
     return _Model(entry.name, run, estimator)

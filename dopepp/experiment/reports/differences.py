@@ -25,6 +25,10 @@ from dopepp.metrics.row import COLUMNS, NOT_AVAILABLE, PoseRow
 WITHIN: Final = "within noise"
 BEYOND: Final = "beyond noise"
 
+REFINED_NOTE: Final = (
+    "Δ of refined poses is against the first refined row, whose own Δ is against the first row."
+)
+
 _SEEDS: Final = "seeds"
 _COSTS: Final = {"parameters": ",", "GMACs": ".3f", "ms/frame": ".1f"}
 """Headings of the fields of :class:`Cost`, and how they are written."""
@@ -105,8 +109,9 @@ def _by_seed(entry: Entry) -> list[Report]:
 def figures(entries: Sequence[Entry]) -> list[Figure]:
     """Return the table of a comparison, method by method and object by object.
 
-    The first entry with a result is the baseline. The reference rows of its test set stand at the
-    end. A method without a result has one line, whose object says why.
+    The first entry with a result is the baseline, of refined poses its refined ones (see
+    :func:`_opposite`). The reference rows of its test set stand at the end. A method without a
+    result has one line, whose object says why.
     """
     baseline = next((entry for entry in entries if entry.reports), None)
     table: list[Figure] = []
@@ -118,13 +123,24 @@ def figures(entries: Sequence[Entry]) -> list[Figure]:
         elif baseline is None or not entry.reports:
             table += _cost_figures(entry, "cost only")
         else:
+            opposite = _opposite(entry, entries)
             for name in entry.objects:
-                known = {} if entry is baseline else differences(entry, baseline, name)
+                known = {} if opposite is None else differences(entry, opposite, name)
                 table += _object_figures(entry, name, known)
                 table += _cost_figures(entry, name)
     for reference, rows in baseline.reports[0].references.items() if baseline else ():
         table += row_figures(reference, rows[MEAN] if len(rows) > 2 else next(iter(rows.values())))
     return table
+
+
+def _opposite(entry: Entry, entries: Sequence[Entry]) -> Entry | None:
+    """Return what an entry is set off against: the first with a result, refined if it is itself.
+
+    The first refined one is set off against the first of all, and that one against nothing.
+    """
+    measured = [one for one in entries if one.reports]
+    alike = [one for one in measured if one.refine == entry.refine]
+    return next((one for one in (alike[0], measured[0]) if one is not entry), None)
 
 
 def _object_figures(
@@ -230,8 +246,11 @@ def notes(entries: Sequence[Entry], table: Sequence[Figure]) -> list[str]:
     """Return a sentence or two for each thing that the table alone does not say."""
     found: list[str] = []
     measured = [entry for entry in entries if entry.reports]
+    networks = [entry for entry in measured if not entry.refine]
     if len(measured) > 1:
-        found += _compared(measured[0], measured[1:], noise(table))
+        found += _compared(measured[0], networks[1:] or measured[1:], noise(table))
+    if len(measured) > len(networks) > 1:
+        found.append(REFINED_NOTE)
     models = [run.config.get("model") for entry in entries for run in entry.runs]
     widths = {float(model.get("width", 1.0)) for model in models if isinstance(model, dict)}
     if factors := ", ".join(f"{width:g}" for width in sorted(widths - {1.0})):

@@ -34,6 +34,9 @@ _TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
 """Options that say where something is, not what is measured."""
 
+_BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_measures")
+"""Options that measure more beside the result, and leave it as it is."""
+
 _LONGEST_NAME: Final = 60
 """Characters of a name that tables and legends have room for."""
 
@@ -89,6 +92,7 @@ class Entry:
         failure: Why there is no result, in one line; empty where only the cost was asked for.
         pruned: Whether the reason is that a search stopped it, which is no failure.
         runs: The run folders; empty where reports do not come from any.
+        refine: How its poses were refined; empty of the network's own.
     """
 
     name: str
@@ -97,6 +101,7 @@ class Entry:
     failure: str = ""
     pruned: bool = False
     runs: list[Run] = field(default_factory=list)
+    refine: str = ""
 
     @property
     def test_set(self) -> str:
@@ -178,9 +183,9 @@ def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report |
 
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
-    """Return configs as one text, without seed and parts and without what only names places."""
+    """Return configs as one text, without seed, parts and what does not touch the result."""
     kept = [
-        {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE)}
+        {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE, *_BESIDE)}
         for config in map(as_written_now, configs)
     ]
     for config in kept:
@@ -284,6 +289,19 @@ def group(runs: Sequence[Run]) -> list[Entry]:
     entries = [method[0] if len(method) == 1 else _join(method) for method in methods]
     _name(entries)
     return entries
+
+
+def with_refined(entries: Sequence[Entry]) -> list[Entry]:
+    """Return the methods, and behind each whose every run was measured refined, too, that."""
+    pairs: list[Entry] = []
+    for entry in entries:
+        pairs.append(entry)
+        refined = [one.refined for one in entry.reports if one.refined is not None]
+        if refined and len(refined) == len(entry.reports):
+            refine = refined[0].name.removeprefix(f"{entry.reports[0].name} + ")
+            name = f"{entry.name} + {refine}"
+            pairs.append(replace(entry, name=name, reports=refined, refine=refine))
+    return pairs
 
 
 def _is_of_another_part(entry: Entry, method: Sequence[Entry]) -> bool:

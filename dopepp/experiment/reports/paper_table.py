@@ -26,7 +26,13 @@ from dopepp.experiment.config.parse import parse
 from dopepp.experiment.cost import COST_FILE, FRAMES_FILE, NOTE, read_frames, save_frame_rates
 from dopepp.experiment.reports import tables
 from dopepp.experiment.reports.conditions import SHADING
-from dopepp.experiment.reports.differences import figures, noise, row_figures, summary
+from dopepp.experiment.reports.differences import (
+    REFINED_NOTE,
+    figures,
+    noise,
+    row_figures,
+    summary,
+)
 from dopepp.experiment.reports.entries import Entry
 from dopepp.experiment.runs import display, record
 from dopepp.metrics.pose import MEAN
@@ -110,21 +116,27 @@ class PaperTable:
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
         """Return the methods by what the paper calls them, or by their own name.
 
-        The own name serves where the paper's would stand for several.
+        The own name serves where the paper's would stand for several. Refined poses are the paper's
+        method and what refined them.
         """
-        used = [entry.runs[0].overrides if entry.runs else [] for entry in entries]
-        labels = [" ".join(self.labels[key] for key in self.labels if key in own) for own in used]
-        called = [label or entry.name for label, entry in zip(labels, entries, strict=True)]
+        called = [self._label(entry) or entry.name for entry in entries]
         count = Counter(called)
         return {
             label if count[label] == 1 else entry.name: entry
             for label, entry in zip(called, entries, strict=True)
         }
 
+    def _label(self, entry: Entry) -> str:
+        used = entry.runs[0].overrides if entry.runs else []
+        label = " ".join(self.labels[key] for key in self.labels if key in used)
+        return f"{label} + {entry.refine}" if label and entry.refine else label
+
 
 def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path) -> None:
     """Print and write ``table.md`` and ``table.csv``, and the figure of a kind that has one."""
     title = ", ".join([table.title, *(_recipe(entries) if table.kind in _MEASURED else [])])
+    if table.kind not in _MEASURED:  # what a network costs is no matter of its poses
+        entries = [entry for entry in entries if not entry.refine]
     methods = table.methods(entries)
     rows, doubts = KINDS[table.kind](table, methods, folder)
     labels = sum(name in _LABELS for name in rows[0])
@@ -146,6 +158,8 @@ def _notes(table: PaperTable, entries: Sequence[Entry]) -> list[str]:
     notes = [*table.notes, *([NOTE] if table.kind == "time" else [])]
     if table.kind in _MEASURED:
         notes.append(f"The paper's pass rate is ADD < {table.threshold:g} m.")
+        if any(entry.refine for entry in entries):
+            notes.append(REFINED_NOTE)
         if any(_starts_untrained(run.config) for entry in entries for run in entry.runs):
             said = "DOPE's VGG19 started untrained, as nothing is downloaded"
             option = "model.backbone.weights_path=FILE"
@@ -171,7 +185,8 @@ Laid = tuple[list[tables.Row], list[str]]
 def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
     """Return, object by object, a row per method: the paper's measures, then stricter ones.
 
-    The first method with a result is what Δ is against. The reference rows stand at the end.
+    The first method with a result is what Δ is against, of refined poses the first refined. The
+    reference rows stand at the end.
     """
     table = figures([replace(entry, name=label) for label, entry in methods.items()])
     measured = [entry for entry in methods.values() if entry.reports]
@@ -237,8 +252,9 @@ def _number(value: float | None) -> str:
 def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
     """Return pass rates at every share, the paper's and Δ beside them; draw them for all methods.
 
-    Rates are means over seeds. Δ is to the first method at the same share; its interval is
-    Student's t of the differences of equal seeds.
+    Rates are means over seeds. Δ is to the first method at the same share, of refined poses to the
+    first refined, whose own Δ is to the first of all; its interval is Student's t of the
+    differences of equal seeds.
     """
     measured = {label: _shading(label, entry) for label, entry in methods.items()}
     table = [one for own in measured.values() for one in own]
@@ -250,7 +266,7 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     panels = {}
     for name in dict.fromkeys(one.object for one in table):
         for measure in (layout.pass_field, _STRICT):
-            baseline: dict[float, list[tables.Figure]] = {}
+            firsts: dict[str, dict[float, list[tables.Figure]]] = {}  # by how poses are refined
             pooled: list[tables.Figure] = []
             head = {_OBJECT: name, _MEASURE: tables.heading(measure)}
             for label in dict.fromkeys(one.method for one in tables.select(table, object=name)):
@@ -259,10 +275,12 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
                 levels = {share: SHADING.heading(share) for share in rates}
                 means = {levels[share]: _mean(rates[share]) for share in rates}
                 rows.append({_METHOD: label, **head, **means})
-                if baseline:
+                refine = methods[label].refine
+                if firsts:
+                    baseline = firsts.get(refine) or next(iter(firsts.values()))
                     changes = {levels[s]: _change(rates[s], baseline.get(s, [])) for s in rates}
                     rows.append({_METHOD: f"{tables.DELTA}{label}", **head, **changes})
-                baseline = baseline or rates
+                firsts.setdefault(refine, rates)
                 printed = layout.paper.get(label, {}).get(name, {})
                 if printed and measure == layout.pass_field:
                     texts = {share: _number(value) for share, value in printed.items()}
@@ -280,11 +298,14 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
 def _shading(label: str, entry: Entry) -> list[tables.Figure]:
     """Return what a method's runs have measured; of one network a part, the mean, too.
 
-    Of several methods in one run's file, the run's own is the last.
+    A run's file may hold other methods, and its own twice, as the network's and refined.
     """
     found: dict[object, tables.Figure] = {}
     for run in entry.runs:
+        report = run.report.refined if run.report and entry.refine else run.report
         for row in tables.read_csv(run.folder / SHADING.table_file):
+            if report is None or row["method"] != report.name:
+                continue
             for measure in (column.field for column in COLUMNS if row.get(column.field)):
                 key = row["object"], measure, float(row["share"]), run.seed
                 found[key] = tables.Figure(

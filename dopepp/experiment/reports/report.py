@@ -26,8 +26,8 @@ from dopepp.models.spec import build_network
 FULL_SIZE_COST: Final = "full_size_cost"
 """Key of the details that holds what a narrowed network costs at full width and size."""
 
-REFINED: Final = "refined"
-"""Key of the details that holds the record of the same poses refined."""
+_REFINED: Final = "refined"
+"""Key of a record that holds that of the same poses refined."""
 
 
 @dataclass
@@ -36,7 +36,8 @@ class Report:
 
     ``rows`` are of every object, then their mean, ``references`` the same by reference. By object,
     ``errors`` are the ADD, metres, and ``rotation_deg`` the rotation error of every instance,
-    infinite where missed; ``diameters`` are metres. ``details`` are further plain facts.
+    infinite where missed; ``diameters`` are metres. ``details`` are further plain facts,
+    ``refined`` is the result of the same poses refined, where they were.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Report:
     rotation_deg: dict[str, Float[np.ndarray, "instances"]] = field(default_factory=dict)
     diameters: dict[str, float] = field(default_factory=dict)
     test_set: str = ""
+    refined: Report | None = None
 
     @property
     def mean(self) -> PoseRow:
@@ -78,6 +80,7 @@ class Report:
             "diameters": self.diameters,
             "test_set": self.test_set,
             "cost": vars(self.cost),
+            **({} if self.refined is None else {_REFINED: self.refined.to_record()}),
             **self.details,
         }
 
@@ -97,6 +100,7 @@ class Report:
             rotation_deg=_unlisted(record.get("rotation_deg", {})),
             diameters=dict(record.get("diameters", {})),
             test_set=record.get("test_set", ""),
+            refined=cls.from_record(record[_REFINED]) if _REFINED in record else None,
         )
         known = report.to_record()
         report.details = {key: value for key, value in record.items() if key not in known}
@@ -108,6 +112,7 @@ class Report:
         reports = sorted(reports, key=lambda report: list(report.rows))
         first = reports[0]
         known = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
+        refined = [report.refined for report in reports if report.refined is not None]
         return replace(
             first,
             rows=_joined_rows([report.rows for report in reports]),
@@ -121,6 +126,7 @@ class Report:
             rotation_deg={name: e for one in reports for name, e in one.rotation_deg.items()},
             diameters={name: d for report in reports for name, d in report.diameters.items()},
             test_set=" ".join(report.test_set for report in reports),
+            refined=cls.joined(refined) if len(refined) == len(reports) else None,
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.experiment.reports.report import REFINED, Report
+from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text, shown_rows
 from dopepp.experiment.runs import record
 from dopepp.metrics.row import COLUMNS
@@ -47,15 +47,14 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
 
 
 def _card(name: str, trained: Checkpoint, report: Report) -> str:
-    refined = report.details.get(REFINED)
-    reported = [report] if refined is None else [report, Report.from_record(refined)]
+    reported = [report] if report.refined is None else [report, report.refined]
     rows = [
         {"object": row.object, "method": row.method}
         | {one.heading: one.text(row) for one in COLUMNS if one.field in _CARD_FIELDS}
         for rows in [*(one.rows for one in reported), *report.references.values()]
         for row in shown_rows(rows).values()
     ]
-    refine = "" if refined is None else " refine=region"
+    refine = "" if report.refined is None else " refine=region"
     width, height = trained.input_size
     parameters = sum(value.numel() for value in trained.state_dict.values())
     sizes = [f"- {part.name}: {1000 * part.diameter:.0f} mm across" for part in trained.parts]

@@ -1,6 +1,7 @@
 """Comparisons: reading run folders, seeds of one method together, the table, its words."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,14 @@ from dopepp.experiment.reports.compare import (
     write_comparison,
 )
 from dopepp.experiment.reports.differences import differences, figures, full, headline
-from dopepp.experiment.reports.entries import Entry, find_runs, group, ordered, read_run
+from dopepp.experiment.reports.entries import (
+    Entry,
+    find_runs,
+    group,
+    ordered,
+    read_run,
+    with_refined,
+)
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import DELTA, read_csv
@@ -188,6 +196,74 @@ def test_all_missed_is_no_angle():
     assert full(figures([seeds]))[0]["rotation °"] == "n/a"  # one seed's alone would flatter
 
 
+# Network and refined
+
+
+def refined(name: str, before: Sequence[float], after: Sequence[float], **options: Any) -> Report:
+    return replace(
+        report(name, before, **options), refined=report(f"{name} + region", after, **options)
+    )
+
+
+def test_refined_poses_stand_behind_their_network(tmp_path):
+    write_run(tmp_path / "0", ["model=dopepp"], refined("dopepp", BAD, [0.001] * 32))
+    write_run(tmp_path / "1", ["model=dope"], refined("dope", BAD, GOOD))
+    methods = compare_runs(find_runs([tmp_path]), tmp_path / "out", num_pictures=0)
+    names = ["dope", "dope + region", "dopepp", "dopepp + region"]
+    assert [one.name for one in methods] == names
+    rows = read_csv(tmp_path / "out" / "compare.csv")
+    assert [row["method"] for row in rows] == [*names, "best constant pose"]
+    assert [row["ADD-0.1d %"] for row in rows[:4]] == ["31.2", "93.8", "31.2", "100.0"]
+    # Refined ones are set off against dope's refined, and those against its network.
+    assert [row["Δ ADD-0.1d %"] for row in rows[:4]] == ["", "+62.5", "+0.0", "+6.2"]
+    text = (tmp_path / "out" / "compare.md").read_text()
+    assert "Δ of refined poses is against the first refined row" in text
+    assert "Of dope" not in text
+    assert text.count(str(tmp_path)) == 2  # where results come from: a line per run
+    with (tmp_path / "out" / "compare_auc.csv").open() as stream:
+        assert stream.readline().strip() == ",".join(["threshold_m", *names])
+
+
+def test_one_network_and_the_same_refined_are_set_off(tmp_path):
+    write_run(tmp_path / "0", [], refined("dopepp", BAD, GOOD))
+    compare_runs(find_runs([tmp_path / "0"]), tmp_path / "out", num_pictures=0)
+    _, row, _ = read_csv(tmp_path / "out" / "compare.csv")
+    assert (row["method"], row["Δ ADD-0.1d %"]) == ("dopepp + region", "+62.5")
+    text = (tmp_path / "out" / "compare.md").read_text()
+    assert "Δ is against dopepp, with" in text
+    assert "Δ of refined" not in text
+
+
+def test_without_a_refined_baseline_the_network_is_the_baseline():
+    entries = with_refined([
+        entry("dope", report("dope", BAD)), entry("x", refined("x", BAD, GOOD)),
+    ])  # fmt: skip
+    rows = {row["method"]: row for row in full(figures(entries))}
+    assert rows["x + region"]["Δ ADD-0.1d %"] == "+62.5"
+
+
+def test_refined_in_one_seed_of_two_is_no_row():
+    both = entry("x", refined("x", BAD, GOOD), report("x", BAD))
+    assert [one.name for one in with_refined([both])] == ["x"]
+
+
+def test_refined_poses_of_a_network_a_part_have_a_mean():
+    def of_part(one: Report, part: str, after: Report | None = None) -> Report:
+        rows = {part: replace(one.rows["part0"], object=part), MEAN: one.rows[MEAN]}
+        return replace(
+            one, rows=rows, references={}, errors={part: one.errors["part0"]}, refined=after
+        )
+
+    bad, good, best = (report("x", add) for add in (BAD, GOOD, [0.001] * 32))
+    bolt, nut = of_part(bad, "bolt", of_part(good, "bolt")), of_part(bad, "nut")
+    joined = Report.joined([replace(nut, refined=of_part(best, "nut")), bolt])
+    assert joined.mean.add_01d == pytest.approx(10 / 32)
+    assert joined.refined is not None
+    assert list(joined.refined.rows) == ["bolt", "nut", MEAN]
+    assert joined.refined.mean.add_01d == pytest.approx((1 + 30 / 32) / 2)
+    assert Report.joined([bolt, nut]).refined is None
+
+
 @pytest.mark.parametrize("others", [[], [entry("dope", report("dope", BAD))]])
 def test_a_failed_job_is_a_row(others, tmp_path, capsys):
     reason = "got data.input_size=[30, 30] | x; allowed: [width, height] [/nothing]; fix: [bold]"
@@ -251,7 +327,9 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path):
         write_run(folder, [f"ckpt_path={run}", "data.num_test=9"])
         record.write_json(folder / record.METRICS_FILE, report("dopepp", GOOD).to_record())
         checkpoint = run / "checkpoints" / "best.ckpt"
-        record.write_config(folder, {"ckpt_path": str(checkpoint), "data": {"num_test": 9}})
+        shares = [0.4] if seed == 1 else None  # measured beside the result
+        config = {"ckpt_path": str(checkpoint), "data": {"num_test": 9}, "shading": shares}
+        record.write_config(folder, config)
     evaluations = [tmp_path / "evaluation1", tmp_path / "evaluation2"]
     first = read_run(evaluations[0])
     assert (first.seed, first.model) == (1, "dopepp")

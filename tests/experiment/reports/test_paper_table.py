@@ -32,22 +32,16 @@ LABELS = {"model=dope": "DOPE", "model=dopepp": "DOPE++"}
 
 def job(
     folder: Path, overrides: list[str], errors: list[float] | None, part: str = "part",
-    **config: Any,
+    refined: list[float] | None = None, **config: Any,
 ) -> None:  # fmt: skip
-    """Write what a job of a sweep leaves; without errors, a failure."""
+    """Write what a job of a sweep leaves, refined as well; without errors, a failure."""
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     if errors is None:
         record.write_json(folder / record.FAILURE_FILE, {"reason": "no memory"})
         return
-    e = torch.tensor(errors, dtype=torch.float64)
-    errors_of = PoseErrors(e, e, e, None, 1000 * e, 1000 * e, e)
-    rows = {part: summarise(part, "x", 0.1, errors_of, 1)}
-    rows[MEAN] = mean_row(list(rows.values()), "x")
-    report = Report(
-        "x", rows, {"best constant pose": rows}, {part: np.array(errors)}, Cost(), len(errors),
-        rotation_deg={part: 1000 * np.array(errors)}, diameters={part: 0.1}, test_set=part,
-    )  # fmt: skip
+    report = report_of("x", errors, part)
+    report.refined = None if refined is None else report_of("x + region", refined, part)
     record.write_json(folder / record.METRICS_FILE, report.to_record())
     seed = next((int(text[5:]) for text in overrides if text.startswith("seed=")), 0)
     model = {"name": "x", "width": 1}
@@ -55,6 +49,17 @@ def job(
     record.write_config(
         folder, {"model": model, "seed": seed, "data": data, "a": overrides[0], **config}
     )
+
+
+def report_of(name: str, errors: list[float], part: str) -> Report:
+    e = torch.tensor(errors, dtype=torch.float64)
+    errors_of = PoseErrors(e, e, e, None, 1000 * e, 1000 * e, e)
+    rows = {part: summarise(part, name, 0.1, errors_of, 1)}
+    rows[MEAN] = mean_row(list(rows.values()), name)
+    return Report(
+        name, rows, {"best constant pose": rows}, {part: np.array(errors)}, Cost(), len(errors),
+        rotation_deg={part: 1000 * np.array(errors)}, diameters={part: 0.1}, test_set=part,
+    )  # fmt: skip
 
 
 def end(folder: Path, table: dict[str, Any]) -> None:
@@ -132,6 +137,23 @@ def test_one_network_a_part_is_one_method_with_a_mean(tmp_path):
     assert {row["seeds"] for row in compared if row["method"].startswith("x ")} == {"1, 2"}
 
 
+def test_refined_poses_are_a_row_without_the_papers_figures(tmp_path):
+    job(tmp_path / "0", ["model=dope"], [0.04, 0.06], refined=[0.004, 0.06])
+    job(tmp_path / "1", ["model=dopepp"], [0.04, 0.04], refined=[0.004, 0.004])
+    printed = {name: {"part": {"pass": 91.5}} for name in LABELS.values()}
+    end(tmp_path, {"title": "Table 6", "labels": LABELS, "paper": printed})
+    rows = read_table(tmp_path)
+    names = ["DOPE", "DOPE + region", "DOPE++", "DOPE++ + region", "best constant pose"]
+    assert [row["method"] for row in rows] == names
+    assert [row["the paper: ADD<5cm %"] for row in rows] == ["91.5", "", "91.5", "", ""]
+    assert [row["ADD-0.1d %"] for row in rows[:4]] == ["0.0", "50.0", "0.0", "100.0"]
+    changes = [row["Δ ADD-0.1d %"].partition(" ")[0] for row in rows[:4]]
+    assert changes == ["", "+50.0", "+0.0", "+50.0"]
+    assert (
+        "Δ of refined poses is against the first refined row" in (tmp_path / "table.md").read_text()
+    )
+
+
 def test_a_part_with_other_seeds_stands_alone(tmp_path):
     job(tmp_path / "0", ["a=1", "seed=1"], [0.004, 0.06], "bolt")
     job(tmp_path / "1", ["a=1", "seed=2"], [0.004, 0.06], "nut")
@@ -178,6 +200,25 @@ def test_shading_is_averaged_over_seeds_and_drawn(tmp_path):
     assert read_rgb(tmp_path / "table_shading.png").std() > 0
 
 
+def test_shading_has_a_line_refined_and_none_of_another_checkpoint(tmp_path):
+    header = "method,object,share,num_instances,pass_5cm,add_01d\n"
+    for number, model in enumerate(("dope", "dopepp")):
+        folder = tmp_path / str(number)
+        job(folder, [f"model={model}"], [0.04, 0.06], refined=[0.004, 0.004])
+        rates = {"other": 0.9, "other + region": 0.8, "x": 0.1, "x + region": 0.2 + number / 2}
+        lines = [f"{name},part,0.2,10,{rate},{rate}\n" for name, rate in rates.items()]
+        (folder / "shading.csv").write_text(header + "".join(lines))
+    table = {"title": "Table 3", "kind": "shading", "labels": LABELS}
+    end(tmp_path, {**table, "paper": {"DOPE": {"part": {"20 %": 14.1}}}})
+    found = [row for row in read_table(tmp_path) if row["measure"] == "ADD<5cm %"]
+    assert [(row["method"], row["20 %"]) for row in found] == [
+        ("DOPE", "10.0"), ("DOPE, the paper", "14.1"),
+        ("DOPE + region", "20.0"), ("Δ DOPE + region", "+10.0"),
+        ("DOPE++", "10.0"), ("Δ DOPE++", "+0.0"),
+        ("DOPE++ + region", "70.0"), ("Δ DOPE++ + region", "+50.0"),
+    ]  # fmt: skip
+
+
 def test_shading_of_one_network_a_part_has_a_mean(tmp_path):
     for number, (part, rate) in enumerate([("bolt", 0.2), ("nut", 0.6)]):
         folder = tmp_path / str(number)
@@ -188,6 +229,12 @@ def test_shading_of_one_network_a_part_has_a_mean(tmp_path):
     rows = {(row["object"], row["measure"]): row["20 %"] for row in read_table(tmp_path)}
     assert rows["mean", "ADD-0.1d %"] == "40.0"
     assert rows["nut", "ADD-0.1d %"] == "60.0"
+
+
+def test_costs_have_no_line_refined(tmp_path):
+    job(tmp_path / "0", ["model=dope"], [0.04], refined=[0.004])
+    end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS})
+    assert [row["method"] for row in read_table(tmp_path)] == ["DOPE: no such measurement"]
 
 
 def test_costs(composed, tmp_path):

@@ -36,6 +36,7 @@ def test_a_report_survives_json(errors, share, ms):
     report.diameters, report.test_set = {"part0": 0.1}, "abc"
     report.cost = Cost(1, 2.0, ms)
     report.details = {"checkpoint": "best.ckpt", FULL_SIZE_COST: vars(Cost(9, 8.0, 7.0))}
+    report.refined = make_report(share)
     text = json.dumps(report.to_record(), allow_nan=False)
     back = Report.from_record(json.loads(text))
     np.testing.assert_array_equal(back.errors["part0"], report.errors["part0"])
@@ -45,6 +46,8 @@ def test_a_report_survives_json(errors, share, ms):
     assert back.references == report.references
     assert (back.name, back.cost, back.num_images) == ("dopepp", report.cost, 4)
     assert back.details == report.details
+    assert back.refined is not None
+    assert back.refined.to_record() == report.refined.to_record()
 
 
 def test_a_report_of_an_earlier_version_is_read():
@@ -53,6 +56,7 @@ def test_a_report_of_an_earlier_version_is_read():
         del stored[key]
     back = Report.from_record(stored)
     assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
+    assert back.refined is None
 
 
 def test_json_that_nobody_else_could_read_is_not_written(tmp_path):
