@@ -36,9 +36,10 @@ def letterboxes(
 ) -> list[Letterbox]:
     """Return the sizes in which a network looks at an image, the smallest first.
 
-    Without ``distances`` it looks where training had the parts, which takes one size for each
-    camera and part. A checkpoint that does not know them looks in the size of the training's
-    images. A :class:`UserError`: the distances are no range of metres.
+    Without ``distances`` it looks where training had the parts, and at the whole image in the size
+    of the training's, which shows parts that fill it; for the training's camera both are one. A
+    checkpoint that does not know distances has the second look only. A :class:`UserError`: the
+    distances are no range of metres.
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
@@ -48,8 +49,8 @@ def letterboxes(
         if part.name in checkpoint.seen:
             seen, reach = checkpoint.seen[part.name], part.diameter * focal
             scales += _scales(seen, reach, _depths(seen, reach, size, distances))
-    if not scales:
-        return [learned]
+    if not scales or distances is None:
+        scales.append(learned.scale_x)
     boxes: list[Letterbox] = []
     for scale in sorted(scales):
         if boxes and scale < MARGIN * boxes[-1].scale_x:

@@ -110,7 +110,7 @@ def test_predict_follows_parts_through_a_folder(tmp_path):
     from dopepp.virtual import PRESETS, Factory
 
     released = Path("pretrained", "pivconnector")
-    rendered = Factory([pivconnector()], PRESETS["quickstart"].resized(640, 480), 2).render(0, 5)
+    rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 6)
     frames, drawn = tmp_path / "frames", tmp_path / "drawn"
     frames.mkdir()
     for number in range(3):
