@@ -55,7 +55,7 @@ from dopepp.training.system import PoseSystem
 _log = logging.getLogger(__name__)
 
 PAPER_INPUT_SIZE: Final = (416, 416)
-QUICKSTART: Final = "python train.py model=dopepp data=hybrid experiment=quickstart"
+QUICKSTART: Final = "python train.py experiment=quickstart"
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
