@@ -43,7 +43,7 @@ def line(done: Result, code: int) -> str:
 def rendered():
     from dopepp.virtual import PRESETS, Factory
 
-    return Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 6)
+    return Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_the_lens_counts(folder, rendered, tmp_path):
         ("whole.png", [], "neither --K nor --camera"),
         ("whole.png", ["--camera", "K.txt", "--K", "9", "9", "9", "9"], "--K and --camera"),
         ("whole.png", ["--camera", "none.yaml"], "none.yaml: No such file"),
-        ("whole.png", ["--camera", "whole.png"], "camera file whole.png: "),
+        ("whole.png", ["--camera", "whole.png"], "camera file"),
         ("half.png", ["--camera", "K.txt"], "at 100% of its width"),
         ("half.png", ["--camera", "plain.json"], "--K-size 640 480 if the picture was resized"),
         ("cut.png", ["--camera", "plain.json"], "--crop X Y 632 400 if it was cut out"),

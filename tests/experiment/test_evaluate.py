@@ -14,13 +14,13 @@ from dopepp.models.checkpoint.schema import read, write_atomic
 def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):
     options = ("ckpt_path=pretrained/pivconnector", "refine=region", "+data.num_test=8")
     network, refined = evaluate(composed(*options, config="evaluate"), tmp_path)
-    assert (network.name, refined.name) == ("dopepp", "dopepp + region")
+    assert (network.name, refined.name) == ("dopepp_fast", "dopepp_fast + region")
     before, after = network.errors["pivconnector"], refined.errors["pivconnector"]
     found = np.isfinite(before)
     assert found.sum() >= 5
     assert np.median(after[found]) < np.median(before[found]) / 3
     written = read_json(tmp_path / METRICS_FILE)
-    assert written["name"] == "dopepp"
+    assert written["name"] == "dopepp_fast"
     assert written["refined"] == refined.to_record()
     assert written["made_worse"] == made_worse(network, refined)
     assert (tmp_path / "compare.csv").is_file()
@@ -42,5 +42,5 @@ def test_silent_images_are_counted_by_reason(composed, tmp_path, capsys):
     options = (f"ckpt_path={tmp_path / 'strict.ckpt'}", "+data.num_test=3")
     evaluate(composed(*options, config="evaluate"), tmp_path / "run")
     (line,) = [one for one in capsys.readouterr().out.splitlines() if "images silent:" in one]
-    assert line.startswith("dopepp: 3 of 3 images silent: ")
-    assert "below the threshold (best score 0." in line
+    assert line.startswith("dopepp_fast: 3 of 3 images silent: ")
+    assert "below the threshold (best score" in line

@@ -218,8 +218,20 @@ class WorkingPlacement(Placement):
         # What is nearer than the middle is as much larger.
         front = depth - (upper[2] - lower[2]) / 2
         extent = (upper - lower)[:2] * K[[0, 1], [0, 1]] / max(front, 1e-6)
-        pixel = np.array(size) / 2 - 0.5 + place * np.maximum(size - extent, 0.0)
-        return np.asarray(depth * np.linalg.solve(K, [*pixel, 1.0]) - (lower + upper) / 2)
+        room = np.maximum(size - extent, 0.0)
+        pixel = np.array(size) / 2 - 0.5 + place * room
+        hull = rotated_hull - (lower + upper) / 2
+        # Perspective moves what is nearer outwards; a few steps bring it back into the picture.
+        for _ in range(10):
+            middle = depth * np.linalg.solve(K, [*pixel, 1.0])
+            image = project(hull + middle, K)
+            beyond = np.maximum(image.max(axis=0) - (np.array(size) - 0.5), 0.0)
+            before = np.maximum(-0.5 - image.min(axis=0), 0.0)
+            missing = np.where(room > 0, before - beyond, 0.0)
+            if not missing.any():
+                break
+            pixel = pixel + missing
+        return np.asarray(middle - (lower + upper) / 2)
 
 
 def _check_ends(
