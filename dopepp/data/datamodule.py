@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -27,7 +26,7 @@ from dopepp.data.sample import (
 from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.drawing.pictures import Size
-from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, transform
+from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, focal_length, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
 from dopepp.parts.seen import Seen, widest
@@ -167,5 +166,5 @@ class PoseDataModule(LightningDataModule):
 def _view(T_cam_obj: Transform, part: Part, K: CameraMatrix, scale: float) -> Seen:
     """Return one instance's diameter in pixels of an image resized by a factor, and its depth."""
     depth = float(transform(T_cam_obj, part.cuboid[CENTROID])[2])
-    pixels = scale * math.sqrt(K[0, 0] * K[1, 1]) * part.diameter / depth
+    pixels = scale * focal_length(K) * part.diameter / depth
     return Seen(pixels, pixels, depth, depth)

@@ -93,6 +93,18 @@ def resize_camera(K: CameraMatrix, scale_x: float, scale_y: float) -> CameraMatr
     return resized
 
 
+def crop_camera(K: CameraMatrix, left: float, top: float) -> CameraMatrix:
+    """Follow a crop whose first pixel was (left, top): the principal point moves, nothing else."""
+    cropped = np.array(K, np.float64)
+    cropped[:2, 2] -= left, top
+    return cropped
+
+
+def focal_length(K: CameraMatrix) -> float:
+    """Return the geometric mean of fx and fy, pixels."""
+    return math.sqrt(K[0, 0] * K[1, 1])
+
+
 def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
     """Move pixel coordinates through the same resize as :func:`resize_camera`."""
     scale = np.array([scale_x, scale_y])

@@ -24,6 +24,7 @@ from dopepp.geometry.camera import (
     WHOLE,
     CameraMatrix,
     check_camera,
+    crop_camera,
     pinhole_matrix,
     resize_camera,
 )
@@ -179,9 +180,7 @@ def _cut(K: CameraMatrix, own: Size | None, size: Size, crop: Crop) -> CameraMat
     if min(x, y) < 0 or beyond:
         inside = f"inside the calibrated picture{f' of {_by(own)}' if own else ''}"
         raise UserError(said, f"x y width height {inside}", "correct it")
-    K = K.copy()
-    K[:2, 2] -= x, y
-    return K
+    return crop_camera(K, x, y)
 
 
 def _one_shape(one: Size, other: Size) -> bool:

@@ -22,6 +22,7 @@ from dopepp.geometry.camera import (
     CameraMatrix,
     Letterbox,
     check_camera,
+    crop_camera,
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
@@ -338,9 +339,8 @@ def cut(
     if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
         allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
         raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
-    shifted = K.copy()
-    shifted[:2, 2] -= x, y
-    return np.ascontiguousarray(image[y : y + rows, x : x + columns]), shifted, (x, y)
+    window = np.ascontiguousarray(image[y : y + rows, x : x + columns])
+    return window, crop_camera(K, x, y), (x, y)
 
 
 def _in_original(

@@ -16,7 +16,7 @@ import numpy as np
 
 from dopepp.core.checks import check_range
 from dopepp.drawing.pictures import Picture, Size
-from dopepp.geometry.camera import CameraMatrix, Letterbox
+from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.seen import Seen
 from dopepp.recovery.detection import Detection
@@ -43,11 +43,10 @@ def letterboxes(
     """
     size = image.shape[1], image.shape[0]
     learned = Letterbox.fit(size, checkpoint.input_size)
-    focal = math.sqrt(K[0, 0] * K[1, 1])
     scales: list[float] = []
     for part in checkpoint.parts:
         if part.name in checkpoint.seen:
-            seen, reach = checkpoint.seen[part.name], part.diameter * focal
+            seen, reach = checkpoint.seen[part.name], part.diameter * focal_length(K)
             scales += _scales(seen, reach, _depths(seen, reach, size, distances))
     if not scales or distances is None:
         scales.append(learned.scale_x)

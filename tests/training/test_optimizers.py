@@ -70,7 +70,7 @@ def test_a_run_goes_on_from_its_state_to_the_last_bit():
             if number >= steps.start:
                 torch.manual_seed(number)
                 step(optimizer, parameters, [torch.randn_like(one) for one in parameters])
-            optimizer._opt_called = True  # skipped steps count for the schedule
+            optimizer._opt_called = True  # so that torch does not warn of steps left out
             schedule.step()
             if number + 1 == steps.stop:
                 return

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from dopepp.geometry.camera import CameraMatrix, resize_camera
+from dopepp.geometry.camera import CameraMatrix, crop_camera, resize_camera
 from dopepp.inference.refinement.colour import colour_bins
 
 SMALLEST_PX: Final = 12
@@ -79,8 +79,7 @@ def crop_around(
     few = min(max(1, round(extent / longest_px)), most)
     width, height = (right - left) // few, (bottom - top) // few
     colours = image[top : top + few * height, left : left + few * width]
-    own = np.array(K, np.float64)
-    own[:2, 2] -= left, top
+    own = crop_camera(K, left, top)
     if few > 1:
         own = resize_camera(own, 1 / few, 1 / few)
         colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)

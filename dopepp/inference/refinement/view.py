@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_image
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, crop_camera
 from dopepp.inference.refinement.visible import (
     Depth,
     Points,
@@ -146,8 +146,7 @@ def view_around(depth: Depth, K: CameraMatrix, points_cam: Points) -> DepthView 
     step = math.ceil(max(crop.shape) / LONGEST_PX)
     # A median keeps edges, and takes away single wild pixels and half of the noise.
     crop = np.ascontiguousarray(cv2.medianBlur(crop, 3)[::step, ::step])
-    own = np.array(K, np.float64)
-    own[:2, 2] -= left, top
+    own = crop_camera(K, left, top)
     own[:2] /= step
     columns, rows = np.meshgrid(np.arange(crop.shape[1]), np.arange(crop.shape[0]))
     rays = np.stack(

@@ -20,7 +20,13 @@ from numpy.random import Generator
 from dopepp.core.checks import check_number, check_range
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Size
-from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera, resize_camera
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    camera_matrix,
+    check_camera,
+    crop_camera,
+    resize_camera,
+)
 from dopepp.virtual.presets.distractors import Distractors
 from dopepp.virtual.presets.looks import Lighting, Materials
 from dopepp.virtual.presets.placement import (
@@ -112,8 +118,8 @@ class Preset:
             return K, size
         spare = np.array(size) - self.window
         corner = rng.uniform(0, 1, 2) * size - np.array(self.window) / 2
-        K[:2, 2] -= np.floor(np.where(spare > 0, np.clip(corner, 0, spare), spare / 2))
-        return K, self.window
+        corner = np.floor(np.where(spare > 0, np.clip(corner, 0, spare), spare / 2))
+        return crop_camera(K, *corner), self.window
 
     def resized(self, width: int, height: int) -> Preset:
         """Return the same scenes in another image size: the camera follows the resize rule.

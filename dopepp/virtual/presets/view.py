@@ -15,7 +15,7 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Size
-from dopepp.geometry.camera import CameraMatrix, check_camera, resize_camera
+from dopepp.geometry.camera import CameraMatrix, check_camera, focal_length, resize_camera
 from dopepp.geometry.camera_file import read_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.presets.placement import WorkingPlacement
@@ -76,15 +76,11 @@ class View:
             fix = "write working_distance=[{1:g},{0:g}]".format(*self.distance)
             raise UserError(f"working_distance={list(self.distance)}", allowed, fix)
 
-    @property
-    def _focal(self) -> float:
-        return math.sqrt(self.K[0, 0] * self.K[1, 1])
-
     def sizes_px(self, parts: Sequence[Part], scale: float = 1.0) -> tuple[float, float]:
         """Return the smallest and the largest diameter of parts in pictures scaled by a factor."""
         diameters = [part.diameter for part in parts]
         near, far = self.distance
-        focal = scale * self._focal
+        focal = scale * focal_length(self.K)
         return focal * min(diameters) / far, focal * max(diameters) / near
 
     def check(self, parts: Sequence[Part], scale: float = 1.0) -> None:
@@ -157,7 +153,7 @@ class View:
         self, parts: Sequence[Part], scale: float = 1.0, window: Size | None = None
     ) -> list[str]:
         """Say how large parts are in what the network sees, and what is unfavourable about it."""
-        near, far = (1000 * end / (scale * self._focal) for end in self.distance)
+        near, far = (1000 * end / (scale * focal_length(self.K)) for end in self.distance)
         smallest, largest = self.sizes_px(parts, scale)
         across, down = (
             math.degrees(2 * math.atan(side / 2 / focal))

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16
 
 from dopepp.drawing.pictures import Picture, Size
-from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera import CameraMatrix, crop_camera
 from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, rgb
 from dopepp.virtual.renderers.raster.visibility import Box
@@ -98,8 +98,7 @@ def make_view(K: CameraMatrix, window: Box) -> View:
     """Return the view of a window of the image."""
     left, top, right, bottom = window
     focal = float(max(K[0, 0], K[1, 1]))
-    K_window = K.copy()
-    K_window[:2, 2] -= left, top
+    K_window = crop_camera(K, left, top)
     if K[0, 0] == K[1, 1] and K[0, 1] == 0.0:
         centre = (float(K_window[0, 2]), float(K_window[1, 2]))
         return View(window, (right - left, bottom - top), focal, centre, np.eye(2, 3))
