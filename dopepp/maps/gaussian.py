@@ -26,6 +26,9 @@ within their own cells. Of 1 to 4, 3 gave the smallest errors on pairs of peaks 
 MARGIN: Final = 1.0
 """The same once both positions are fitted."""
 
+SURELY: Final = 1e-6
+"""Squared cells beyond which a comparison of distances is none of rounding."""
+
 PLATEAU: Final = 3
 """Cells as high as the peak's from which on its top is cut off; an exact tie of two is none."""
 
@@ -53,106 +56,32 @@ UNCERTAIN: Final = 4.0
 
 @compiled()
 def fit_peaks(
-    table: Array,
-    width: int,
-    half: int,
-    sigma: float,
-    radius: float,
-    position: Array,
-    covariance: Array,
-    toward: Array,
-) -> None:
-    """Fit the peaks of every channel and average the field around them.
-
-    Args:
-        table: Of each peak its cell's index, its belief (−∞: no peak; the channel's peaks come
-            first), the (2·half + 1)² cells around it, NaN outside of the map, and where there is
-            a field the x, then the y of the vectors around it; (channels, peaks, columns).
-        width: Of the map, cells.
-        half: Half-width of a window, cells.
-        sigma: Standard deviation of a perfect peak, cells.
-        radius: Of the disc around a corner that carries its vector, cells.
-        position: Filled with (x, y) of each peak, cells.
-        covariance: Filled with the covariance of each position, cells²: the fitted Gaussian's less
-            the target's, as far as the map's noise does not explain it, and that of the fit.
-        toward: Filled with the mean vectors, unless there is no field.
-    """
-    side = 2 * half + 1
-    columns = table.shape[2]
-    for channel in range(len(table)):
-        count = 0
-        while count < table.shape[1] and table[channel, count, 1] > -math.inf:
-            count += 1
-        if not count:
-            continue
-        rows = table[channel, :count]
-        cells = np.empty((count, 2))
-        windows = np.empty((count, side, side))
-        for i in range(count):
-            cells[i] = rows[i, 0] % width, rows[i, 0] // width
-            windows[i] = rows[i, 2 : 2 + side * side].copy().reshape(side, side)
-        _fit_channel(windows, cells, sigma, position[channel, :count], covariance[channel, :count])
-        if columns > 2 + side * side:
-            vectors = rows[:, 2 + side * side :]
-            _mean_vectors(vectors, cells, position[channel, :count], radius, toward[channel])
-
-
-@compiled()
-def _mean_vectors(
-    vectors: Array, cells: Array, position: Array, radius: float, toward: Array
-) -> None:
-    """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
-
-    Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, which no position is exact enough to tell.
-    """
-    area = vectors.shape[1] // 2
-    side = 1
-    while side * side < area:
-        side += 1
-    half = side // 2
-    for i in range(len(cells)):
-        total = 0.0
-        for y in range(side):
-            for x in range(side):
-                column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
-                squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
-                weight = 1 - squared / radius**2
-                u, v = vectors[i, y * side + x], vectors[i, area + y * side + x]
-                if not (weight > 0.0 and math.isfinite(u) and math.isfinite(v)):
-                    continue
-                nearest = True
-                for j in range(len(cells)):
-                    if (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2 < squared:
-                        nearest = False
-                        break
-                if nearest:
-                    total += weight
-                    toward[i, 0] += weight * u
-                    toward[i, 1] += weight * v
-        if total > 0.0:
-            toward[i] /= total
-
-
-@compiled()
-def _fit_channel(
-    windows: Array, cells: Array, sigma: float, position: Array, covariance: Array
+    belief: Array, cells: Array, half: int, sigma: float, position: Array, covariance: Array
 ) -> None:
     """Fit all peaks of one channel, first their logarithms, then the beliefs themselves.
 
     The logarithm makes the first fit linear and exact for a clean Gaussian, at the border too,
     where the neighbourhood is cut; weights b² undo the logarithm's amplification of noise (Guo,
     IEEE SPM 2011). Gauss–Newton on b itself then removes the bias that noise leaves in logarithms.
+
+    Args:
+        belief: The channel's map.
+        cells: (column, row) of each peak.
+        half: Half-width of the window around a peak that it is fitted to, cells.
+        sigma: Standard deviation of a perfect peak, cells.
+        position: Filled with (x, y) of each peak, cells.
+        covariance: Filled with the covariance of each position, cells²: the fitted Gaussian's less
+            the target's, as far as the map's noise does not explain it, and that of the fit.
     """
-    count = len(cells)
+    count, side = len(cells), 2 * half + 1
     theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
     noise, freedom = 0.0, 0.0
     scores, work = np.empty(count), np.empty((5, 10))
-    half = windows.shape[1] // 2
+    windows, own = np.empty((count, side, side)), np.empty((count, side, side), np.bool_)
     for i in range(count):
+        _read_window(belief, cells[i, 0] - half, cells[i, 1] - half, windows[i])
         scores[i] = windows[i, half, half]
-        position[i] = cells[i]
-    own = np.empty((count, windows.shape[1], windows.shape[1]), np.bool_)
+        position[i, 0], position[i, 1] = cells[i, 0], cells[i, 1]
     for i in range(count):
         _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
     for i in range(count):
@@ -174,6 +103,58 @@ def _fit_channel(
         offset, sound = _mode(windows[i], theta[i])
         position[i] = cells[i] + offset
         _covariance(theta[i], offset, sound, hessian[i], relative, sigma, covariance[i])
+
+
+@compiled()
+def _read_window(belief: Array, left: int, top: int, window: Array) -> None:
+    """Copy the cells around a peak, NaN outside of the map."""
+    height, width = belief.shape
+    for y in range(len(window)):
+        for x in range(len(window)):
+            row, column = top + y, left + x
+            inside = 0 <= row < height and 0 <= column < width
+            window[y, x] = belief[row, column] if inside else math.nan
+
+
+@compiled()
+def mean_vectors(
+    vectors: Array, cells: Array, position: Array, radius: float, toward: Array
+) -> None:
+    """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
+
+    Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
+    fall to 0 at the edges of discs, which no position is exact enough to tell. ``vectors`` are the
+    corner's two channels of the field; the radius is in cells.
+    """
+    height, width = vectors.shape[1:]
+    half = math.ceil(radius)
+    near = np.empty(len(cells), np.int64)
+    for i in range(len(cells)):
+        count = 0
+        for j in range(len(cells)):
+            dx, dy = position[j, 0] - position[i, 0], position[j, 1] - position[i, 1]
+            if j != i and dx * dx + dy * dy < 4.1 * radius**2:  # farther discs do not overlap
+                near[count] = j
+                count += 1
+        total = 0.0
+        for row in range(max(cells[i, 1] - half, 0), min(cells[i, 1] + half + 1, height)):
+            for column in range(max(cells[i, 0] - half, 0), min(cells[i, 0] + half + 1, width)):
+                squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+                weight = 1 - squared / radius**2
+                u, v = vectors[0, row, column], vectors[1, row, column]
+                if not (weight > 0.0 and math.isfinite(u) and math.isfinite(v)):
+                    continue
+                nearest = True
+                for j in near[:count]:
+                    if (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2 < squared:
+                        nearest = False
+                        break
+                if nearest:
+                    total += weight
+                    toward[i, 0] += weight * u
+                    toward[i, 1] += weight * v
+        if total > 0.0:
+            toward[i] /= total
 
 
 @compiled()
@@ -203,6 +184,13 @@ def _own_cells(
         if j == i or far > 4 * half + 2:
             continue
         handicap = 2 * sigma**2 * math.log(scores[i] / scores[j]) - margin
+        # The difference of the squared distances is linear, so a corner has the least of it.
+        column = cells[i, 0] + (half if position[j, 0] > position[i, 0] else -half)
+        row = cells[i, 1] + (half if position[j, 1] > position[i, 1] else -half)
+        mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+        other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
+        if mine - handicap < other - SURELY:
+            continue
         for y in range(side):
             for x in range(side):
                 column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
@@ -281,7 +269,10 @@ def _step(
     if move:
         solve_damped(hessian, gradient, 0.0, step)
         theta += step
-    return squared, used, np.abs(step).max()
+    farthest = 0.0
+    for value in step:
+        farthest = max(farthest, abs(value))
+    return squared, used, farthest
 
 
 @compiled()
@@ -371,8 +362,8 @@ def _covariance(
     determinant = a * c - b * b
     shape = np.array([[c, -b], [-b, a]]) / determinant
     x, y = offset[0], offset[1]
-    slopes = np.array([[0.0, 1.0, 0.0, -2 * x, -y, 0.0], [0.0, 0.0, 1.0, 0.0, -x, -2 * y]])
-    slopes = shape @ slopes
+    moves = np.array([[0.0, 1.0, 0.0, -2 * x, -y, 0.0], [0.0, 0.0, 1.0, 0.0, -x, -2 * y]])
+    slopes = shape[:, :1] * moves[0] + shape[:, 1:] * moves[1]
     moved = np.empty(6)
     for k in range(2):
         solve_damped(hessian, -slopes[k], 0.0, moved)
