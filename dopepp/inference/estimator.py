@@ -79,7 +79,7 @@ class PoseEstimator:
         self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
-        self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = network.for_inference().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
