@@ -31,7 +31,7 @@ def degenerate(
     ``to_px`` turns rays into pixels, ``whitening`` pixels into standard deviations.
     """
     if len(object_points) < MIN_POINTS:
-        return f"only {len(object_points)} usable points, {MIN_POINTS} are needed"
+        return too_few(len(object_points))
     extent, length, breadth, distinct, image_length, image_breadth, noise = _spreads(
         object_points, rays, to_px, whitening
     )
@@ -46,6 +46,11 @@ def degenerate(
     if math.hypot(image_length, image_breadth) < noise * math.sqrt(len(rays)):
         return "the pixels spread no wider than their own noise"
     return ""
+
+
+def too_few(num_points: int) -> str:
+    """Say that so many points fix no pose."""
+    return f"only {num_points} usable points, {MIN_POINTS} are needed"
 
 
 @compiled()

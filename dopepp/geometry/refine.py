@@ -66,12 +66,13 @@ def refine_pose(
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
     moved_R, moved_t = np.empty((3, 3)), np.empty(3)
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    room = np.empty((7, 6))
     if not reproject(object_points, rays, whitening, R, t, residuals):
         return
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
     normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
-        solve_damped(hessian, gradient, damping, step)
+        solve_inside(hessian, gradient, damping, step, room)
         turn(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
@@ -176,7 +177,13 @@ def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -
 
     Scaled to a unit diagonal, rotations and translations of any size are damped alike.
     """
-    L, scale = np.zeros((6, 6)), np.empty(6)
+    solve_inside(hessian, gradient, damping, step, np.empty((7, 6)))
+
+
+@compiled()
+def solve_inside(hessian: Array, gradient: Array, damping: float, step: Array, room: Array) -> None:
+    """Do the same within a (7, 6) array, so that a loop need not ask for memory each time."""
+    L, scale = room[:6], room[6]
     for i in range(6):
         scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
     for i in range(6):

@@ -283,9 +283,7 @@ def _best_triple(
         for n in range(3):
             known[n] = (missing + 1 + n) % 4
             corners[n] = DIAGONALS[known[n], sides >> n & 1]
-        combinations = 1
-        for n in range(3):
-            combinations *= usable[corners[n]]
+        combinations = usable[corners[0]] * usable[corners[1]] * usable[corners[2]]
         chosen[:] = 0
         for _ in range(combinations):
             diagonals[missing] = 0.0

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.degeneracy import MIN_POINTS, too_few
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
@@ -152,6 +153,9 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
     A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
     agree on a pose, the deviations are widened and the pose solved again.
     """
+    found = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
+    if found < MIN_POINTS:  # as of most centroids that noise makes
+        return PnPResult(None, math.inf, np.zeros(NUM_KEYPOINTS, bool), too_few(found))
     covariance = _averaged(group.covariance_px)
     return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)
 
