@@ -72,7 +72,7 @@ def predict(
     ] = None,
     unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
     refine: Annotated[
-        str | None, typer.Option(help="region: on the picture; depth: with --depth")
+        str | None, typer.Option(help="region: on the picture; depth: with --depth; region,depth")
     ] = None,
     max_ms: Annotated[
         float | None, typer.Option(help="of refining, then detections keep the network's poses")
@@ -94,11 +94,12 @@ def predict(
     from dopepp.recovery.silence import explained
 
     with report_errors():
-        _check_options(refine, depth, track, verify, distance or roi)
+        terms = () if refine is None else tuple(refine.split(","))
+        _check_options(terms, depth, track, verify, distance or roi)
         _check_overlay(overlay, track)
         lens = _Lens(_camera(intrinsics, camera), K_size, crop)
-        refine = "region" if track else refine
-        estimator, known = _estimator(checkpoint, device, refine, verify, parts, unit, max_ms)
+        terms = ("region",) if track else terms
+        estimator, known = _estimator(checkpoint, device, terms, verify, parts, unit, max_ms)
         if track:
             _track(estimator, image, lens, overlay)
             return
@@ -118,7 +119,7 @@ def predict(
         typer.echo(f"nothing found: {why}", err=True)
     for number, one in enumerate(found):
         record = _record(one)
-        if refine is not None:
+        if terms:
             record["kept"] = one.kept or None
         if verify:
             record["agreement"] = agreements[number]
@@ -168,10 +169,10 @@ def _camera(intrinsics: tuple[float, float, float, float] | None, path: Path | N
 
 
 def _check_options(
-    refine: str | None, depth: Path | None, track: bool, verify: bool, where: object
+    refine: Sequence[str], depth: Path | None, track: bool, verify: bool, where: object
 ) -> None:
     """Refuse options that do not go together."""
-    if (refine == "depth") != (depth is not None):
+    if ("depth" in refine) != (depth is not None):
         raise UserError(
             "--depth without --refine depth" if depth else "--refine depth without --depth",
             "both or none of them",
@@ -195,7 +196,7 @@ def _check_overlay(overlay: Path | None, track: bool) -> None:
 def _estimator(
     checkpoint: Path,
     device: str,
-    refine: str | None,
+    refine: Sequence[str],
     verify: bool,
     parts: Sequence[str] | None,
     unit: str | None,
@@ -207,9 +208,9 @@ def _estimator(
 
     estimator = PoseEstimator.load(checkpoint, device, max_ms=max_ms)
     known = estimator.parts
-    if verify or refine == "region":
+    if verify or "region" in refine:
         known = with_meshes(known, parts or (), unit)
-    return (estimator if refine is None else estimator.refining(refine, known)), known
+    return (estimator.refining(refine, known) if refine else estimator), known
 
 
 def _agreements(

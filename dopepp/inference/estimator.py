@@ -26,7 +26,7 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import make_refiner
+from dopepp.inference.refinement.refiner import Refine, make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.scales import Distances, letterboxes, merged
@@ -55,15 +55,16 @@ class PoseEstimator:
         network: The trained network.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
-        refine: ``region`` refines poses on the picture (:mod:`dopepp.inference.refinement.region`),
-            ``depth`` with the depth that :meth:`predict` is given; None does not.
+        refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
+            picture; ``depth``, the depth that :meth:`predict` is given; or both, ``("region",
+            "depth")``. None does not.
         parts: The checkpoint's parts with their meshes, where it has none itself (an earlier
             version's).
         max_ms: Milliseconds of refining a picture after which its further detections, the best
             score first, keep the network's poses; None sets no limit.
 
     Raises:
-        UserError: The refinement is unknown, its extra is missing, or a part has no mesh.
+        UserError: The refinement is unknown, or a part has no mesh.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class PoseEstimator:
         network: PoseNetwork,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> None:
@@ -89,7 +90,7 @@ class PoseEstimator:
         cls,
         path: str | Path,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
@@ -100,7 +101,7 @@ class PoseEstimator:
         """
         return cls(*load_network(Path(path)), device, refine, parts, max_ms)
 
-    def refining(self, refine: str, parts: Sequence[Part] | None = None) -> PoseEstimator:
+    def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
         return type(self)(self.network, self.checkpoint, self.device, refine, parts, self.max_ms)
 

@@ -78,10 +78,10 @@ def test_predict_says_in_one_line_why_there_is_nothing(write_checkpoint, picture
 
 
 def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
-    pytest.importorskip("small_gicp")
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
-    for options in (("depth", "--depth", depth), ("region",)):
+    measured = ("--depth", depth)
+    for options in (("depth", *measured), ("region",), ("region,depth", *measured)):
         done = call("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
         assert done.exit_code == 0, done.output
         for line in done.stdout.splitlines():
@@ -94,7 +94,8 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
     [
         (["--refine", "depth"], "--refine depth without --depth"),
         (["--depth", "d.png"], "--depth without --refine depth"),
-        (["--refine", "icp"], "refine='icp'"),
+        (["--refine", "icp"], "refine=('icp',)"),
+        (["--refine", "region,"], "refine=('region', '')"),
         (["--track", "--verify"], "--track with --verify"),
         (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
