@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -25,8 +25,9 @@ from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
-from dopepp.models.network import network_cost
+from dopepp.models.network import PoseNetwork, network_cost
 from dopepp.parts.part import Parts
 from dopepp.recovery.silence import Reason, furthest
 
@@ -114,7 +115,11 @@ class EstimatorMethod:
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
         size = self.estimator.checkpoint.input_size
-        parameters, gmacs = network_cost(self.estimator.network, size)
+        network = self.estimator.network
+        if isinstance(network, ExportedNetwork):  # without the network's own modules
+            parameters, gmacs = network.export.parameters, network.export.gmacs
+        else:
+            parameters, gmacs = network_cost(cast(PoseNetwork, network), size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 
