@@ -7,6 +7,7 @@ Batch, height and width are free, the sides multiples of the network's. To add a
 
 from __future__ import annotations
 
+import errno
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -102,7 +103,10 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
     def save(folder: Path, checkpoint: Checkpoint, export: Export) -> None:
         model.set_rt_info(pack(checkpoint, export), [KEY])
         folder.mkdir(exist_ok=True)
-        openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
+        try:
+            openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
+        except RuntimeError as error:  # does not say what the system has refused
+            raise OSError(errno.EIO, "OpenVINO could not write it, is the disk full?") from error
 
     return save
 

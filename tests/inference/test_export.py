@@ -45,6 +45,8 @@ def original(request, tiny_spec, tmp_path_factory):
         if isinstance(module, nn.BatchNorm2d):
             nn.init.normal_(module.running_mean)
             nn.init.uniform_(module.running_var, 0.5, 2)
+    for branch in (*network.head.belief_branches, *network.head.field_branches):
+        nn.init.normal_(branch.outputs[-1].weight, std=0.5)  # untrained ones answer a constant
     checkpoint = Checkpoint(
         spec, network.state_dict(), [pivconnector()], (128, 96), 8, 1.5, {"peak_threshold": 1e-3}
     )
@@ -82,7 +84,7 @@ def test_the_same_maps_for_any_batch_height_and_width(exported, original):
         with torch.inference_mode():
             pairs = zip(theirs.network.maps(images), ours.network.maps(images), strict=True)
         for one, other in pairs:
-            assert other.std() > 1e-3
+            assert other.std() > 0.01
             torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
 
 

@@ -75,6 +75,8 @@ class OnnxNetwork(ExportedNetwork):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = num_threads()
         options.inter_op_num_threads = 1
+        # Threads that wait busily for the next picture take the cores from decoding and refining.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = _ERRORS_ONLY
         try:
             self.session = onnxruntime.InferenceSession(

@@ -36,9 +36,6 @@ MAX_XML_BYTES: Final = 2 * MAX_HEADER_BYTES
 _OWN: Final = re.compile(r"opset\d{1,2}", re.ASCII)
 """Versions of operators that are OpenVINO's own."""
 
-_MAX_SIZES: Final = 4
-"""Input sizes for which a compiled graph is kept."""
-
 
 def load_openvino(choice: str) -> Any:
     """Import OpenVINO; a :class:`~dopepp.core.errors.UserError` where its extra is missing.
@@ -64,22 +61,15 @@ def read(path: Path) -> OpenVinoNetwork:
     xml = read_bytes(file, MAX_XML_BYTES)
     weights = read_bytes(file.with_suffix(WEIGHTS))
     checkpoint, export = unpack(_check_xml(xml, len(weights), path), path)
+    width, height = checkpoint.input_size
     try:
         model = openvino.Core().read_model(xml, weights)
-        network = OpenVinoNetwork(model, path, checkpoint, export)
-        width, height = checkpoint.input_size
-        sized = network.resized(1, height, width)
-        shapes = {
-            f"{one.get_friendly_name()}.{number}": None
-            if output.get_partial_shape().is_dynamic
-            else list(output.get_shape())
-            for one in sized.get_ops()
-            for number, output in enumerate(one.outputs())
-        }
+        sized = model.clone()
+        sized.reshape({sized.inputs[0]: [1, 3, height, width]})
+        check_shapes(path, _shapes(sized), width * height)
+        return OpenVinoNetwork(model, path, checkpoint, export)
     except RuntimeError as error:
         raise refused(path, _reason(error)) from error
-    check_shapes(path, shapes, width * height)
-    return network
 
 
 class OpenVinoNetwork(ExportedNetwork):
@@ -87,26 +77,12 @@ class OpenVinoNetwork(ExportedNetwork):
 
     def __init__(self, model: Any, path: Path, checkpoint: Checkpoint, export: Export) -> None:
         super().__init__(path, checkpoint, export)
-        self.model = model
-        self._requests: dict[tuple[int, ...], Any] = {}
-
-    def resized(self, count: int, height: int, width: int) -> Any:
-        """Return a copy of the model for inputs of one shape."""
-        model = self.model.clone()
-        model.reshape({model.inputs[0]: [count, 3, height, width]})
-        return model
+        self.request = compiled(model).create_infer_request()
 
     def run(self, pixels: Pixels) -> Arrays:
-        """Return what the graph answers; it is compiled for every shape that comes."""
-        request = self._requests.pop(pixels.shape, None)
-        if request is None:
-            count, _, height, width = pixels.shape
-            request = compiled(self.resized(count, height, width)).create_infer_request()
-        self._requests[pixels.shape] = request  # the latest as the last
-        if len(self._requests) > _MAX_SIZES:
-            del self._requests[next(iter(self._requests))]
-        request.infer([pixels])
-        belief, field = (request.get_output_tensor(number).data.copy() for number in range(2))
+        """Return what the graph answers."""
+        self.request.infer([pixels])
+        belief, field = (self.request.get_output_tensor(number).data.copy() for number in range(2))
         return belief, field
 
 
@@ -122,6 +98,17 @@ def compiled(model: Any) -> Any:
         "PERFORMANCE_HINT": "LATENCY",
     }
     return load_openvino("an exported network").Core().compile_model(model, "CPU", options)
+
+
+def _shapes(model: Any) -> dict[str, list[int] | None]:
+    """Return the shape of every tensor of a model, None where it is not known."""
+    return {
+        f"{one.get_friendly_name()}.{number}": None
+        if output.get_partial_shape().is_dynamic
+        else list(output.get_shape())
+        for one in model.get_ops()
+        for number, output in enumerate(one.outputs())
+    }
 
 
 def _find(folder: Path) -> Path:
