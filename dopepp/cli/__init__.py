@@ -11,11 +11,23 @@ from typing import Any, Final
 import typer
 from typer.core import TyperGroup
 
-from dopepp.cli import check, compare, download, predict, release, render, symmetries
+from dopepp.cli import (
+    benchmark,
+    check,
+    compare,
+    download,
+    export,
+    predict,
+    release,
+    render,
+    symmetries,
+)
 from dopepp.cli.errors import USERS_MISTAKE
 
 COMMANDS: Final = (
     predict.predict,
+    export.export,
+    benchmark.benchmark,
     render.render,
     check.check,
     download.download,

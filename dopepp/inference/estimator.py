@@ -27,12 +27,13 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
+from dopepp.inference import runtimes
 from dopepp.inference.refinement.refiner import Refine, Refiner, make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.inference.scales import Distances, letterboxes, merged
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
-from dopepp.models.network import PoseNetwork
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
@@ -63,7 +64,7 @@ class PoseEstimator:
     """Finds the 6D poses of the trained parts on RGB images of any size.
 
     Args:
-        network: The trained network.
+        network: The trained network, of PyTorch's or out of an exported file.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
         refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
@@ -80,7 +81,7 @@ class PoseEstimator:
 
     def __init__(
         self,
-        network: PoseNetwork,
+        network: Runtime,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
         refine: Refine | None = None,
@@ -95,7 +96,7 @@ class PoseEstimator:
         """Its parts, with the meshes that it was given."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Milliseconds since it was made, by step of :data:`STEPS`."""
-        self.network = network.for_inference().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
@@ -109,12 +110,13 @@ class PoseEstimator:
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
-        """Load a checkpoint written by training; see the class for the options.
+        """Load a checkpoint, or what ``dopepp export`` made of one; see the class for the options.
 
-        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or the
-        refinement is not possible.
+        A :class:`UserError`: the file is missing, is neither of these or not safe to load, its
+        extra is missing, or the refinement is not possible.
         """
-        return cls(*load_network(Path(path)), device, refine, parts, max_ms)
+        chosen = checked_device(device)
+        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
 
     def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
