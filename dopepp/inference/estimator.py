@@ -26,7 +26,6 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.scales import Distances, letterboxes, merged
@@ -76,7 +75,11 @@ class PoseEstimator:
         max_ms: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as all else but torch
+            from dopepp.inference.refinement.refiner import make_refiner
+
+            self.refiner = make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -108,6 +111,26 @@ class PoseEstimator:
     def parts(self) -> Sequence[Part]:
         """The objects this estimator knows, in the network's order."""
         return self.checkpoint.parts
+
+    def __repr__(self) -> str:
+        """Say what it finds at which distances, with which network and thresholds."""
+        known, limits = self.checkpoint, self.recovery
+        parameters = sum(one.numel() for one in self.network.parameters())
+        width, height = known.input_size
+        name = known.data.get("name", "network")
+        lines = [f"PoseEstimator({name}, {parameters:,} parameters, {width}×{height} pixels, "
+                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        for part in self.parts:
+            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
+            seen = known.seen.get(part.name)
+            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            lines.append(f"{part.name}: {size} mm{where}")
+        lines.append(
+            f"thresholds: peak {limits.peak_threshold:.3g}, "
+            f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
+            f"refined score {limits.refined_min_score:.3g}"
+        )
+        return "\n  ".join(lines)
 
     def predict(
         self,
