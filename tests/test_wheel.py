@@ -1,6 +1,7 @@
 """The wheel: it holds every file that the program reads, and works where there is no repository."""
 
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -16,6 +17,7 @@ from setuptools import Distribution
 import dopepp
 
 ROOT = Path(__file__).parents[1]
+COMPILED = shutil.ignore_patterns("__pycache__")
 
 
 def test_it_holds_every_file_that_the_program_reads(monkeypatch):
@@ -50,18 +52,24 @@ Run = Callable[..., "CompletedProcess[str]"]
 def installed(tmp_path_factory) -> Run:
     """Build the wheel, install it beside this environment's libraries; run it in a bare folder."""
     base = tmp_path_factory.mktemp("wheel")
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    wheel = [*pip, "wheel", str(ROOT), "--no-deps", "--no-build-isolation", "-w", str(base)]
-    subprocess.run(wheel, check=True, capture_output=True)
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    for name in ("dopepp", "hydra_plugins", "conf"):  # a build leaves its own files in the sources
+        shutil.copytree(ROOT / name, base / "sources" / name, ignore=COMPILED)
+    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, base / "sources")
+
+    def pip(*arguments: str) -> None:
+        command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
+        subprocess.run(command, check=True, capture_output=True, env=own)
+
+    pip("wheel", f"{base}/sources", "--no-deps", "--no-build-isolation", "-w", str(base))
     (path,) = base.glob("dopepp-*.whl")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", base / "venv"], check=True)
     python = base / "venv" / "bin" / "python"
-    install = [*pip, "--python", str(python), "install", "--no-deps", "--no-index", str(path)]
-    subprocess.run(install, check=True, capture_output=True)
+    pip("--python", str(python), "install", "--no-deps", "--no-index", str(path))
     (site,) = (base / "venv" / "lib").glob("python*/site-packages")
     # Paths of a .pth file are searched, their own .pth files are not: no editable dopepp comes in.
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def run(*arguments: str, folder: Path) -> "CompletedProcess[str]":
         command = [str(base / "venv" / "bin" / "dopepp"), *arguments]
@@ -84,7 +92,7 @@ def test_a_wheel_trains_and_measures_in_an_empty_folder(installed, tiny_options,
     assert "experiment: " in run("train", "--help")
     assert "name: dopepp_fast" in run("train", "--cfg", "job", "model=dopepp_fast")
     assert "nearest seed" in run("train", "sed=1", code=2)
-    assert "got data.parts" in run("train", "data=virtual", "data.parts=[none.stl]", code=2)
+    assert "got mesh none.stl" in run("train", "data=virtual", "data.parts=[none.stl]", code=2)
     assert not list(tmp_path.iterdir()) or not list((tmp_path / "outputs").iterdir())
     shown = run("train", *tiny_options)
     assert "deprecat" not in shown.lower()

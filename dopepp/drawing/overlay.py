@@ -15,8 +15,6 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import resize_points
@@ -174,6 +172,10 @@ def draw_text(
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
     """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
+    # Imported where text is drawn: a command that prints poses alone starts without it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     # Wide enough for any glyph (an em each), cut to the measured width afterwards.
     width = size_px * (len(text) + 1)
     figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)

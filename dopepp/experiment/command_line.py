@@ -28,6 +28,7 @@ import dopepp
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
 from dopepp.experiment.launch import remote
+from dopepp.experiment.runs.program import shown
 
 # The modules that load PyTorch are imported inside functions: a typo is told before.
 
@@ -70,7 +71,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
         if remote.is_first_process():
-            _log.info("begins in %s", run_dir)
+            _log.info("begins in %s", shown(run_dir))
         try:
             # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
             resumed = any(text.startswith("resume=") for text in hydra.overrides.task)

@@ -160,4 +160,6 @@ class AnnounceJobs(Callback):
         folder = config.hydra.sweep.dir
         _log.info("begins in %s", folder)
         if is_remote(str(config.hydra.launcher._target_)):
-            _log.info("each job prints to %s/JOB/%s", folder, LOG_FILE)
+            from dopepp.experiment.runs import display
+
+            display.console.print(f"each job prints to {folder}/JOB/{LOG_FILE}")

@@ -17,6 +17,13 @@ def typed(verb: str) -> str:
     return f"python {verb}.py" if script else f"dopepp {verb}"
 
 
+def shown(path: Path) -> str:
+    """Return a path as a person would type it here: relative where it is below this folder."""
+    path = path.absolute()
+    below = path.is_relative_to(Path.cwd())
+    return str(path.relative_to(Path.cwd()) if below else path)
+
+
 def command() -> list[str]:
     """Return the words of the present command, the program without its folder."""
     return [Path(sys.argv[0]).name, *sys.argv[1:]]

@@ -19,6 +19,7 @@ from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text
 from dopepp.experiment.runs import program, record
+from dopepp.experiment.runs.program import shown
 from dopepp.metrics.row import shown_columns
 from dopepp.training.callbacks.pictures import best_effort
 
@@ -151,13 +152,6 @@ def write_sweep_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, 
         markdown_text(rows, ["job", "state"]) if rows else "",
     ]
     _write(folder, sections)
-
-
-def shown(path: Path) -> str:
-    """Return a path as a person would type it here: relative where it is below this folder."""
-    path = path.absolute()
-    below = path.is_relative_to(Path.cwd())
-    return str(path.relative_to(Path.cwd()) if below else path)
 
 
 def _write(folder: Path, sections: Sequence[str]) -> None:

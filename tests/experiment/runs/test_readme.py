@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from dopepp.experiment.runs import readme, record
+from dopepp.experiment.runs import program, readme, record
 
 CONFIG: Any = SimpleNamespace(
     model=SimpleNamespace(name="dopepp"),
@@ -52,9 +52,9 @@ def test_every_state_is_told_with_what_to_do(run, monkeypatch):
 
 
 def test_paths_are_typed_as_from_here(run, monkeypatch):
-    assert readme.shown(run) == str(run)
+    assert program.shown(run) == str(run)
     monkeypatch.chdir(run.parent)
-    assert readme.shown(run / "x") == "a run/x"
+    assert program.shown(run / "x") == "a run/x"
 
 
 def test_a_readme_that_cannot_be_written_ends_no_run(run, caplog):
