@@ -28,7 +28,6 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference import runtimes
-from dopepp.inference.refinement.refiner import Refine, Refiner, make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.runtimes.runtime import Runtime
@@ -42,6 +41,7 @@ from dopepp.recovery.silence import Reason, rejected_refined
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.refinement.refiner import Refine, Refiner
     from dopepp.inference.results import PoseResult
     from dopepp.inference.sources import SourceLike
     from dopepp.inference.stream import StreamOptions
@@ -89,7 +89,11 @@ class PoseEstimator:
         max_ms: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as all else but torch
+            from dopepp.inference.refinement.refiner import make_refiner
+
+            self.refiner = make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
         self.solid_parts = tuple(parts or checkpoint.parts)
@@ -126,6 +130,26 @@ class PoseEstimator:
     def parts(self) -> Sequence[Part]:
         """The objects this estimator knows, in the network's order."""
         return self.checkpoint.parts
+
+    def __repr__(self) -> str:
+        """Say what it finds at which distances, with which network and thresholds."""
+        known, limits = self.checkpoint, self.recovery
+        runtime = type(self.network).__name__
+        width, height = known.input_size
+        name = known.data.get("name", "network")
+        lines = [f"PoseEstimator({name} as {runtime}, {width}×{height} pixels, "
+                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        for part in self.parts:
+            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
+            seen = known.seen.get(part.name)
+            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            lines.append(f"{part.name}: {size} mm{where}")
+        lines.append(
+            f"thresholds: peak {limits.peak_threshold:.3g}, "
+            f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
+            f"refined score {limits.refined_min_score:.3g}"
+        )
+        return "\n  ".join(lines)
 
     def predict(
         self,
