@@ -11,7 +11,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperGroup
 
-from dopepp.cli import check, compare, download, predict, release, render, symmetries
+from dopepp.cli import calibrate, check, compare, download, predict, release, render, symmetries
 from dopepp.cli.errors import USERS_MISTAKE
 
 COMMANDS: Final = (
@@ -57,3 +57,4 @@ def _configure() -> None:
 
 for _command in COMMANDS:
     app.command(cls=render.RenderCommand if _command is render.render else None)(_command)
+app.add_typer(calibrate.app, name="calibrate")
