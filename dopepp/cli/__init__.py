@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from dopepp import __version__
 from dopepp.cli import (
     benchmark,
+    calibrate,
     check,
     compare,
     download,
@@ -88,3 +89,5 @@ for _command in COMMANDS:
         else None,
         add_help_option=_command not in (entries.train, entries.evaluate),
     )(_command)
+
+app.add_typer(calibrate.app, name="calibrate")
