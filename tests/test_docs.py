@@ -34,7 +34,13 @@ APP: Final = typer.main.get_command(app)
 APP_OPTIONS: Final = {text for parameter in APP.params for text in parameter.opts}
 COMMANDS: Final = APP.commands
 OPTIONS: Final = {
-    name: {text for parameter in command.params for text in parameter.opts} | {"--help"}
+    name: {
+        text
+        for one in (command, *getattr(command, "commands", {}).values())  # of `dopepp calibrate …`
+        for parameter in one.params
+        for text in parameter.opts
+    }
+    | {"--help"}
     for name, command in COMMANDS.items()
 }
 
@@ -206,7 +212,11 @@ def parse_problem(words: list[str]) -> str | None:
             overrides = [word for word in plain if "=" in word and not word.startswith("-")]
             OverridesParser.create().parse_overrides(overrides)
         elif words[0] == "dopepp" and program[1] in COMMANDS:
-            COMMANDS[program[1]].make_context(program[1], arguments)
+            command = COMMANDS[program[1]]
+            if hasattr(command, "commands"):
+                name, *arguments = arguments
+                command = command.commands[name]
+            command.make_context(program[1], arguments)
     except (OverrideParseException, USAGE_ERROR) as error:
         return str(error)
     return None
