@@ -49,7 +49,8 @@ def _by_region(parts: Sequence[Part]) -> Refiner:
     }
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
-        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance)
+        followed = one.agreement is not None  # which only refinement gives
+        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, followed)
 
     return refined
 
