@@ -22,7 +22,8 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.contour import Contour
-from dopepp.inference.refinement.solver import DAMPING, Terms
+from dopepp.inference.refinement.fit import Terms
+from dopepp.inference.refinement.solver import DAMPING
 
 LEAST_CHANGE: Final = 3.0
 """Grey levels that are noise: a picture that changes less has no edges."""
