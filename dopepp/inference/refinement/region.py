@@ -181,7 +181,7 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
     rounds = _needed(rounds, reach)
-    if rounds[0].stage is FINE:
+    if rounds[0] is rounds[-1]:  # the last one alone
         return _refined(rounds, given, prior, reach)
     rounds[0].learn(given, reach)
     wide = Prior(given, prior.information / WIDENED**2)
