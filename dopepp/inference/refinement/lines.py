@@ -66,6 +66,14 @@ class Weights(NamedTuple):
     edge: float
 
 
+FOUND: Final = Weights(colour=0.5, edge=1.0)
+"""For a start that may be far off: many edges are near, and colours tell which is the part's."""
+
+FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
+"""For one that is near: the nearest edge is the part's, and blur leaves its middle where it was,
+whatever the colours. From far starts on real pictures 9 % of poses get worse by it, not 7 %."""
+
+
 @dataclass(frozen=True, eq=False)
 class Shifts:
     """How far the picture's outline is from a pose's, along each normal.

@@ -17,6 +17,7 @@ from dopepp.inference.refinement.contour import Contour, find_contour
 from dopepp.inference.refinement.crop import EDGE_PX, Crop
 from dopepp.inference.refinement.fit import Prior, Terms
 from dopepp.inference.refinement.lines import (
+    FOLLOWED,
     INDEPENDENT_PX,
     LEAST_INFORMATION,
     Shifts,
@@ -186,7 +187,8 @@ class Round:
                 f"{distance:.1f} standard deviations from the given pose, more than {FARTHEST:g}"
             )
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
-        if np.mean((rows @ offset) ** 2) >= 1.0:  # within a pixel, single pixels would decide
+        near = self._followed and np.mean((rows @ offset) ** 2) < 1.0
+        if not near:  # of a followed part within a pixel, single pixels would decide
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the picture fits the given pose no worse")
@@ -195,15 +197,19 @@ class Round:
     def _gain(self, end: Solution, known: Float[np.ndarray, "6 6"]) -> float:
         """Return by how much the outline makes the covariance's volume smaller, its logarithm.
 
-        Where there is nothing beside the outline, what it says of a pose that was known well is
-        measured against one that was known less.
+        What it says of a followed part, whose pose was known well, is measured against one that
+        was known less.
         """
         said = end.information - known
-        if not self._more:
+        if self._followed:
             turn, shift = FIRM
             firm = np.repeat([turn, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
             known = np.linalg.inv(np.linalg.inv(known) + np.diag(firm))
         return float(np.linalg.slogdet(known + said)[1] - np.linalg.slogdet(known)[1])
+
+    @property
+    def _followed(self) -> bool:
+        return self.stage.weights == FOLLOWED
 
     def reach(self, reach: float) -> float:
         """Return the stage's share of a reach, in pixels of its crop."""
