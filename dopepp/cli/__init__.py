@@ -23,6 +23,7 @@ from dopepp.cli import (
     predict,
     release,
     render,
+    serve,
     symmetries,
 )
 from dopepp.cli.errors import USERS_MISTAKE
@@ -31,6 +32,7 @@ COMMANDS: Final = (
     entries.train,
     entries.evaluate,
     predict.predict,
+    serve.serve,
     export.export,
     benchmark.benchmark,
     render.render,
