@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -115,7 +116,8 @@ class EstimatorMethod:
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
         checkpoint = self.estimator.checkpoint
-        network = build_network(checkpoint.spec)  # as it was trained: the estimator's is folded
+        with torch.device("meta"):  # as it was trained, where the estimator's is folded
+            network = build_network(checkpoint.spec)
         parameters, gmacs = network_cost(network, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
