@@ -8,30 +8,35 @@ from typing import Final
 
 import typer
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import RunError, UserError
 
 USERS_MISTAKE: Final = 2
+FAILED: Final = 1
 
 
 @contextmanager
 def report_errors() -> Iterator[None]:
-    """End the command with one line for a user's mistake."""
+    """End the command with one line for a user's mistake, or for work that cannot go on."""
     try:
         yield
-    except UserError as error:
+    except (UserError, RunError) as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(USERS_MISTAKE) from error
+        code = USERS_MISTAKE if isinstance(error, UserError) else FAILED
+        raise typer.Exit(code) from error
 
 
 @contextmanager
-def resumable() -> Iterator[None]:
-    """End the command with one line when it is interrupted or cannot go on, too."""
-    from dopepp.core.interrupts import Interruption, StoppedError, interruptible
+def resumable(advice: str | None = None) -> Iterator[None]:
+    """End the command with one line when it is interrupted or cannot go on, too.
+
+    ``advice`` is what an interruption tells in place of how to resume.
+    """
+    from dopepp.core.interrupts import RESUME, Interruption, StoppedError, interruptible
 
     try:
-        with report_errors(), interruptible():
+        with report_errors(), interruptible(advice or RESUME):
             yield
-    except StoppedError as error:
+    except (RunError, StoppedError) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error
     except Interruption as interruption:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, Unpack
 
 import cv2
 import numpy as np
@@ -26,17 +27,28 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import Refine, make_refiner
+from dopepp.inference import runtimes
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.inference.scales import Distances, letterboxes, merged
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
-from dopepp.models.network import PoseNetwork
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 from dopepp.recovery.silence import Reason, rejected_refined
+
+if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.refinement.refiner import Refine, Refiner
+    from dopepp.inference.results import PoseResult
+    from dopepp.inference.sources import SourceLike
+    from dopepp.inference.stream import StreamOptions
+
+STEPS: Final = ("pre", "network", "decode", "refine")
+"""What a picture's time is spent on: undistorting and resizing, the network, from its maps to
+poses, and making these precise."""
 
 Decoded = TypeVar("Decoded")
 
@@ -52,7 +64,7 @@ class PoseEstimator:
     """Finds the 6D poses of the trained parts on RGB images of any size.
 
     Args:
-        network: The trained network.
+        network: The trained network, of PyTorch's or out of an exported file.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
         refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
@@ -69,7 +81,7 @@ class PoseEstimator:
 
     def __init__(
         self,
-        network: PoseNetwork,
+        network: Runtime,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
         refine: Refine | None = None,
@@ -77,10 +89,18 @@ class PoseEstimator:
         max_ms: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as all else but torch
+            from dopepp.inference.refinement.refiner import make_refiner
+
+            self.refiner = make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
-        self.network = network.for_inference().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.solid_parts = tuple(parts or checkpoint.parts)
+        """Its parts, with the meshes that it was given."""
+        self.spent_ms = dict.fromkeys(STEPS, 0.0)
+        """Milliseconds since it was made, by step of :data:`STEPS`."""
+        self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
@@ -94,12 +114,13 @@ class PoseEstimator:
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
-        """Load a checkpoint written by training; see the class for the options.
+        """Load a checkpoint, or what ``dopepp export`` made of one; see the class for the options.
 
-        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or the
-        refinement is not possible.
+        A :class:`UserError`: the file is missing, is neither of these or not safe to load, its
+        extra is missing, or the refinement is not possible.
         """
-        return cls(*load_network(Path(path)), device, refine, parts, max_ms)
+        chosen = checked_device(device)
+        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
 
     def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
@@ -109,6 +130,26 @@ class PoseEstimator:
     def parts(self) -> Sequence[Part]:
         """The objects this estimator knows, in the network's order."""
         return self.checkpoint.parts
+
+    def __repr__(self) -> str:
+        """Say what it finds at which distances, with which network and thresholds."""
+        known, limits = self.checkpoint, self.recovery
+        runtime = type(self.network).__name__
+        width, height = known.input_size
+        name = known.data.get("name", "network")
+        lines = [f"PoseEstimator({name} as {runtime}, {width}×{height} pixels, "
+                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        for part in self.parts:
+            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
+            seen = known.seen.get(part.name)
+            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            lines.append(f"{part.name}: {size} mm{where}")
+        lines.append(
+            f"thresholds: peak {limits.peak_threshold:.3g}, "
+            f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
+            f"refined score {limits.refined_min_score:.3g}"
+        )
+        return "\n  ".join(lines)
 
     def predict(
         self,
@@ -175,13 +216,24 @@ class PoseEstimator:
         """
         if self.refiner is None:
             return list(detections)
+        with self._timed("refine"):
+            return self._refined(self.refiner, detections, image, K, depth)
+
+    def _refined(
+        self,
+        refiner: Refiner,
+        detections: Sequence[Detection],
+        image: Picture,
+        K: CameraMatrix,
+        depth: Depth | None,
+    ) -> list[Detection]:
         refined: list[Detection] = []
         start = time.perf_counter()
         for one in detections:
             if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
                 refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
                 continue
-            result = self.refiner(one, image, K, depth)
+            result = refiner(one, image, K, depth)
             if result.covariance is None:
                 refined.append(replace(one, kept=result.reason, agreement=None))
                 continue
@@ -194,6 +246,22 @@ class PoseEstimator:
                 )
             )  # fmt: skip
         return refined
+
+    def stream(
+        self,
+        source: SourceLike,
+        K: CameraMatrix | None = None,
+        camera: Camera | Path | str | None = None,
+        **options: Unpack[StreamOptions],
+    ) -> Iterator[PoseResult]:
+        """Find the parts on every picture of a source; see :func:`dopepp.inference.stream.stream`.
+
+        The source is a path (a picture, a folder, a video, a ROS bag), a glob pattern, a camera's
+        number or a stream's URL. K, the camera or its file may be left out where a bag has it.
+        """
+        from dopepp.inference.stream import stream  # which follows parts with an estimator
+
+        return stream(self, source, K, camera, **options)
 
     def explain(
         self,
@@ -247,11 +315,24 @@ class PoseEstimator:
         letterbox: Letterbox,
     ) -> list[Decoded]:
         """Give an image's maps to :func:`recover` or :func:`explain`."""
-        belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
+        with self._timed("pre"):
+            image = letterboxed(image, letterbox, self.network.size_multiple)
+        with self._timed("network"):
+            belief, field = self.maps(image)
         names = [part.name for part in self.parts]
         K, stride = letterbox.camera(K), self.network.stride
         options = self.recovery if self.refiner is None else self.recovery.of_candidates()
-        return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
+        with self._timed("decode"):
+            return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        """Count what a step takes, with what it has left to a GPU to do."""
+        start = time.perf_counter()
+        yield
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        self.spent_ms[step] += 1000 * (time.perf_counter() - start)
 
     def maps(self, image: Picture) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""

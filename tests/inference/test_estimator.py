@@ -101,6 +101,15 @@ def test_loads_what_was_saved(estimator, parts):
     assert estimator.recovery.sigma == 1.5
 
 
+def test_it_says_what_it_knows():
+    text = repr(PoseEstimator.load("pretrained/pivconnector", refine="region"))
+    assert "128×128 pixels, cpu, refine=region)" in text
+    assert (
+        "pivconnector: 105 × 52 × 7 mm, learned at 0.085 – 0.16 m" in text
+    )  # the paper's 10.5×5.2×0.7 cm
+    assert "thresholds: " in text
+
+
 @pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
 def test_any_image_size(estimator, size):
     longest = max(size)

@@ -26,6 +26,7 @@ from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
@@ -115,10 +116,13 @@ class EstimatorMethod:
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
-        checkpoint = self.estimator.checkpoint
-        with torch.device("meta"):  # as it was trained, where the estimator's is folded
-            network = build_network(checkpoint.spec)
-        parameters, gmacs = network_cost(network, checkpoint.input_size)
+        checkpoint, network = self.estimator.checkpoint, self.estimator.network
+        if isinstance(network, ExportedNetwork):  # without the network's own modules
+            parameters, gmacs = network.export.parameters, network.export.gmacs
+        else:
+            with torch.device("meta"):  # as it was trained, where the estimator's is folded
+                trained = build_network(checkpoint.spec)
+            parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 
