@@ -306,7 +306,7 @@ def test_refines_on_the_picture(parts_path):
     alone = estimator.predict(np.full_like(rendered.image, 90), K_VGA)[0]
     assert alone.kept
     assert alone.agreement is None
-    assert_array_equal(alone.T_cam_obj, found.T_cam_obj)
+    assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
 
 
 def test_refines_no_longer_than_it_may(parts_path):

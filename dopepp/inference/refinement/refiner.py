@@ -44,7 +44,8 @@ def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
     refiners = {part.name: PartRefiner(part, terms) for part in parts}
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
-        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, depth)
+        followed = one.agreement is not None  # which only refinement gives
+        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, depth, followed)
 
     return refined
 
@@ -82,6 +83,7 @@ class PartRefiner:
         T_cam_obj: Transform,
         covariance: PoseMatrix | None = None,
         depth: Depth | None = None,
+        followed: bool = False,
     ) -> Refinement:
         """Refine one pose.
 
@@ -92,6 +94,7 @@ class PartRefiner:
             covariance: Of the given pose: rotation vector about the object's origin and shift, both
                 in camera axes, radians and metres. Without it, a broad one is taken.
             depth: Metres along z, aligned to the image, 0 where unknown.
+            followed: Whether the pose follows from one that was refined on the frame before.
 
         Returns:
             The refined pose with its covariance, or the given one with the reason why it was kept.
@@ -101,7 +104,7 @@ class PartRefiner:
             return Refinement(given, reason="the pose is not finite")
         alone = None
         if self._region is not None:
-            alone = self._region.refine(image, K, given, covariance)
+            alone = self._region.refine(image, K, given, covariance, followed)
         if alone is not None and (depth is None or not self._by_depth):
             return alone
         try:
