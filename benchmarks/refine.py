@@ -1,9 +1,11 @@
-"""Refinement on the picture: errors before and after on virtual pictures, and time a detection.
+"""Refinement on virtual pictures: errors before and after, and time a detection.
 
     python benchmarks/refine.py [--images 20] [--seed 77] [--presets wide table …] [--parts NAME …]
+                                [--refine region,depth]
 
 Poses start around the truth with a turn of 9° and a shift of 5 mm (medians), which is also their
-covariance. Times are process time of one thread, at 640×480, after a warm-up.
+covariance. Depth is a structured-light camera's, as in ``benchmarks/depth.py``. Times are process
+time of one thread, at 640×480, after a warm-up.
 """
 
 from __future__ import annotations
@@ -14,10 +16,11 @@ import time
 
 import cv2
 import numpy as np
+from depth import sensed
 
 from dopepp.geometry.camera import moved, transform
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory
 
@@ -39,27 +42,28 @@ def errors(T: np.ndarray, true: np.ndarray, points: np.ndarray) -> list[float]:
     return [turn, 1e3 * shift, 1e3 * float(distances.mean())]
 
 
-def measure(name: str, preset: str, num_images: int, seed: int, unit: str) -> str:
+def measure(name: str, preset: str, num_images: int, seed: int, unit: str, terms: list[str]) -> str:
     """Return one row of the table."""
     part = load_part(name, unit)
-    assert part.mesh is not None
-    refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+    refiner = PartRefiner(part, terms)
     factory = Factory([part], PRESETS[preset].resized(*SIZE), seed)
     rng = np.random.default_rng(seed)
     before, after, took, kept = [], [], [], 0
     for index in range(num_images):
         rendered = factory.render(0, index)
+        depth = None
+        if "depth" in terms:
+            depth = sensed(rendered.depth, np.random.default_rng([seed, index]))
         for number in rendered.scene.targets:
             if rendered.visible_fractions[number] < LEAST_VISIBLE:
                 continue
             true = rendered.scene.objects[number].T_cam_obj
             start = moved(true, rng.normal(size=6) * DEVIATIONS)
+            given = rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2), depth
             if not took:  # compiles, or loads what was compiled
-                refiner.refine(rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2))
+                refiner.refine(*given)
             began = time.process_time()
-            refined = refiner.refine(
-                rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2)
-            )
+            refined = refiner.refine(*given)
             took.append(1e3 * (time.process_time() - began))
             before.append(errors(start, true, part.points))
             after.append(errors(refined.T_cam_obj, true, part.points))
@@ -91,6 +95,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--presets", nargs="+", default=["quickstart", "wide", "table"])
     parser.add_argument("--parts", nargs="+", default=["pivconnector", "servoholder"])
+    parser.add_argument("--refine", default="region", help="terms: region, depth, region,depth")
     parser.add_argument("--unit", default="mm", help="of mesh files")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -101,7 +106,10 @@ def main() -> None:
     print("|" + " --- |" * 12)
     for name in arguments.parts:
         for preset in arguments.presets:
-            row = measure(name, preset, arguments.images, arguments.seed, arguments.unit)
+            row = measure(
+                name, preset, arguments.images, arguments.seed, arguments.unit,
+                arguments.refine.split(","),
+            )  # fmt: skip
             print(row, flush=True)
 
 

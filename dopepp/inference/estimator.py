@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, Unpack
 
 import cv2
 import numpy as np
@@ -28,7 +28,6 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference import runtimes
-from dopepp.inference.refinement.refiner import Refiner, make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.runtimes.runtime import Runtime
@@ -39,6 +38,13 @@ from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 from dopepp.recovery.silence import Reason, rejected_refined
+
+if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.refinement.refiner import Refine, Refiner
+    from dopepp.inference.results import PoseResult
+    from dopepp.inference.sources import SourceLike
+    from dopepp.inference.stream import StreamOptions
 
 STEPS: Final = ("pre", "network", "decode", "refine")
 """What a picture's time is spent on: undistorting and resizing, the network, from its maps to
@@ -61,15 +67,16 @@ class PoseEstimator:
         network: The trained network, of PyTorch's or out of an exported file.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
-        refine: ``region`` refines poses on the picture (:mod:`dopepp.inference.refinement.region`),
-            ``depth`` with the depth that :meth:`predict` is given; None does not.
+        refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
+            picture; ``depth``, the depth that :meth:`predict` is given; or both, ``("region",
+            "depth")``. None does not.
         parts: The checkpoint's parts with their meshes, where it has none itself (an earlier
             version's).
         max_ms: Milliseconds of refining a picture after which its further detections, the best
             score first, keep the network's poses; None sets no limit.
 
     Raises:
-        UserError: The refinement is unknown, its extra is missing, or a part has no mesh.
+        UserError: The refinement is unknown, or a part has no mesh.
     """
 
     def __init__(
@@ -77,14 +84,20 @@ class PoseEstimator:
         network: Runtime,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as all else but torch
+            from dopepp.inference.refinement.refiner import make_refiner
+
+            self.refiner = make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
+        self.solid_parts = tuple(parts or checkpoint.parts)
+        """Its parts, with the meshes that it was given."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Milliseconds since it was made, by step of :data:`STEPS`."""
         self.network = runtimes.placed(network, self.device)
@@ -97,7 +110,7 @@ class PoseEstimator:
         cls,
         path: str | Path,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
@@ -109,7 +122,7 @@ class PoseEstimator:
         chosen = checked_device(device)
         return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
 
-    def refining(self, refine: str, parts: Sequence[Part] | None = None) -> PoseEstimator:
+    def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
         return type(self)(self.network, self.checkpoint, self.device, refine, parts, self.max_ms)
 
@@ -117,6 +130,26 @@ class PoseEstimator:
     def parts(self) -> Sequence[Part]:
         """The objects this estimator knows, in the network's order."""
         return self.checkpoint.parts
+
+    def __repr__(self) -> str:
+        """Say what it finds at which distances, with which network and thresholds."""
+        known, limits = self.checkpoint, self.recovery
+        runtime = type(self.network).__name__
+        width, height = known.input_size
+        name = known.data.get("name", "network")
+        lines = [f"PoseEstimator({name} as {runtime}, {width}×{height} pixels, "
+                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        for part in self.parts:
+            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
+            seen = known.seen.get(part.name)
+            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            lines.append(f"{part.name}: {size} mm{where}")
+        lines.append(
+            f"thresholds: peak {limits.peak_threshold:.3g}, "
+            f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
+            f"refined score {limits.refined_min_score:.3g}"
+        )
+        return "\n  ".join(lines)
 
     def predict(
         self,
@@ -213,6 +246,22 @@ class PoseEstimator:
                 )
             )  # fmt: skip
         return refined
+
+    def stream(
+        self,
+        source: SourceLike,
+        K: CameraMatrix | None = None,
+        camera: Camera | Path | str | None = None,
+        **options: Unpack[StreamOptions],
+    ) -> Iterator[PoseResult]:
+        """Find the parts on every picture of a source; see :func:`dopepp.inference.stream.stream`.
+
+        The source is a path (a picture, a folder, a video, a ROS bag), a glob pattern, a camera's
+        number or a stream's URL. K, the camera or its file may be left out where a bag has it.
+        """
+        from dopepp.inference.stream import stream  # which follows parts with an estimator
+
+        return stream(self, source, K, camera, **options)
 
     def explain(
         self,

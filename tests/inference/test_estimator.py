@@ -101,6 +101,15 @@ def test_loads_what_was_saved(estimator, parts):
     assert estimator.recovery.sigma == 1.5
 
 
+def test_it_says_what_it_knows():
+    text = repr(PoseEstimator.load("pretrained/pivconnector", refine="region"))
+    assert "128×128 pixels, cpu, refine=region)" in text
+    assert (
+        "pivconnector: 105 × 52 × 7 mm, learned at 0.085 – 0.16 m" in text
+    )  # the paper's 10.5×5.2×0.7 cm
+    assert "thresholds: " in text
+
+
 @pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
 def test_any_image_size(estimator, size):
     longest = max(size)
@@ -202,7 +211,7 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
     with pytest.raises(UserError, match=message) as caught:
         estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, or none"):
+    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, several of them, or none"):
         PoseEstimator.load(checkpoint_path, refine="icp")
 
 
@@ -267,7 +276,6 @@ def error(pose):
 
 
 def test_refines_with_depth_where_it_is_given(parts_path):
-    pytest.importorskip("small_gicp")
     estimator, rendered = seen(parts_path, "depth")
     found = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
     alone = estimator.predict(rendered.image, K_VGA)[0]

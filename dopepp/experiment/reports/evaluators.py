@@ -12,9 +12,10 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol, cast
+from typing import Final, Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -27,7 +28,8 @@ from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
-from dopepp.models.network import PoseNetwork, network_cost
+from dopepp.models.network import network_cost
+from dopepp.models.spec import build_network
 from dopepp.parts.part import Parts
 from dopepp.recovery.silence import Reason, furthest
 
@@ -114,12 +116,13 @@ class EstimatorMethod:
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
-        size = self.estimator.checkpoint.input_size
-        network = self.estimator.network
+        checkpoint, network = self.estimator.checkpoint, self.estimator.network
         if isinstance(network, ExportedNetwork):  # without the network's own modules
             parameters, gmacs = network.export.parameters, network.export.gmacs
         else:
-            parameters, gmacs = network_cost(cast(PoseNetwork, network), size)
+            with torch.device("meta"):  # as it was trained, where the estimator's is folded
+                trained = build_network(checkpoint.spec)
+            parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 

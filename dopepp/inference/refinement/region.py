@@ -25,13 +25,13 @@ from jaxtyping import Float, UInt8
 
 from dopepp.geometry.camera import CameraMatrix, Transform, moved
 from dopepp.inference.refinement.crop import EDGE_PX, crop_around
-from dopepp.inference.refinement.depth import Refinement
+from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import Prior, make_prior
 from dopepp.inference.refinement.lines import outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.rounds import Round, Stage, UndecidedError
+from dopepp.inference.refinement.rounds import Round, Stage
 from dopepp.inference.refinement.silhouette import posed
-from dopepp.inference.refinement.solver import Solution
+from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, UndecidedError
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(longest_px=120, reach=1.0, steps=3, points=100, tiles=1)
@@ -91,23 +91,61 @@ class RegionRefiner:
         given = np.asarray(T_cam_obj, np.float64)
         if not np.isfinite(given).all():
             return Refinement(given, reason="the pose is not finite")
+        try:
+            prior = _prior(given, self._diameter, covariance)
+            end, agreement = _search(self._rounds(image, K, given), prior)
+        except UndecidedError as undecided:
+            return Refinement(given, reason=str(undecided))
+        return Refinement(end.T_cam_obj, np.linalg.inv(end.information), agreement=agreement)
+
+    def refine_with(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        K: CameraMatrix,
+        depth: DepthEvidence,
+        start: Solution,
+    ) -> tuple[Solution, float]:
+        """Refine a pose on the picture and with depth at once.
+
+        Args:
+            image: RGB.
+            K: Its camera matrix, pixels.
+            depth: What pulls beside the outline.
+            start: Where one of them alone has led.
+
+        Returns:
+            The end, and the share of the outline that agrees there.
+
+        Raises:
+            UndecidedError: The picture does not decide.
+        """
+        depth.look(start.T_cam_obj)
+        rounds = self._rounds(image, K, start.T_cam_obj, [depth.evidence()])
+        reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
+        end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
+        known = depth.information(end.T_cam_obj)
+        return end, rounds[-1].agreement(end, depth.prior, reach, known)
+
+    def _rounds(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        K: CameraMatrix,
+        pose: Transform,
+        more: Sequence[Evidence] = (),
+    ) -> list[Round]:
+        """Return the rounds around a pose; an :class:`UndecidedError` where it is not in view."""
         K = np.asarray(K, np.float64)
-        at = posed(self._mesh, given, K)
+        at = posed(self._mesh, pose, K)
         if at is None:
-            return Refinement(given, reason="the part reaches behind the camera")
+            raise UndecidedError("the part reaches behind the camera")
         corners = np.stack([at.pixels.min(axis=0), at.pixels.max(axis=0)])
         rounds = []
         for stage in (COARSE, MIDDLE, FINE):
             crop = crop_around(image, K, corners, stage.longest_px)
             if isinstance(crop, str):
-                return Refinement(given, reason=crop)
-            rounds.append(Round(self._mesh, crop, stage))
-        prior = _prior(given, self._diameter, covariance)
-        try:
-            end, agreement = _search(rounds, prior)
-        except UndecidedError as undecided:
-            return Refinement(given, reason=str(undecided))
-        return Refinement(end.T_cam_obj, np.linalg.inv(end.information), agreement=agreement)
+                raise UndecidedError(crop)
+            rounds.append(Round(self._mesh, crop, stage, more))
+        return rounds
 
 
 def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None) -> Prior:
@@ -122,9 +160,6 @@ def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6
 def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     """Descend from the given pose and, where that is doubtful, from the best of several draws.
 
-    Rounds that look farther than the prior asks for are left out: a tracked part needs the last one
-    only, once.
-
     Returns:
         The end, and the share of the outline that agrees there.
 
@@ -133,12 +168,9 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
     """
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
-    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
-        rounds = rounds[1:]
-    if len(rounds) == 1:
-        # From where the first time led, the colours are learned better.
-        again = rounds if rounds[0].farthest(reach) < reach else ()
-        return _refined([*rounds, *again], given, prior, reach)
+    rounds = _needed(rounds, reach)
+    if rounds[0].stage is FINE:
+        return _refined(rounds, given, prior, reach)
     rounds[0].learn(given, reach)
     wide = Prior(given, prior.information / WIDENED**2)
     try:
@@ -157,6 +189,16 @@ def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
             raise doubt from None
 
 
+def _needed(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
+    """Leave out rounds that look farther than the reach: a tracked part needs the last one only."""
+    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
+        rounds = rounds[1:]
+    if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
+        # From where the first time led, the colours are learned better.
+        return [*rounds, *rounds]
+    return rounds
+
+
 def _refined(
     rounds: Sequence[Round], start: Transform, prior: Prior, reach: float
 ) -> tuple[Solution, float]:
@@ -165,11 +207,17 @@ def _refined(
     Raises:
         UndecidedError: Not to be believed.
     """
+    end = _descended(rounds, start, prior, reach)
+    return end, rounds[-1].agreement(end, prior, reach, prior.information)
+
+
+def _descended(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
+    """Descend in one round after the other."""
     end = Solution(start, prior.information)
     for one in rounds:
         one.learn(end.T_cam_obj, reach)
         end = one.descend(end.T_cam_obj, prior, reach)
-    return end, rounds[-1].agreement(end, prior, reach)
+    return end
 
 
 def _starts(prior: Prior) -> list[Transform]:

@@ -46,5 +46,5 @@ def load(path: Path, device: torch.device) -> tuple[Runtime, Checkpoint]:
 def placed(network: Runtime, device: torch.device) -> Runtime:
     """Return a network ready to run; one of PyTorch's is moved to the device for it."""
     if isinstance(network, PoseNetwork):
-        network = network.eval().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = network.for_inference().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network
