@@ -89,9 +89,11 @@ class OpenVinoNetwork(ExportedNetwork):
 def compiled(model: Any) -> Any:
     """Compile a model for one image after the other, in float32 where it is not quantised.
 
-    OpenVINO would otherwise compute in bfloat16 where the processor can.
+    OpenVINO would otherwise compute in bfloat16 where the processor can, and keep its threads on
+    cores that another program may be using.
     """
     options = {
+        "ENABLE_CPU_PINNING": False,
         "INFERENCE_NUM_THREADS": num_threads(),
         "INFERENCE_PRECISION_HINT": "f32",
         "NUM_STREAMS": 1,
