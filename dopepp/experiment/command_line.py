@@ -28,7 +28,7 @@ import dopepp
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
 from dopepp.experiment.launch import remote
-from dopepp.experiment.runs.program import shown
+from dopepp.experiment.runs import program
 
 # The modules that load PyTorch are imported inside functions: a typo is told before.
 
@@ -71,7 +71,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
         if remote.is_first_process():
-            _log.info("begins in %s", shown(run_dir))
+            program.say(f"begins in {program.shown(run_dir)}")
         try:
             # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
             resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
@@ -169,13 +169,13 @@ def entry(
     os.environ["HYDRA_FULL_ERROR"] = "1"
     remote.configure_logging()
     try:
-        program, given = sys.argv[:num_words], sys.argv[num_words:]
+        words, given = sys.argv[:num_words], sys.argv[num_words:]
         arguments = [_spelled_out(text, short_names or {}, open_nodes) for text in given]
-        begun = remote.begun_run([*program[1:], *arguments])
+        begun = remote.begun_run([*words[1:], *arguments])
         if begun is not None:
             arguments.append(f"resume={begun}")
         _refuse_used_folder(arguments)
-        sys.argv = [*program, *_resumed(arguments)]
+        sys.argv = [*words, *_resumed(arguments)]
         with interruptible("start the command again"):
             main()
     except Interruption as interruption:

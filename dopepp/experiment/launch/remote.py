@@ -24,6 +24,8 @@ from typing import Any, Final
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from dopepp.experiment.runs import program
+
 _log = logging.getLogger(__name__)
 
 LOG_FILE: Final = "job.log"
@@ -158,8 +160,6 @@ class AnnounceJobs(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Name the folder, and the file that each job of another process prints to."""
         folder = config.hydra.sweep.dir
-        _log.info("begins in %s", folder)
+        program.say(f"begins in {folder}")
         if is_remote(str(config.hydra.launcher._target_)):
-            from dopepp.experiment.runs import display
-
-            display.console.print(f"each job prints to {folder}/JOB/{LOG_FILE}")
+            program.say(f"each job prints to {folder}/JOB/{LOG_FILE}")

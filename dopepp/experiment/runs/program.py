@@ -24,6 +24,12 @@ def shown(path: Path) -> str:
     return str(path.relative_to(Path.cwd()) if below else path)
 
 
+def say(line: str) -> None:
+    """Print a line at once: Rich's console, which prints the others, takes long to import."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def command() -> list[str]:
     """Return the words of the present command, the program without its folder."""
     return [Path(sys.argv[0]).name, *sys.argv[1:]]
