@@ -40,7 +40,7 @@ def grasp(
     grasps: Annotated[Path | None, typer.Option(help="YAML of `dopepp grasp propose`")] = None,
     layout: Annotated[str, typer.Option(help="single, distractors, heap")] = "single",
     renderer: Annotated[
-        str, typer.Option(help="of the camera's pictures: raster, mujoco")
+        str, typer.Option(help="of the camera's pictures: raster, raster-shadows, mujoco")
     ] = "raster",
     yaw: Annotated[
         float | None, typer.Option(help="how far parts are turned to either side, degrees")

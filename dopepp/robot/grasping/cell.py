@@ -145,7 +145,8 @@ def _model(
         _add_camera(spec, T_flange_cam)
     spec.worldbody.add_geom(
         name="bench", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.3, 0.22, 0.01],
-        pos=TRAY - np.array([0, 0, 0.01]), friction=[FRICTION, 0.005, 0.0001], rgba=[0.72, 0.7, 0.66, 1],
+        pos=TRAY - np.array([0, 0, 0.01]),
+        friction=[FRICTION, 0.005, 0.0001], rgba=[0.72, 0.7, 0.66, 1],
     )  # fmt: skip
     for number, thing in enumerate(things):
         _add_thing(spec, number, thing, shown != "nothing")

@@ -21,12 +21,14 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import check_target
 from dopepp.core.futures import THREAD_LIMITS, available_cores
 from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.cell import Cell
 from dopepp.robot.grasping.film import show
 from dopepp.robot.grasping.grasps import find_grasps
 from dopepp.robot.grasping.layouts import LAYOUTS
+from dopepp.robot.grasping.rehearsal import SIZE
 from dopepp.robot.grasping.report import markdown, write_report
 from dopepp.robot.grasping.trial import BLOCK, Record, Source, Task, Trials
-from dopepp.robot.grasping.view import RENDERERS
+from dopepp.robot.grasping.view import RENDERERS, open_gl
 
 MAX_TRIALS: Final = 100_000
 
@@ -85,6 +87,8 @@ def make_experiment(
     for path, suffix in ((folder / "grasps.md", ".md"), (video, ".mp4"), (rerun, ".rrd")):
         if path is not None:
             check_target(path, (suffix,))
+    if video is not None or task.renderer == "mujoco":
+        open_gl(Cell(shown="things").model, SIZE).close()  # refused now, not after all trials
     start, records = time.monotonic(), []
     for record in run_trials(task, count, workers or available_cores()):
         records.append(record)
@@ -94,6 +98,12 @@ def make_experiment(
             say(f"{done} of {count}: {caught} caught")
     facts = _facts(task, records, time.monotonic() - start)
     write_report(folder, records, facts)
+    if all(one.failure == "no plan" for one in records):
+        raise UserError(
+            f"{task.grasps or task.part}: none of its grasps is reached in {count} trials",
+            "grasps that come from above on a face on which the part lies",
+            "write some with `dopepp grasp propose`, or see --rest",
+        )
     show(task, records, folder, video, rerun)
     return markdown(records, facts)
 

@@ -69,8 +69,8 @@ class Stage:
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, VIDEO_SIZE)
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat[:] = TRAY + np.array([0.0, 0.0, 0.15])
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.95, 155.0, -18.0
+        self._camera.lookat[:] = TRAY + np.array([0.0, 0.0, 0.12])
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.8, 155.0, -18.0
 
     def draw(self, positions: Any) -> Picture:
         """Draw a recorded state."""

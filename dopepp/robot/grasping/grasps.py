@@ -96,10 +96,11 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
     lines = [f"part: {part.name}", "grasps:"]
     for one in grasps:
         vectors = ", ".join(
-            f"{name}: [{', '.join(f'{value:.4g}' for value in getattr(one, name))}]"
+            # Adding 0 makes −0 of rounding a 0.
+            f"{name}: [{', '.join(f'{round(value, 5) + 0.0:g}' for value in getattr(one, name))}]"
             for name in ("point", "closing", "approach")
         )
-        lines.append(f"- {{{vectors}, width: {one.width:.4g}}}")
+        lines.append(f"- {{{vectors}, width: {round(one.width, 5):g}}}")
     write_whole(path, ("\n".join(lines) + "\n").encode())
 
 

@@ -37,6 +37,7 @@ from dopepp.robot.grasping.view import MujocoView, RasterView, View
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
+    from dopepp.recovery.detection import Detection
 
 BLOCK: Final = 50
 """Trials after which another robot is calibrated, as Table 9 counts them."""
@@ -123,9 +124,10 @@ class Record:
         off: By how much the pose was put off on purpose, millimetres and degrees.
         seen: Whether there was a pose.
         recognised: Whether it was right: ADD below a tenth of the diameter.
-        add_mm: ADD of it in the camera's frame, millimetres; NaN without one.
-        error_mm: How far the part was from where the arm looked for it, base frame.
-        error_deg: And how it was turned.
+        add_mm: ADD of it, millimetres; NaN without one. Like the others in the arm's base frame,
+            so that the calibration's error is in it.
+        error_mm: How far the part's origin was from where the arm looked for it, millimetres, and
+        error_deg: how it was turned, degrees.
         caught: Whether the part was held after lift and shake.
         failure: Which of :data:`FAILURES` it was; empty for none.
         hand_eye_mm: How far the calibration was off at the part's distance, and
@@ -175,7 +177,7 @@ class Scene:
     def targets(self) -> list[Transform]:
         """Where the parts are, the highest first."""
         parts = [pose for one, pose in zip(self.lying, self.poses, strict=True) if one.body.part]
-        return sorted(parts, key=lambda pose: -float(pose[2, 3]))
+        return sorted(parts, key=_height, reverse=True)
 
 
 @dataclass(eq=False)
@@ -276,7 +278,7 @@ class Trials:
         return Attempt(record, outcome or Outcome(), believed)
 
     def _poses(self, scene: Scene, source: Source) -> list[Transform]:
-        """Return where the controller believes parts to be, T_base_obj, the best first."""
+        """Return where the controller believes parts to be, T_base_obj, the highest first."""
         rng = np.random.default_rng([self.task.seed, scene.number, 2])
         if source.kind == "random":
             return [self.layout.drop(rng)]
@@ -287,13 +289,15 @@ class Trials:
         else:
             T_base_flange = self.arm.flange(scene.joints)
             T_base_cam = T_base_flange @ scene.calibrated.knowledge.T_flange_cam
-        return [T_base_cam @ one for one in self._detected(scene)]
+        poses = [T_base_cam @ one.T_cam_obj for one in self._detected(scene)]
+        return sorted(poses, key=_height, reverse=True)
 
-    def _detected(self, scene: Scene) -> list[Transform]:
-        """Return poses of the part on the picture, T_cam_obj, the surest first."""
+    def _detected(self, scene: Scene) -> list[Detection]:
+        """Return the parts on the picture that are at least half as sure as the surest."""
         lens = scene.calibrated.camera
         found = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
-        return [one.T_cam_obj for one in found if one.object == self.part.name]
+        own = [one for one in found if one.object == self.part.name]
+        return [one for one in own if one.score >= own[0].score / 2]
 
     def _record(
         self, scene: Scene, source: Source, believed: Transform | None, outcome: Outcome | None
@@ -366,7 +370,7 @@ class Trials:
 
     def _view(self, lying: Sequence[Lying]) -> View:
         """Return what takes the picture: of MuJoCo's, one for parts alone is kept."""
-        if self.task.renderer == "raster":
+        if self.task.renderer != "mujoco":
             return self._raster
         things = [one.thing for one in lying]
         if any(one.body.part is None for one in lying):
@@ -377,7 +381,11 @@ class Trials:
 
     @cached_property
     def _raster(self) -> RasterView:
-        return RasterView()
+        return RasterView(self.task.renderer == "raster-shadows")
+
+
+def _height(T_base_obj: Transform) -> float:
+    return float(T_base_obj[2, 3])
 
 
 def _off(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:

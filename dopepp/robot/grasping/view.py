@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from typing import Any, Final, Protocol
@@ -25,8 +24,9 @@ from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.sensor import capture
 
-RENDERERS: Final = ("raster", "mujoco")
-"""Of the camera's pictures: the project's, and MuJoCo's."""
+RENDERERS: Final = ("raster", "raster-shadows", "mujoco")
+"""Of the camera's pictures: the project's as the released networks learned, on a bench without
+shadows; the same with the shadows that parts throw on it; and MuJoCo's."""
 
 LOOK: Final = PRESETS["wide"]
 """Whose light, materials and camera errors the scenes have: the released networks'."""
@@ -47,9 +47,10 @@ class View(Protocol):
 
 
 class RasterView:
-    """The project's renderer: random materials, light and table under the parts."""
+    """The project's renderer: random materials and light, over a picture that lies on the bench."""
 
-    def __init__(self) -> None:
+    def __init__(self, shadows: bool) -> None:
+        self._shadows = shadows
         self._render = find_renderer("raster")
         self._backgrounds = ProceduralBackgrounds()
         # Blur and motion belong to the preset's pictures, which are as wide as they are high.
@@ -73,7 +74,7 @@ class RasterView:
         picture = Table().draw_picture(rng, self._backgrounds, TRUE_K, SIZE, T_cam_table)
         scene = Scene(
             TRUE_K, picture.seen(TRUE_K, SIZE, T_cam_table), tuple(objects), lights, ambient,
-            plane_of(T_cam_table), self._sensors.draw(rng),
+            plane_of(T_cam_table) if self._shadows else None, self._sensors.draw(rng),
         )  # fmt: skip
         return capture(self._render(scene).image, scene.sensor)
 
@@ -118,7 +119,6 @@ def table_seen(T_base_cam: Transform) -> Transform:
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
     """Return MuJoCo's renderer; a :class:`UserError` where there is no OpenGL."""
     os.environ.setdefault("MUJOCO_GL", "egl")
-    logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
     try:
         return mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # whatever the driver raises

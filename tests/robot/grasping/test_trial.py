@@ -1,0 +1,87 @@
+"""Trials: plans keep clear of what is believed, physics decides, and seeds repeat them."""
+
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dopepp.geometry.camera import make_transform
+from dopepp.robot.grasping.cell import HOME, TRAY
+from dopepp.robot.grasping.grasps import Grasp
+from dopepp.robot.grasping.trial import Source, Task, Trials
+
+
+@pytest.fixture
+def planner(trials, scene):
+    return trials._planner(scene)
+
+
+def test_a_part_at_a_known_pose_is_caught(trials, scene):
+    attempt = trials.attempt(scene, Source("exact"))
+    assert attempt.record.caught
+    assert attempt.record.recognised
+    assert attempt.record.failure == ""
+    assert attempt.record.add_mm == 0
+    # It hangs in the air at the end, and lay on the bench before.
+    states = attempt.outcome.states
+    assert states[-1][-5] > states[0][-5] + 0.1
+
+
+def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
+    aside = [one @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for one in scene.targets]
+    monkeypatch.setattr(trials, "_poses", lambda *_: aside)
+    record = trials.attempt(scene, Source("exact")).record
+    assert not record.caught
+    assert not record.recognised
+    assert record.failure == "wrong pose"
+    assert record.error_mm == pytest.approx(50)
+
+
+def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
+    monkeypatch.setattr(trials, "_poses", lambda *_: [])
+    record = trials.attempt(scene, Source("exact")).record
+    assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
+
+
+def test_one_seed_makes_one_trial(scene):
+    again = Trials(Task(sources=(Source("exact"),)))
+    second = again.scene(0)
+    np.testing.assert_array_equal(second.picture, scene.picture)
+    np.testing.assert_array_equal(second.T_base_cam, scene.T_base_cam)
+    records = [asdict(again.attempt(one, Source("exact"))).get("record") for one in [second] * 2]
+    assert records[0] == records[1]
+
+
+def test_the_planner_comes_from_above_and_lifts(trials, scene, planner):
+    plan = planner.plan(scene.targets, trials.grasps, scene.joints)
+    assert plan is not None
+    flanges = [trials.arm.flange(one) for one in (*plan.descent, plan.lift[-1])]
+    heights = [one[2, 3] for one in flanges]
+    assert heights[0] - heights[-2] == pytest.approx(0.06, abs=0.001)
+    assert heights[-1] - heights[-2] == pytest.approx(0.12, abs=0.001)
+    ends = heights[-2] - trials.gripper.reach(plan.grasp.width)
+    assert 0 < ends < 0.003  # the pads' ends, above the bench
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn"),
+    [((1.2, 0, 0), np.eye(3)), ((0, 0, -0.02), np.eye(3)), ((0, 0, 0), np.diag([1.0, -1, -1]))],
+    ids=["out of reach", "inside the bench", "from below only"],
+)
+def test_there_is_no_plan(trials, scene, planner, shift, turn):
+    pose = make_transform(turn, TRAY + np.array([0, 0, 0.0035]) + np.array(shift))
+    front = [one for one in trials.grasps if one.approach[2] < -0.9]
+    assert planner.plan([pose], front, scene.joints) is None
+
+
+def test_a_plan_keeps_clear_of_another_part(trials, part):
+    knowledge = trials.robot(0)[1].knowledge
+    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=knowledge))
+    crowded = Trials(replace(trials.task, layout="heap"))
+    planner = crowded._planner(scene)
+    lower = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+    over = make_transform(np.eye(3), TRAY + np.array([0, 0.02, 0.012]))
+    across = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
+    assert planner.plan([lower], across, HOME) is not None
+    assert planner.plan([lower, over], across, HOME) is None
