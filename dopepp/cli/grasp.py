@@ -36,7 +36,9 @@ def grasp(
     poses: Annotated[
         str, typer.Option(help="network, exact, random, true-matrices, curve; several by commas")
     ] = "network",
-    refine: Annotated[bool, typer.Option(help="refine the network's poses")] = True,
+    no_refine: Annotated[
+        bool, typer.Option("--no-refine", help="take the network's poses as they are")
+    ] = False,
     grasps: Annotated[Path | None, typer.Option(help="YAML of `dopepp grasp propose`")] = None,
     layout: Annotated[str, typer.Option(help="single, distractors, heap")] = "single",
     renderer: Annotated[
@@ -49,7 +51,9 @@ def grasp(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     workers: Annotated[int | None, typer.Option(min=1, help="processes; default: cores")] = None,
     out: Annotated[Path, typer.Option(help="folder of the results")] = Path("outputs/grasps"),
-    video: Annotated[Path | None, typer.Option(help="of the first grasp, .mp4")] = None,
+    video: Annotated[
+        Path | None, typer.Option(help="of the first grasp: .mp4, or .jpg for six pictures")
+    ] = None,
     rerun: Annotated[Path | None, typer.Option(help="of the first grasp, .rrd")] = None,
 ) -> None:
     """Grip parts that a network sees, 200 times, in MuJoCo; the paper's Table 9 beside it."""
@@ -65,7 +69,7 @@ def grasp(
             network = known[0]
         turned = yaw if yaw is not None else known[1] if known is not None else 180.0
         task = Task(
-            part, unit, grasps, network, refine, layout, renderer, turned, rest, seed,
+            part, unit, grasps, network, not no_refine, layout, renderer, turned, rest, seed,
         )  # fmt: skip
         task = check_task(task, poses, count)
         report = make_experiment(task, count, workers, out, video, rerun, typer.echo)

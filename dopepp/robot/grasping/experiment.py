@@ -84,9 +84,10 @@ def make_experiment(
     video: Path | None, rerun: Path | None, say: Callable[[str], object],
 ) -> str:  # fmt: skip
     """Make trials, write their report and pictures to a folder; return the tables, in Markdown."""
-    for path, suffix in ((folder / "grasps.md", ".md"), (video, ".mp4"), (rerun, ".rrd")):
+    films = ((folder / "grasps.md", (".md",)), (video, (".mp4", ".jpg")), (rerun, (".rrd",)))
+    for path, suffixes in films:
         if path is not None:
-            check_target(path, (suffix,))
+            check_target(path, suffixes)
     if video is not None or task.renderer == "mujoco":
         open_gl(Cell(shown="things").model, SIZE).close()  # refused now, not after all trials
     start, records = time.monotonic(), []

@@ -21,7 +21,7 @@ from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.execution import FRAME_S
 from dopepp.robot.grasping.rehearsal import MOUNT, TRUE_K
 from dopepp.robot.grasping.trial import Attempt, Record, Scene, Task, Trials
-from dopepp.robot.grasping.view import open_gl
+from dopepp.robot.grasping.view import has_gl, open_gl
 
 VIDEO_SIZE: Final = (640, 480)
 
@@ -54,7 +54,9 @@ def show(
     if video is not None or rerun is not None:
         scene = trials.scene(0)
         attempt = trials.attempt(scene, first)
-        if video is not None:
+        if video is not None and video.suffix == ".jpg":
+            write_picture(video, strip(trials, scene, attempt))
+        elif video is not None:
             write_video(video, trials, scene, attempt)
         if rerun is not None:
             write_rerun(rerun, trials, scene, attempt)
@@ -69,8 +71,8 @@ class Stage:
         self._state = self._cell.data()
         self._renderer = open_gl(self._cell.model, VIDEO_SIZE)
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat[:] = TRAY + np.array([0.0, 0.0, 0.12])
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.8, 155.0, -18.0
+        self._camera.lookat[:] = TRAY + np.array([0.0, 0.0, 0.1])
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = 0.66, 155.0, -18.0
 
     def draw(self, positions: Any) -> Picture:
         """Draw a recorded state."""
@@ -92,10 +94,10 @@ def seen(trials: Trials, scene: Scene, attempt: Attempt) -> Picture:
 
 
 def strip(trials: Trials, scene: Scene, attempt: Attempt) -> Picture:
-    """Return six pictures of a trial, the first as the camera saw it."""
+    """Return six pictures of a trial, the first as the camera saw it; without OpenGL that only."""
     states = attempt.outcome.states
     tiles = [Tile(seen(trials, scene, attempt))]
-    if states:
+    if states and has_gl():
         stage = Stage(scene)
         tiles += [Tile(stage.draw(states[round(at * (len(states) - 1))])) for at in STRIP[1:]]
     return contact_sheet(tiles, columns=3, tile_width=320)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import logging
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Final, Protocol
 
 import mujoco
@@ -31,6 +32,8 @@ shadows; the same with the shadows that parts throw on it; and MuJoCo's."""
 LOOK: Final = PRESETS["wide"]
 """Whose light, materials and camera errors the scenes have: the released networks'."""
 
+
+_log = logging.getLogger(__name__)
 
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
 """Joints of an arm that points at the ceiling."""
@@ -116,9 +119,19 @@ def table_seen(T_base_cam: Transform) -> Transform:
     return invert_transform(T_base_cam) @ make_transform(np.eye(3), origin)
 
 
+@cache
+def has_gl() -> bool:
+    """Tell whether MuJoCo can draw; the log says so where it cannot."""
+    try:
+        open_gl(Cell(shown="things").model, (64, 64)).close()
+    except UserError as error:
+        _log.warning("failures are shown by the camera's picture alone: %s", error.got)
+        return False
+    return True
+
+
 def open_gl(model: Any, size: tuple[int, int]) -> Any:
     """Return MuJoCo's renderer; a :class:`UserError` where there is no OpenGL."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         return mujoco.Renderer(model, size[1], size[0])
     except Exception as error:  # whatever the driver raises
