@@ -10,6 +10,12 @@ from typer.testing import CliRunner
 from dopepp.cli import app
 
 
+@pytest.fixture(autouse=True)
+def _quick_calibration(request, monkeypatch):
+    if "slow" not in request.keywords:
+        monkeypatch.setattr("dopepp.robot.grasping.rehearsal.VIEWS", 8)
+
+
 def call(*words):
     done = CliRunner().invoke(app, ["grasp", *map(str, words)])
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
@@ -24,13 +30,13 @@ def grasped(tmp_path, *words):
 
 def test_a_network_and_exact_poses_grip_the_same_parts(tmp_path):
     content, output = grasped(
-        tmp_path, "-n", 6, "--poses", "network,exact,random", "--workers", 1
+        tmp_path, "-n", 3, "--poses", "network,exact,random", "--workers", 1
     )  # fmt: skip
     sources = content["sources"]
-    assert sources["network"]["recognised"] == 6
-    assert sources["network"]["caught"] >= 5
-    assert sources["exact poses"]["caught"] == 6
-    assert sources["random poses"]["caught"] <= 2
+    assert sources["network"]["recognised"] == 3
+    assert sources["network"]["caught"] >= 2
+    assert sources["exact poses"]["caught"] == 3
+    assert sources["random poses"]["caught"] <= 1
     assert "94.0 % (89.8 – 96.5)" in output  # the paper's
 
 

@@ -21,7 +21,7 @@ SPREAD: Final = 0.025
 """Radius of the circle in which a part's middle lies, metres."""
 
 HEAP: Final = (3, 5)
-HEAP_SPREAD: Final = 0.03
+HEAP_SPREAD: Final = 0.05
 HEAP_TILT: Final = 15.0
 """Fewest and most parts of a heap, the radius in which they fall, metres, and how tilted, degrees.
 """

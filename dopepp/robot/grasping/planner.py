@@ -24,8 +24,9 @@ from dopepp.robot.grasping.grasps import Grasp
 
 Path = Float[np.ndarray, "waypoints 6"]
 
-INSERTION: Final = 0.009
-"""How far the pads' ends go beyond a grasp's point, where there is room, metres: half a pad."""
+INSERTIONS: Final = (0.009, 0.003)
+"""How far the pads' ends go beyond a grasp's point, where there is room, metres: half a pad, or no
+deeper than what lies below may allow."""
 
 ABOVE_BENCH: Final = 0.001
 """Metres that the pads' ends keep from the bench."""
@@ -121,8 +122,8 @@ class Planner:
             points = ends @ T[:3, :3].T + T[:3, 3] - self._known.T_base_bench[:3, 3]
             room = (float((points @ up).min()) - ABOVE_BENCH) / steep
             if room >= 0:
-                T[:3, 3] += min(room, INSERTION) * T[:3, 2]
-                yield T
+                for depth in sorted({min(room, one) for one in INSERTIONS}, reverse=True):
+                    yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
 
     def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
         """Return the motion to a pose of the pads' ends, if the arm gets there unhindered."""

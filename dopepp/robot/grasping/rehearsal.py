@@ -60,7 +60,7 @@ ZERO: Final = np.radians(0.02)
 TOUCH: Final = 1e-4
 """Standard deviation of a touch, metres along each axis."""
 
-TOUCHES, VIEWS = 8, 20
+TOUCHES, VIEWS = 8, 15
 BOARD: Final = "charuco:8x6:20:15"
 
 _DOWN: Final = np.diag([1.0, -1.0, -1.0])
