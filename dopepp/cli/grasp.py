@@ -87,6 +87,7 @@ def propose(
 ) -> None:
     """Find places of a part that two fingers can grip; write the file that --grasps reads."""
     with report_errors():
+        _require()
         from dopepp.core.files import check_target
         from dopepp.parts.catalogue import load_part
         from dopepp.robot.grasping.grasps import write_grasps

@@ -27,6 +27,7 @@ from dopepp.robot.grasping.grasps import find_grasps
 from dopepp.robot.grasping.layouts import LAYOUTS
 from dopepp.robot.grasping.rehearsal import SIZE
 from dopepp.robot.grasping.report import markdown, write_report
+from dopepp.robot.grasping.solid import convex_pieces
 from dopepp.robot.grasping.trial import BLOCK, Record, Source, Task, Trials
 from dopepp.robot.grasping.view import RENDERERS, open_gl
 
@@ -60,7 +61,7 @@ def check_task(task: Task, poses: str, count: int) -> Task:
     A :class:`UserError`: an option is none there is, or the part has no network or no grasp.
     """
     for name, value, allowed in (
-        ("--layout", task.layout, tuple(LAYOUTS)),
+        ("--layout", task.layout, LAYOUTS),
         ("--renderer", task.renderer, RENDERERS),
         ("--rest", task.rest, ("front", "any")),
     ):
@@ -75,7 +76,9 @@ def check_task(task: Task, poses: str, count: int) -> Task:
             f"part {task.part} without a network", "a checkpoint of it, or exact or random poses",
             "pass --network CHECKPOINT, or --poses exact",
         )  # fmt: skip
-    find_grasps(load_part(task.part, task.unit), task.grasps)
+    part = load_part(task.part, task.unit)
+    find_grasps(part, task.grasps)
+    convex_pieces(part)  # which takes a minute, once, and not in every process
     return replace(task, sources=sources, network=task.network if needed else None)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.random import Generator
@@ -53,14 +52,15 @@ class Layout:
     """
 
     def __init__(self, part: Part, name: str, yaw_deg: float, rest: str) -> None:
-        self._draw: Callable[[Generator], list[Lying]] = LAYOUTS[name].__get__(self)
+        self._name = name
         self.part, self.body = part, make_body(part, is_target=True)
         self.thing = Thing(convex_pieces(part), part.mesh, COLOUR)
         self._yaw, self._rest = np.radians(yaw_deg), rest
 
     def draw(self, rng: Generator) -> list[Lying]:
         """Draw things, the part or parts first."""
-        return self._draw(rng)
+        lying: list[Lying] = getattr(self, self._name)(rng)
+        return lying
 
     def drop(self, rng: Generator) -> Transform:
         """Draw a pose of a part that lies somewhere in the tray, alone."""
@@ -109,12 +109,8 @@ class Layout:
         return [self._lying(rng, HEAP_SPREAD, 0.002 + 0.02 * k, HEAP_TILT) for k in range(count)]
 
 
-LAYOUTS: Final[dict[str, Any]] = {
-    "single": Layout.single,
-    "distractors": Layout.distractors,
-    "heap": Layout.heap,
-}
-"""To add one, write a method and name it here."""
+LAYOUTS: Final = ("single", "distractors", "heap")
+"""Methods of :class:`Layout`; to add one, write it and name it here."""
 
 
 def _stood(body: Body, place: np.ndarray, rng: Generator) -> Lying:

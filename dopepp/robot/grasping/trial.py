@@ -350,7 +350,12 @@ class Trials:
             if joints is not None:
                 true = self.arm.flange(joints + robot.zero) @ robot.T_flange_cam
                 return joints, true
-        raise AssertionError("the arm reaches the tray")
+        raise UserError(
+            f"--network {self.task.network}, which has learned to look from "
+            f"{self.distance[0]:.2f} to {self.distance[1]:.2f} m",
+            "distances at which this arm can hold its camera over the tray, up to about 0.6 m",
+            "train for nearer ones: working_distance=[0.2,0.4]",
+        )
 
     def _cell(self, lying: Sequence[Lying]) -> Cell:
         """Return a model of what lies there; those of parts alone are kept."""
