@@ -16,11 +16,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.geometry.camera import Transform, make_transform
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.rotation import Vector, rotation_vector_to_matrix
 from dopepp.robot.grasping.arm import PAD_HALF, Arm, Gripper, Joints
 from dopepp.robot.grasping.cell import JOINTS, Cell
 from dopepp.robot.grasping.grasps import Grasp
+from dopepp.virtual.body import Hull
 
 Path = Float[np.ndarray, "waypoints 6"]
 
@@ -30,6 +31,10 @@ deeper than what lies below may allow."""
 
 ABOVE_BENCH: Final = 0.001
 """Metres that the pads' ends keep from the bench."""
+
+FLAT: Final = np.radians(8.0)
+LOW: Final = 0.005
+"""How far a part that lies on the bench may seem tilted, radians, or off it, metres."""
 
 STEEPEST: Final = np.radians(40.0)
 """Largest angle between an approach and straight down."""
@@ -79,6 +84,29 @@ class Plan:
     lift: Path
     opening: float
     grasp: Grasp
+
+
+def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
+    """Lay a part that is seen almost flat on the bench flat on it.
+
+    A picture from above tells a part's tilt and height least, the bench best. What is tilted by
+    more than :data:`FLAT` or higher than :data:`LOW` lies on something else and stays as it is.
+    """
+    up = T_base_bench[:3, 2]
+    normals = hull.rests[0] @ T_base_obj[:3, :3].T
+    down = normals[int(np.argmin(normals @ up))]
+    axis, cosine = np.cross(down, -up), float(-down @ up)
+    sine = float(np.linalg.norm(axis))
+    turn = rotation_vector_to_matrix(axis * (np.arctan2(sine, cosine) / sine if sine else 0.0))
+    centre = transform(T_base_obj, hull.centre)
+    flat = make_transform(
+        turn @ T_base_obj[:3, :3], centre + turn @ (T_base_obj[:3, 3] - centre)
+    )  # fmt: skip
+    lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
+    if np.arctan2(sine, cosine) > FLAT or abs(lowest) > LOW:
+        return T_base_obj
+    flat[:3, 3] -= lowest * up
+    return flat
 
 
 class Planner:

@@ -105,7 +105,7 @@ def markdown(records: Sequence[Record], facts: Mapping[str, Any]) -> str:
     first = next(iter(sources.values()))
     lines = [
         "# Grasps in simulation", "",
-        *(f"- {name}: {value}" for name, value in facts.items()), "",
+        *(f"- {name}: {value}" for name, value in facts.items() if value is not None), "",
         f"## Table 9: {first[0].source}", "", *table_9(first), "",
         "## Poses and failures", "", *sources_table(records), "",
     ]  # fmt: skip

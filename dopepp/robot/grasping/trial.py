@@ -24,7 +24,7 @@ from dopepp.robot.grasping.cell import HOME, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
 from dopepp.robot.grasping.grasps import find_grasps
 from dopepp.robot.grasping.layouts import Layout, Lying
-from dopepp.robot.grasping.planner import Planner
+from dopepp.robot.grasping.planner import Planner, rested
 from dopepp.robot.grasping.rehearsal import (
     MOUNT,
     Calibrated,
@@ -121,6 +121,7 @@ class Record:
 
     Attributes:
         number: The trial's, from 0; trials of one number are of one scene.
+        source: The source's name.
         off: By how much the pose was put off on purpose, millimetres and degrees.
         seen: Whether there was a pose.
         recognised: Whether it was right: ADD below a tenth of the diameter.
@@ -171,7 +172,6 @@ class Scene:
     joints: Joints
     T_base_cam: Transform
     picture: Picture
-    rng: Generator
 
     @property
     def targets(self) -> list[Transform]:
@@ -254,7 +254,7 @@ class Trials:
         bodies = [one.body for one in lying]
         picture = self._view(lying).take(bodies, poses, T_base_cam, rng)
         return Scene(
-            number, cell, lying, state, poses, robot, calibrated, joints, T_base_cam, picture, rng
+            number, cell, lying, state, poses, robot, calibrated, joints, T_base_cam, picture
         )
 
     def attempt(self, scene: Scene, source: Source) -> Attempt:
@@ -262,15 +262,16 @@ class Trials:
         found = self._poses(scene, source)
         if not found:
             return Attempt(self._record(scene, source, None, None))
-        planner = self._planner(scene)
-        plan, believed = None, found[0]
-        for number in range(len(found)):
-            order = [found[number], *found[:number], *found[number + 1 :]][:MOST_BELIEVED]
-            plan = planner.plan(order, self.grasps, scene.joints)
+        bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
+        laid = [rested(one, hull, bench) for one in found][:MOST_BELIEVED]
+        planner, plan, chosen = self._planner(scene), None, 0
+        for number, first in enumerate(laid):
+            others = [*laid[:number], *laid[number + 1 :]]
+            plan = planner.plan([first, *others], self.grasps, scene.joints)
             if plan is not None:
-                believed = found[number]
+                chosen = number
                 break
-        outcome = None
+        believed, outcome = found[chosen], None
         if plan is not None:
             state = copy(scene.start)
             outcome = Execution(scene.cell, state, self.gripper, scene.robot.zero).run(plan)

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, TRAY
 from dopepp.robot.grasping.grasps import Grasp
+from dopepp.robot.grasping.planner import rested
 from dopepp.robot.grasping.trial import Source, Trials
 
 
@@ -73,6 +75,24 @@ def test_there_is_no_plan(trials, scene, planner, shift, turn):
     pose = make_transform(turn, TRAY + np.array([0, 0, 0.0035]) + np.array(shift))
     front = [one for one in trials.grasps if one.approach[2] < -0.9]
     assert planner.plan([pose], front, scene.joints) is None
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "rise", "is_laid"),
+    [(0, 0, True), (3, 0.002, True), (6, -0.003, True), (20, 0, False), (1, 0.02, False)],
+)
+def test_a_part_that_seems_to_lie_on_the_bench_is_laid_on_it(trials, tilt_deg, rise, is_laid):
+    bench = make_transform(np.eye(3), np.array([0.3, 0.1, 0.02]))
+    flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
+    tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
+    seen = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
+    laid = rested(seen, trials.layout.body.hull, bench)
+    if is_laid:
+        np.testing.assert_allclose(laid[:3, 2], [0, 0, 1], atol=1e-9)
+        assert laid[2, 3] == pytest.approx(0.0235, abs=1e-9)
+        assert np.linalg.norm(laid[:2, 3] - flat[:2, 3]) < 0.001
+    else:
+        np.testing.assert_array_equal(laid, seen)
 
 
 def test_a_plan_keeps_clear_of_another_part(trials, part):
