@@ -32,7 +32,7 @@ deeper than what lies below may allow."""
 ABOVE_BENCH: Final = 0.001
 """Metres that the pads' ends keep from the bench."""
 
-FLAT: Final = np.radians(8.0)
+FLAT: Final = np.radians(30.0)
 LOW: Final = 0.005
 """How far a part that lies on the bench may seem tilted, radians, or off it, metres."""
 
@@ -87,10 +87,11 @@ class Plan:
 
 
 def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
-    """Lay a part that is seen almost flat on the bench flat on it.
+    """Lay a part that seems to lie on the bench flat on it.
 
     A picture from above tells a part's tilt and height least, the bench best. What is tilted by
-    more than :data:`FLAT` or higher than :data:`LOW` lies on something else and stays as it is.
+    more than :data:`FLAT`, or higher than :data:`LOW`, stays as it is: leaning on something, a
+    part's middle is higher than that.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T

@@ -79,7 +79,14 @@ def test_there_is_no_plan(trials, scene, planner, shift, turn):
 
 @pytest.mark.parametrize(
     ("tilt_deg", "rise", "is_laid"),
-    [(0, 0, True), (3, 0.002, True), (6, -0.003, True), (20, 0, False), (1, 0.02, False)],
+    [
+        (0, 0, True),
+        (3, 0.002, True),
+        (6, -0.003, True),
+        (20, 0, True),
+        (45, 0, False),
+        (1, 0.02, False),
+    ],
 )
 def test_a_part_that_seems_to_lie_on_the_bench_is_laid_on_it(trials, tilt_deg, rise, is_laid):
     bench = make_transform(np.eye(3), np.array([0.3, 0.1, 0.02]))
