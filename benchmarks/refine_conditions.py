@@ -3,7 +3,8 @@
     python benchmarks/refine_conditions.py [--checkpoint pretrained/NAME] [--images 60]
 
 Poses are those that the network finds on rendered pictures that it was not trained on, the same
-scenes in every row; they are measured as it gives them and refined.
+scenes in every row; they are measured as it gives them and refined. Two parts of one kind, of one
+material, stand side by side in pictures twice as wide and high, the network's size of parts.
 """
 
 from __future__ import annotations
@@ -20,14 +21,20 @@ import torch
 import trimesh
 
 from dopepp.core.files import write_png
+from dopepp.data.sample import Instance
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.geometry.camera import project_keypoints, transform
-from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.camera import Transform, crop_camera, transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.mesh import make_outline_mesh
+from dopepp.inference.refinement.silhouette import filled_mask, posed
+from dopepp.metrics.pose import assign
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Scene, render
+from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.scene import Grooves, Material
 from dopepp.virtual.sensor import capture
 
@@ -75,6 +82,49 @@ SCENES: dict[str, Callable[[Scene], Scene]] = {
 """What is wrong with the picture."""
 
 SIZES = ((640, 480), (1920, 1080))
+PAIRS = {"two touching parts of one kind": 0.0, "the same, one under the other by 15 %": 0.15}
+"""Of the second part, the share that the first one hides."""
+
+
+def paired(scene: Scene, hidden: float, rng: np.random.Generator) -> Scene:
+    """Put a second part of the same kind and material beside a scene's part, in the same plane.
+
+    One that is partly hidden lies under the first. Distractors are left out.
+    """
+    one = scene.objects[scene.targets[0]]
+    part, (width, height) = one.part, scene.size
+    assert part is not None
+    assert part.mesh is not None
+    outline = make_outline_mesh(part.mesh.vertices, part.mesh.faces)
+    K, size = crop_camera(scene.K, -width // 2, -height // 2), (2 * width, 2 * height)
+    # In its plane the second one is turned to the other side as far as the first one is.
+    first, turned, (a, b) = one.T_cam_obj, np.eye(4), one.T_cam_obj[:2, 0]
+    turned[:3, :3] = rotation_vector_to_matrix(np.array([0.0, 0.0, 2.0 * math.atan2(b, a)]))
+    way, middle = rng.uniform(0.0, 2.0 * math.pi), part.cuboid[CENTROID]
+    thickness = np.ptp(part.cuboid[:, 2]) if hidden else 0.0
+
+    def poses(apart: float) -> tuple[Transform, Transform]:
+        second = turned.copy()
+        second[:3, 3] = middle - turned[:3, :3] @ middle
+        second[:3, 3] += apart * math.cos(way), apart * math.sin(way), -thickness
+        both = first.copy(), first @ second
+        centre = np.mean([transform(T, middle[None])[0] for T in both], axis=0)
+        for T in both:
+            T[:2, 3] -= centre[:2]
+        return both
+
+    def share(apart: float) -> float:
+        views = [posed(outline, T, K) for T in poses(apart)]
+        over, under = (filled_mask(outline, at, size) for at in views if at is not None)
+        return float((over & under).sum() / under.sum())
+
+    near, far = 0.0, 2.0 * part.diameter
+    for _ in range(12):
+        apart = (near + far) / 2
+        near, far = (apart, far) if share(apart) > hidden else (near, apart)
+    objects = tuple(replace(one, T_cam_obj=T) for T in poses(far))
+    background = ProceduralBackgrounds().draw(rng, *size)
+    return replace(scene, K=K, objects=objects, background=background)
 
 
 def thicker(part: Part) -> Part:
@@ -99,36 +149,44 @@ def measure(
         image = capture(render(scene).image, scene.sensor)
         K = scene.K * np.array([[focal], [focal], [1.0]])
         K[:2, 2] = scene.K[:2, 2]
-        true = scene.objects[scene.targets[0]].T_cam_obj
-        found = network.predict(image, K)[:1]
-        if not found:
-            missed += 1
-            continue
-        (refined,) = estimator.refined(found, image, K)
-        kept += bool(refined.kept)
-        pair = []
-        for one in (*found, refined):
-            T = one.T_cam_obj
-            away = transform(T, part.points) - transform(true, part.points)
-            turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
-            pair.append((turn, 1e3 * float(np.linalg.norm(away, axis=1).mean())))
-        rows.append(pair)
-        frames = [Wireframe(project_keypoints(part.cuboid, true, scene.K), GREEN, "true"),
-                  Wireframe(found[0].keypoints, BLUE, "network"),
-                  Wireframe(refined.keypoints, YELLOW, "refined")]  # fmt: skip
-        tiles.append(Tile(overlay(image, frames), f"{name}: {pair[0][1]:.1f} to {pair[1][1]:.1f}"))
-    both = np.array(rows).reshape(-1, 2, 2)
+        shown = [
+            Instance(part.name, scene.objects[number].T_cam_obj, scene.keypoints(number))
+            for number in scene.targets
+        ]
+        found = network.predict(image, K)
+        numbers = assign(part.cuboid[CENTROID], found, shown)
+        missed += len(shown) - int((numbers >= 0).sum())
+        frames, errors = [Wireframe(one.keypoints, GREEN, "true") for one in shown], []
+        pairs = zip(found, estimator.refined(found, image, K), numbers, strict=True)
+        for first, refined, number in pairs:
+            if number < 0:
+                continue
+            kept += bool(refined.kept)
+            true = shown[number].T_cam_obj
+            errors.append([_errors(one.T_cam_obj, true, part) for one in (first, refined)])
+            frames += [Wireframe(first.keypoints, BLUE, "network"),
+                       Wireframe(refined.keypoints, YELLOW, "refined")]  # fmt: skip
+        rows += errors
+        title = ", ".join(f"{before[1]:.1f} to {after[1]:.1f}" for before, after in errors)
+        tiles.append(Tile(overlay(image, frames), f"{name}: {title}"))
+    both, num_shown = np.array(rows).reshape(-1, 2, 2), missed + len(rows)
     arrows = [f"{np.median(both[:, 0, c]):.1f} → {np.median(both[:, 1, c]):.1f}" for c in (0, 1)]
     shares = [
         " → ".join(
-            f"{np.sum(both[:, k, 1] < 1e3 * share * part.diameter) / len(scenes):.0%}"
-            for k in (0, 1)
+            f"{np.sum(both[:, k, 1] < 1e3 * share * part.diameter) / num_shown:.0%}" for k in (0, 1)
         )
         for share in (0.1, 0.05)
     ]
     worse = float(np.mean(both[:, 1, 1] > both[:, 0, 1] + 1)) if len(both) else 0.0
     cells = [name, f"{missed}", *shares, *arrows, f"{worse:.0%}", f"{kept}"]
     return "| " + " | ".join(cells) + " |", tiles[:3]
+
+
+def _errors(T: Transform, true: Transform, part: Part) -> tuple[float, float]:
+    """Return degrees, and millimetres of ADD."""
+    away = transform(T, part.points) - transform(true, part.points)
+    turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
+    return turn, 1e3 * float(np.linalg.norm(away, axis=1).mean())
 
 
 def main() -> None:
@@ -165,6 +223,9 @@ def main() -> None:
         show(name, usual, part, [change(scene) for scene in plain])
     show("focal length 1 % too long", usual, part, plain, focal=1.01)
     show("CAD 0.3 mm too thick", estimator.refining("region", [thicker(part)]), part, plain)
+    for name, hidden in PAIRS.items():
+        rng = np.random.default_rng(SEED)
+        show(name, usual, part, [paired(scene, hidden, rng) for scene in plain])
     for size in SIZES:
         show(f"{size[0]}×{size[1]} pixels", usual, part, scenes(size))
     if arguments.pictures is not None:

@@ -81,7 +81,10 @@ class Refinement:
             where the given pose was kept.
         reason: Why the given pose was kept; empty where it was refined.
         fit: How well the refined pose fits the depth; None where there was nothing to fit.
-        agreement: Share of the refined outline that the picture agrees with; None without it.
+        agreement: Share of what the picture tells about the refined outline that agrees with it;
+            None without it.
+        support: Share of the refined outline that the picture tells about and that agrees; None
+            without it.
     """
 
     T_cam_obj: camera.Transform
@@ -89,6 +92,7 @@ class Refinement:
     reason: str = ""
     fit: Fit | None = None
     agreement: float | None = None
+    support: float | None = None
 
 
 class DepthRefiner:

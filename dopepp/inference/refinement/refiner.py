@@ -6,6 +6,7 @@ To add one, write a function from parts to a :data:`Refiner` and one line in :da
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from dopepp.core.errors import UserError
@@ -13,6 +14,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.inference.refinement.depth import DepthRefiner, Refinement
 from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.starts import poses_of_four
 from dopepp.inference.refinement.visible import Depth
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
@@ -42,6 +44,7 @@ def _by_region(parts: Sequence[Part]) -> Refiner:
             "a mesh of every part of the checkpoint",
             f"add --part {bare[0]}=FILE and its --unit (parts=… in Python), or train again",
         )
+    cuboids = {part.name: part.cuboid for part in parts}
     refiners = {
         part.name: RegionRefiner(part.mesh.vertices, part.mesh.faces)
         for part in parts
@@ -49,7 +52,10 @@ def _by_region(parts: Sequence[Part]) -> Refiner:
     }
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
-        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance)
+        # One that was refined before comes from a tracker, which knows how far it may have moved.
+        network = one.agreement is None
+        elsewhere = partial(poses_of_four, cuboids[one.object], one.peaks, K) if network else None
+        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, elsewhere)
 
     return refined
 
