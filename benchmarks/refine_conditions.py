@@ -3,7 +3,8 @@
     python benchmarks/refine_conditions.py [--checkpoint pretrained/NAME] [--images 60]
 
 Poses are those that the network finds on rendered pictures that it was not trained on, the same
-scenes in every row; they are measured as it gives them and refined. Two parts of one kind, of one
+scenes in every row, and those that it finds with refinement. Degrees, millimetres and "worse" are
+of parts that both find. Two parts of one kind, of one
 material, stand side by side in pictures twice as wide and high, the network's size of parts.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,7 +145,7 @@ def measure(
     focal: float = 1.0,
 ) -> tuple[str, list[Tile]]:
     """Return one row of the table, and pictures: truth green, network blue, refined yellow."""
-    rows, tiles, kept, missed = [], [], 0, 0
+    rows, tiles, kept = [], [], 0
     for scene in scenes:
         image = capture(render(scene).image, scene.sensor)
         K = scene.K * np.array([[focal], [focal], [1.0]])
@@ -153,32 +154,39 @@ def measure(
             Instance(part.name, scene.objects[number].T_cam_obj, scene.keypoints(number))
             for number in scene.targets
         ]
-        found = network.predict(image, K)
-        numbers = assign(part.cuboid[CENTROID], found, shown)
-        missed += len(shown) - int((numbers >= 0).sum())
-        frames, errors = [Wireframe(one.keypoints, GREEN, "true") for one in shown], []
-        pairs = zip(found, estimator.refined(found, image, K), numbers, strict=True)
-        for first, refined, number in pairs:
-            if number < 0:
-                continue
-            kept += bool(refined.kept)
-            true = shown[number].T_cam_obj
-            errors.append([_errors(one.T_cam_obj, true, part) for one in (first, refined)])
-            frames += [Wireframe(first.keypoints, BLUE, "network"),
-                       Wireframe(refined.keypoints, YELLOW, "refined")]  # fmt: skip
-        rows += errors
-        title = ", ".join(f"{before[1]:.1f} to {after[1]:.1f}" for before, after in errors)
-        tiles.append(Tile(overlay(image, frames), f"{name}: {title}"))
-    both, num_shown = np.array(rows).reshape(-1, 2, 2), missed + len(rows)
-    arrows = [f"{np.median(both[:, 0, c]):.1f} → {np.median(both[:, 1, c]):.1f}" for c in (0, 1)]
-    shares = [
-        " → ".join(
-            f"{np.sum(both[:, k, 1] < 1e3 * share * part.diameter) / num_shown:.0%}" for k in (0, 1)
+        frames = [Wireframe(one.keypoints, GREEN, "true") for one in shown]
+        errors = np.full((2, len(shown), 2), np.inf)
+        for method, colour, own in zip((network, estimator), (BLUE, YELLOW), errors, strict=True):
+            found = method.predict(image, K)
+            for one, number in zip(found, assign(part.cuboid[CENTROID], found, shown), strict=True):
+                kept += bool(one.kept)
+                frames.append(
+                    Wireframe(one.keypoints, colour, "network" if colour == BLUE else "refined")
+                )
+                if number >= 0:
+                    own[number] = _errors(one.T_cam_obj, shown[number].T_cam_obj, part)
+        rows.append(errors)
+        title = ", ".join(
+            f"{one[1]:.1f} to {other[1]:.1f}" for one, other in zip(*errors, strict=True)
         )
-        for share in (0.1, 0.05)
+        tiles.append(Tile(overlay(image, frames), f"{name}: {title}"))
+    both = np.concatenate(rows, axis=1)
+    found = np.isfinite(both[..., 1])
+    twice = both[:, found.all(axis=0)]
+
+    def pair(values: Iterable[float], text: str) -> str:
+        return " → ".join(f"{value:{text}}" for value in values)
+
+    worse = float(np.mean(twice[1, :, 1] > twice[0, :, 1] + 1)) if twice.size else 0.0
+    limits = [1e3 * share * part.diameter for share in (0.1, 0.05)]
+    cells = [
+        name,
+        pair((~found).mean(axis=1), ".0%"),
+        *(pair((both[..., 1] < limit).mean(axis=1), ".0%") for limit in limits),
+        *(pair(np.median(twice[..., c], axis=1), ".1f") for c in (0, 1)),
+        f"{worse:.0%}",
+        f"{kept / both.shape[1]:.0%}",
     ]
-    worse = float(np.mean(both[:, 1, 1] > both[:, 0, 1] + 1)) if len(both) else 0.0
-    cells = [name, f"{missed}", *shares, *arrows, f"{worse:.0%}", f"{kept}"]
     return "| " + " | ".join(cells) + " |", tiles[:3]
 
 
@@ -205,7 +213,7 @@ def main() -> None:
     usual = estimator.refining("region", [part])
 
     def scenes(size: tuple[int, int] | None = None) -> list[Scene]:
-        sized = preset if size is None else preset.resized(*size)
+        sized = preset if size is None else preset.reframed(*size)
         factory = Factory([part], sized, SEED)
         return [factory.scene(0, index) for index in range(arguments.images)]
 

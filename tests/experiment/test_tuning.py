@@ -163,14 +163,14 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
 
 
 def test_refined_poses_are_scored_by_their_agreement():
-    sure = replace(found(POSE, 0.3), agreement=0.9)
+    sure = replace(found(POSE, 0.3), agreement=0.9, support=0.6)
     result = score_images(estimator(sure, refiner=True), [PART], Images(POSE))
-    expected = [1.0, np.log(0.3 / 0.7), 0.9]
+    expected = [1.0, np.log(0.3 / 0.7), 0.9, 0.6]
     np.testing.assert_allclose(result.features, [expected, expected])
     kept = score_images(estimator(found(POSE, 0.3), refiner=True), [PART], Images(POSE))
-    assert kept.features[0, 2] == 0.0
+    assert kept.features[0, 2:].tolist() == [0.0, 0.0]
     nothing = score_images(estimator(refiner=True), [PART], Images(POSE))
-    assert nothing.features.shape == (0, 3)
+    assert nothing.features.shape == (0, 4)
 
 
 def test_a_symmetric_part_is_right_at_any_of_its_poses():

@@ -5,8 +5,9 @@ the normals of the outline they and the picture's edges tell where the part ends
 (:mod:`~dopepp.inference.refinement.lines`), and a few Gauss–Newton steps follow, from coarse to
 fine, with the given pose and its covariance as prior. Where the picture does not agree with what
 that leads to, the descent starts from elsewhere too (:mod:`~dopepp.inference.refinement.starts`),
-with a prior that lets go, and the end that the picture agrees with best is taken. Where the picture
-does not decide, the given pose is kept.
+with a prior that lets go, and the end that the picture agrees with best is taken. That is for poses
+whose covariance may be wrong, as a network's of a part that is hidden. Where the picture does not
+decide, the given pose is kept.
 
 Errors of neighbouring points are alike, and an offset may be common to all: a covariance that took
 them for independent would let a blurred edge overrule the network's distance. Edges and creases
@@ -96,7 +97,7 @@ class RegionRefiner:
         K: CameraMatrix,
         T_cam_obj: Transform,
         covariance: Float[np.ndarray, "6 6"] | None = None,
-        starts: Starts | None = list,
+        starts: Starts | None = None,
     ) -> Refinement:
         """Refine one pose.
 
@@ -106,8 +107,9 @@ class RegionRefiner:
             T_cam_obj: The pose to start from, metres.
             covariance: Of the given pose: rotation vector about the object's origin and shift, both
                 in camera axes, radians and metres. Without it, a broad one is taken.
-            starts: Asked for further poses to start from, where the picture does not agree with
-                what is near the given one; some are drawn in any case. None: look near it only.
+            starts: Asked for further poses, where the picture does not agree with what is near the
+                given one: then those, and some that are drawn, are started from too. None: the
+                covariance is believed.
 
         Returns:
             The refined pose with its covariance, or the given one with the reason why it was kept.
@@ -170,7 +172,7 @@ def _search(
     except UndecidedError as undecided:
         doubt = undecided
     if starts is not None and (near is None or near[1].share < SURE):
-        near = _far(rounds, loose, starts(), near) or near
+        near = _far(rounds, prior, loose, starts(), near) or near
     if near is None:
         assert doubt is not None
         raise doubt
@@ -196,6 +198,7 @@ def _near(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, Agreement]:
 
 def _far(
     rounds: Sequence[Round],
+    prior: Prior,
     loose: Prior,
     starts: Sequence[Transform],
     near: tuple[Solution, Agreement] | None,
@@ -208,20 +211,25 @@ def _far(
     with contextlib.suppress(UndecidedError):
         reach = _first_reach(rounds[0], loose)
         if near is None:
-            rounds[-1].learn(loose.T_cam_obj, reach)
-            before = rounds[-1].agreement(loose.T_cam_obj, reach)
+            rounds[-1].learn(prior.T_cam_obj, reach)
+            before = rounds[-1].agreement(prior.T_cam_obj, reach)
         else:
             before = near[1]
         supported = max(SUPPORTED, before.support + MORE)
-        rounds[0].learn(loose.T_cam_obj, reach)
+        rounds[0].learn(prior.T_cam_obj, reach)
         others = [*starts, *drawn_poses(loose, 1 / FAR)]
         others.sort(key=lambda start: -rounds[0].log_likelihood(start, loose))
-        for start in (loose.T_cam_obj, *others[:NUM_STARTS]):
+        for start in (prior.T_cam_obj, *others[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                end = _descended(rounds, start, loose, reach)
+                end, _ = _descended(rounds, start, loose, reach)
+                # A prior that admits where that led, and holds the pose no less than it must.
+                away = prior.offset(end.T_cam_obj)
+                surprise = max(1.0, float(away @ prior.information @ away) / len(away))
+                admitting = Prior(prior.T_cam_obj, prior.information / surprise)
+                found = _refined(rounds[-1:], end.T_cam_obj, admitting, reach)
                 least = SURE if best is None else best[1].share
-                if end[1].share >= least and end[1].support >= supported:
-                    best = end
+                if found[1].share >= least and found[1].support >= supported:
+                    best = found
             if best is not None and best[1].share >= CERTAIN:
                 break
     return best
