@@ -26,7 +26,7 @@ from dopepp.data.formats.ycb_video.frame import read_classes
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Mesh, Part, make_part
@@ -37,6 +37,7 @@ from dopepp.virtual.scene import Plane, Scene, SceneObject
 SIZE = (640, 480)
 PLACES = ("air", "wall", "table")
 LEAST_VISIBLE = 0.3
+NO_PICTURE = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
 Array = np.ndarray
 
 
@@ -137,11 +138,11 @@ def add(part: Part, one: Array, other: Array) -> float:
 
 def virtual(part: Part, place: str, count: int, seed: int) -> str:
     """Return a row for a part at a place."""
-    refiner, rows = DepthRefiner([part]), []
+    refiner, rows = PartRefiner(part, ["depth"]), []
     for depth, K, T, rng in scenes(part, place, count, seed):
         start = started(T, rng, (0.012, 0.016), (3, 5), along=4)
         begin = time.process_time()
-        refined = refiner.refine(part.name, start, depth, K)
+        refined = refiner.refine(NO_PICTURE, K, start, depth=depth)
         took = 1000 * (time.process_time() - begin)
         both = add(part, start, T), add(part, refined.T_cam_obj, T)
         rows.append((*both, took, bool(refined.reason)))
@@ -162,10 +163,8 @@ def real(root: Path, draws: int, seed: int) -> Iterator[str]:
         str(path.relative_to(root / "data"))[: -len("-color.png")]
         for path in (root / "data").rglob("*-color.png")
     )
-    source, refiner = (
-        YcbVideoSource(root, list(parts.values()), frames=frames),
-        DepthRefiner(list(parts.values())),
-    )
+    source = YcbVideoSource(root, list(parts.values()), frames=frames)
+    refiners = {name: PartRefiner(part, ["depth"]) for name, part in parts.items()}
     for number in range(len(source)):
         sample = source.sample(number)
         assert sample.depth is not None
@@ -174,7 +173,9 @@ def real(root: Path, draws: int, seed: int) -> Iterator[str]:
             for draw in range(draws):
                 rng = np.random.default_rng([seed, number, draw])
                 start = started(instance.T_cam_obj, rng, (0.01, 0.01), (5, 5), along=1)
-                refined = refiner.refine(part.name, start, sample.depth, sample.K)
+                refined = refiners[part.name].refine(
+                    sample.image, sample.K, start, depth=sample.depth
+                )
                 poses = start, refined.T_cam_obj
                 close = [add_s(part, pose, instance.T_cam_obj) for pose in poses]
                 errors.append([*(add(part, pose, instance.T_cam_obj) for pose in poses), *close])

@@ -1,10 +1,12 @@
-"""Refinement on the picture: errors before and after on virtual pictures, and time a detection.
+"""Refinement on virtual pictures: errors before and after, and time a detection.
 
     python benchmarks/refine.py [--images 20] [--seed 77] [--presets wide table …] [--parts NAME …]
+                                [--refine region,depth]
 
 Poses start around the truth with a turn of 9° and a shift of 5 mm (medians), which is also their
 covariance; those of a symmetric part are measured against the nearest pose in which it looks the
-same. Times are process time of one thread, at 640×480, after a warm-up.
+same. Depth is a structured-light camera's, as in ``benchmarks/depth.py``. Times are process
+time of one thread, at 640×480, after a warm-up.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ import time
 
 import cv2
 import numpy as np
+from depth import sensed
 
 from dopepp.data.part_symmetries import with_found_symmetries
 from dopepp.geometry.camera import moved, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
-from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Factory
@@ -39,9 +42,7 @@ def errors(T: np.ndarray, true: np.ndarray, part: Part, group: np.ndarray) -> li
     """Return degrees, millimetres of translation and of ADD, to the nearest of equal poses."""
     points, some = part.points, part.points[::50]
     equal = true @ group
-    away = (some @ T[:3, :3].T + T[:3, 3]) - (
-        some @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3]
-    )
+    away = transform(T, some) - (some @ equal[:, :3, :3].swapaxes(1, 2) + equal[:, None, :3, 3])
     true = equal[np.linalg.norm(away, axis=2).mean(axis=1).argmin()]
     turn = math.degrees(float(rotation_angle(T[:3, :3] @ true[:3, :3].T)))
     distances = np.linalg.norm(transform(T, points) - transform(true, points), axis=1)
@@ -49,28 +50,29 @@ def errors(T: np.ndarray, true: np.ndarray, part: Part, group: np.ndarray) -> li
     return [turn, 1e3 * shift, 1e3 * float(distances.mean())]
 
 
-def measure(name: str, preset: str, num_images: int, seed: int, unit: str) -> str:
+def measure(name: str, preset: str, num_images: int, seed: int, unit: str, terms: list[str]) -> str:
     """Return one row of the table."""
     part = with_found_symmetries(load_part(name, unit))
-    assert part.mesh is not None
     group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
-    refiner = RegionRefiner(part.mesh.vertices, part.mesh.faces)
+    refiner = PartRefiner(part, terms)
     factory = Factory([part], PRESETS[preset].resized(*SIZE), seed)
     rng = np.random.default_rng(seed)
     before, after, took, kept = [], [], [], 0
     for index in range(num_images):
         rendered = factory.render(0, index)
+        depth = None
+        if "depth" in terms:
+            depth = sensed(rendered.depth, np.random.default_rng([seed, index]))
         for number in rendered.scene.targets:
             if rendered.visible_fractions[number] < LEAST_VISIBLE:
                 continue
             true = rendered.scene.objects[number].T_cam_obj
             start = moved(true, rng.normal(size=6) * DEVIATIONS)
+            given = rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2), depth
             if not took:  # compiles, or loads what was compiled
-                refiner.refine(rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2))
+                refiner.refine(*given)
             began = time.process_time()
-            refined = refiner.refine(
-                rendered.image, rendered.scene.K, start, np.diag(DEVIATIONS**2)
-            )
+            refined = refiner.refine(*given)
             took.append(1e3 * (time.process_time() - began))
             before.append(errors(start, true, part, group))
             after.append(errors(refined.T_cam_obj, true, part, group))
@@ -101,6 +103,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--presets", nargs="+", default=["quickstart", "wide", "table"])
     parser.add_argument("--parts", nargs="+", default=["pivconnector", "servoholder"])
+    parser.add_argument("--refine", default="region", help="terms: region, depth, region,depth")
     parser.add_argument("--unit", default="mm", help="of mesh files")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -111,7 +114,10 @@ def main() -> None:
     print("|" + " --- |" * 12)
     for name in arguments.parts:
         for preset in arguments.presets:
-            row = measure(name, preset, arguments.images, arguments.seed, arguments.unit)
+            row = measure(
+                name, preset, arguments.images, arguments.seed, arguments.unit,
+                arguments.refine.split(","),
+            )  # fmt: skip
             print(row, flush=True)
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import typer
 
-from dopepp.core.errors import UserError
+from dopepp.core.errors import RunError, UserError
 
 USERS_MISTAKE: Final = 2
 
@@ -24,14 +24,17 @@ def report_errors() -> Iterator[None]:
 
 
 @contextmanager
-def resumable() -> Iterator[None]:
-    """End the command with one line when it is interrupted or cannot go on, too."""
-    from dopepp.core.interrupts import Interruption, StoppedError, interruptible
+def resumable(advice: str | None = None) -> Iterator[None]:
+    """End the command with one line when it is interrupted or cannot go on, too.
+
+    ``advice`` is what an interruption tells in place of how to resume.
+    """
+    from dopepp.core.interrupts import RESUME, Interruption, StoppedError, interruptible
 
     try:
-        with report_errors(), interruptible():
+        with report_errors(), interruptible(advice or RESUME):
             yield
-    except StoppedError as error:
+    except (RunError, StoppedError) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from error
     except Interruption as interruption:

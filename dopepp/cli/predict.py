@@ -1,40 +1,44 @@
-"""``dopepp predict``: the poses on one picture."""
+"""``dopepp predict``: the poses on pictures, in videos, and before a camera."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dopepp.cli.errors import report_errors
+from dopepp.cli.errors import resumable
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
-    from dopepp.drawing.overlay import Wireframe
+    from dopepp.cli.outputs import Output, Outputs
     from dopepp.drawing.pictures import Picture
     from dopepp.geometry.camera import CameraMatrix
-    from dopepp.geometry.camera_file import Camera, Crop
+    from dopepp.geometry.camera_file import Camera
     from dopepp.inference.estimator import PoseEstimator
-    from dopepp.inference.refinement.view import Depth32
+    from dopepp.inference.results import PoseResult
+    from dopepp.inference.sources import Source
+    from dopepp.inference.stream import StreamOptions
     from dopepp.parts.part import Part
     from dopepp.recovery.detection import Detection
 
-FRAMES: Final = (".png", ".jpg", ".jpeg")
-"""Suffixes of a folder's frames."""
-
 
 def predict(
-    checkpoint: Annotated[Path, typer.Argument(help="best.ckpt of a run")],
-    image: Annotated[
-        Path, typer.Argument(help="a picture (PNG, JPEG, TIFF); with --track, a folder of frames")
+    model: Annotated[Path, typer.Argument(help="best.ckpt of a run, or a released network")],
+    source: Annotated[
+        list[str],
+        typer.Argument(
+            help="pictures, folders, 'frames/*.png', videos, ROS bags (.bag, .mcap, a folder), "
+            "a camera's number, an rtsp:// or http:// stream"
+        ),
     ],
     intrinsics: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option("--K", help="fx fy cx cy, pixels; or --camera"),
+        typer.Option("--K", help="fx fy cx cy, pixels; or --camera; a bag may have its own"),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -48,6 +52,9 @@ def predict(
         tuple[int, int, int, int] | None,
         typer.Option(help="x y width height, if the picture was cut out of the calibrated one"),
     ] = None,
+    topic: Annotated[
+        str | None, typer.Option(help="of a ROS bag's pictures, where it has several")
+    ] = None,
     distance: Annotated[
         tuple[float, float] | None,
         typer.Option(help="nearest and farthest part, metres; else those of training, then any"),
@@ -56,23 +63,13 @@ def predict(
         tuple[int, int, int, int] | None,
         typer.Option(help="x y width height: look at this part of the picture only"),
     ] = None,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(help="write the picture with wireframes (.png, .jpg); with --track, a folder"),
-    ] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
-    verify: Annotated[
-        bool, typer.Option("--verify", help="add how well picture and drawn part agree, 0 to 1")
+    conf: Annotated[float, typer.Option(help="least score of a detection, 0 to 1")] = 0.0,
+    stride: Annotated[int, typer.Option(help="every so manieth picture only")] = 1,
+    track: Annotated[
+        bool, typer.Option("--track", help="follow the parts from picture to picture")
     ] = False,
-    parts: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--part", help="mesh in place of the checkpoint's: built-in part, file, or NAME=FILE"
-        ),
-    ] = None,
-    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
     refine: Annotated[
-        str | None, typer.Option(help="region: on the picture; depth: with --depth")
+        str | None, typer.Option(help="region: on the picture; depth: with --depth; region,depth")
     ] = None,
     max_ms: Annotated[
         float | None, typer.Option(help="of refining, then detections keep the network's poses")
@@ -81,97 +78,64 @@ def predict(
         Path | None, typer.Option(help="16-bit PNG aligned to the picture, 0 where unknown")
     ] = None,
     depth_scale: Annotated[float, typer.Option(help="metres per unit of --depth")] = 0.001,
-    track: Annotated[
-        bool, typer.Option("--track", help="follow the parts through a folder of frames")
+    verify: Annotated[
+        bool, typer.Option("--verify", help="print how well picture and drawn part agree, 0 to 1")
     ] = False,
+    parts: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--part", help="mesh in place of the checkpoint's: built-in part, file, or NAME=FILE"
+        ),
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    save: Annotated[
+        Path | None, typer.Option(help="folder for pictures and videos with the poses drawn")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="file with a line of JSON for each picture")
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(help="file of poses in the BOP challenge's format")
+    ] = None,
+    rerun: Annotated[Path | None, typer.Option(help="recording for the Rerun viewer, .rrd")] = None,
+    show: Annotated[bool, typer.Option("--show", help="open the Rerun viewer")] = False,
 ) -> None:
-    """Print the poses on one picture, or a folder's, as JSON, a line per detection.
+    """Print the poses on pictures as JSON, a line per detection, and on stderr how it went.
 
-    Where nothing is found on a picture, it is said why.
+    Where nothing is found on a picture, it is said why. Exit codes: 0 done; 1 stopped (a camera
+    delivers no more, the disk is full); 2 wrong input; 130, 143 interrupted.
     """
-    from dopepp.core.files import write_picture
-    from dopepp.drawing.overlay import overlay as draw
-    from dopepp.recovery.silence import explained
+    with resumable("what was written is complete"):
+        from dopepp.cli.outputs import Outputs
+        from dopepp.geometry.camera import camera_matrix
+        from dopepp.inference.lens import one_camera
+        from dopepp.inference.sources import open_sources
 
-    with report_errors():
-        _check_options(refine, depth, track, verify, distance or roi)
-        _check_overlay(overlay, track)
-        lens = _Lens(_camera(intrinsics, camera), K_size, crop)
-        refine = "region" if track else refine
-        estimator, known = _estimator(checkpoint, device, refine, verify, parts, unit, max_ms)
-        if track:
-            _track(estimator, image, lens, overlay)
-            return
-        picture, K = lens.picture(image)
-        metres = None if depth is None else lens.depth(depth, depth_scale, K)
-        where: dict[str, Any] = {"depth": metres, "roi": roi, "cropped": crop is not None}
-        found = estimator.predict(picture, K, distances=distance, **where)
-        if not found and distance is None:
-            found = estimator.predict(picture, K, distances="any", **where)
-            if found:
-                typer.echo(
-                    "nothing where training had the parts; found at another distance", err=True
-                )
-        agreements = _agreements(picture, K, found, known) if verify else []
-        why = "" if found else explained(estimator.explain(picture, K, distances=distance, **where))
-    if not found:
-        typer.echo(f"nothing found: {why}", err=True)
-    for number, one in enumerate(found):
-        record = _record(one)
-        if refine is not None:
-            record["kept"] = one.kept or None
-        if verify:
-            record["agreement"] = agreements[number]
-        typer.echo(json.dumps(record))
-    if overlay is not None:
-        write_picture(overlay, draw(picture, _wireframes(found)))
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """What the options say of the camera, and how the pictures came about."""
-
-    camera: Camera
-    K_size: tuple[int, int] | None
-    crop: Crop | None
-
-    def picture(self, path: Path) -> tuple[Picture, CameraMatrix]:
-        """Return a picture without distortion and its K."""
-        from dopepp.drawing.pictures import read_photo
-
-        picture = read_photo(path)
-        size = (picture.shape[1], picture.shape[0])
-        camera = self.camera.for_picture(size, self.K_size, self.crop)
-        return camera.undistorted(picture), camera.K
-
-    def depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
-        """Return a depth image without distortion, metres."""
-        from dopepp.inference.refinement.view import read_depth, undistorted_depth
-
-        metres, lens = read_depth(path, scale), self.camera.coefficients
-        return metres if lens is None else undistorted_depth(metres, K, lens)
-
-
-def _camera(intrinsics: tuple[float, float, float, float] | None, path: Path | None) -> Camera:
-    """Return the camera of the one of two options that is given."""
-    from dopepp.geometry.camera import camera_matrix
-    from dopepp.geometry.camera_file import Camera, read_camera
-
-    if (intrinsics is None) == (path is None):
-        got = "--K and --camera" if path else "neither --K nor --camera"
-        fix = "pass --K fx fy cx cy (pixels of this picture) or --camera FILE"
-        raise UserError(got, "one of the two", fix)
-    if path is not None:
-        return read_camera(path)
-    assert intrinsics is not None
-    return Camera(None, camera_matrix(*intrinsics), (), "--K")
+        terms = () if refine is None else tuple(refine.split(","))
+        _check_options(terms, depth, track, verify, distance or roi)
+        terms = ("region",) if track else terms
+        outputs = _outputs(save, json_file, csv, stride)
+        sources = open_sources(source, topic)
+        K = None if intrinsics is None else camera_matrix(*intrinsics)
+        cameras = [one_camera(K, camera, one) for one in sources]
+        estimator, known = _estimator(model, device, terms, verify, parts, unit, max_ms)
+        outputs += _viewers(estimator, rerun, show)
+        options: StreamOptions = {
+            "stride": stride, "track": track, "least_score": conf, "distances": distance,
+            "roi": roi, "K_size": K_size, "crop": crop, "depth": depth, "depth_scale": depth_scale,
+        }  # fmt: skip
+        session = _Session(estimator, options, known if verify else None)
+        with Outputs(outputs) as written:
+            for one, its_camera in zip(sources, cameras, strict=True):
+                session.run(one, its_camera, written)
 
 
 def _check_options(
-    refine: str | None, depth: Path | None, track: bool, verify: bool, where: object
+    refine: Sequence[str], depth: Path | None, track: bool, verify: bool, where: object
 ) -> None:
     """Refuse options that do not go together."""
-    if (refine == "depth") != (depth is not None):
+    if ("depth" in refine) != (depth is not None):
         raise UserError(
             "--depth without --refine depth" if depth else "--refine depth without --depth",
             "both or none of them",
@@ -182,20 +146,10 @@ def _check_options(
         raise UserError(got, "--track alone", "leave it out")
 
 
-def _check_overlay(overlay: Path | None, track: bool) -> None:
-    """Refuse a place where no picture can be written, before the work is done for it."""
-    from dopepp.core.files import PICTURES, check_target
-
-    if overlay is not None and track:
-        check_target(overlay / "frame.png")
-    elif overlay is not None:
-        check_target(overlay, PICTURES)
-
-
 def _estimator(
-    checkpoint: Path,
+    model: Path,
     device: str,
-    refine: str | None,
+    refine: Sequence[str],
     verify: bool,
     parts: Sequence[str] | None,
     unit: str | None,
@@ -205,11 +159,11 @@ def _estimator(
     from dopepp.inference.estimator import PoseEstimator
     from dopepp.parts.catalogue import with_meshes
 
-    estimator = PoseEstimator.load(checkpoint, device, max_ms=max_ms)
+    estimator = PoseEstimator.load(model, device, max_ms=max_ms)
     known = estimator.parts
-    if verify or refine == "region":
+    if verify or "region" in refine:
         known = with_meshes(known, parts or (), unit)
-    return (estimator if refine is None else estimator.refining(refine, known)), known
+    return (estimator.refining(refine, known) if refine else estimator), known
 
 
 def _agreements(
@@ -223,41 +177,94 @@ def _agreements(
     return [agreement(picture, K, one.T_cam_obj, meshes[one.object]) for one in found]
 
 
-def _track(estimator: PoseEstimator, folder: Path, lens: _Lens, overlay: Path | None) -> None:
-    """Print the parts on every frame of a folder, in the order of the frames' names."""
-    from dopepp.core.files import write_png
-    from dopepp.drawing.overlay import overlay as draw
-    from dopepp.inference.tracker import PoseTracker
+def _outputs(
+    save: Path | None, json_file: Path | None, csv: Path | None, stride: int
+) -> list[tuple[Path, Output]]:
+    """Return what is to be written; where it cannot be, that is told before the work is done."""
+    from dopepp.cli.outputs import BopCsv, JsonLines, Overlays
 
-    frames = [path for path in sorted(folder.glob("*")) if path.suffix.lower() in FRAMES]
-    if not frames:
-        allowed = f"a folder with frames ({', '.join(FRAMES)})"
-        raise UserError(f"--track of {folder}", allowed, "pass the folder of a sequence")
-    tracker = PoseTracker(estimator)
-    for frame in frames:
-        picture, K = lens.picture(frame)
-        tracks = tracker.track(picture, K, cropped=lens.crop is not None)
-        for one in tracks:
-            record = {"frame": frame.name, "identity": one.identity, **_record(one.detection)}
-            typer.echo(json.dumps(record))
-        if overlay is not None:
-            labels = [f"{one.detection.object} {one.identity}" for one in tracks]
-            wireframes = _wireframes([one.detection for one in tracks], labels)
-            write_png(overlay / f"{frame.stem}.png", draw(picture, wireframes))
+    outputs: list[tuple[Path, Output]] = []
+    if save is not None:
+        outputs.append((save, Overlays(save, stride)))
+    if json_file is not None:
+        outputs.append((json_file, JsonLines(json_file)))
+    if csv is not None:
+        outputs.append((csv, BopCsv(csv)))
+    return outputs
 
 
-def _record(one: Detection) -> dict[str, object]:
-    return {
-        "object": one.object,
-        "score": one.score,
-        "T_cam_obj": one.T_cam_obj.tolist(),
-        "keypoints": one.keypoints.tolist(),
-        "reprojection_error_px": one.reprojection_error_px,
-    }
+def _viewers(estimator: PoseEstimator, rerun: Path | None, show: bool) -> list[tuple[Path, Output]]:
+    """Return the recording and the window that were asked for."""
+    if rerun is None and not show:
+        return []
+    from dopepp.inference.viewer import Viewer
+
+    paths = [rerun] * (rerun is not None) + [None] * show
+    return [(path or Path("the viewer"), Viewer(estimator, path)) for path in paths]
 
 
-def _wireframes(found: Sequence[Detection], labels: Sequence[str] = ()) -> list[Wireframe]:
-    from dopepp.drawing.overlay import YELLOW, Wireframe
+class _Session:
+    """Looks at one source after the other, and tells what it finds.
 
-    names = labels or [one.object for one in found]
-    return [Wireframe(one.keypoints, YELLOW, name) for one, name in zip(found, names, strict=True)]
+    ``verified`` are the parts to draw and compare with the picture, None where that is not asked.
+    """
+
+    def __init__(
+        self, estimator: PoseEstimator, options: StreamOptions, verified: Sequence[Part] | None
+    ) -> None:
+        self._estimator, self._options, self._verified = estimator, options, verified
+
+    def run(self, source: Source, camera: Camera, outputs: Outputs) -> None:
+        """Print and write the poses on every picture of a source."""
+        total = source.count and math.ceil(source.count / self._options["stride"])
+        outputs.begin(source)
+        results = self._estimator.stream(source, camera=camera, **self._options)
+        for done, result in enumerate(results, 1):
+            why = ""
+            if not result.detections and source.rate is None and not self._options["track"]:
+                result, why = self._searched(result, camera)
+            self._print(result)
+            place = "" if total == 1 else f"{done}/{total or '…'} {Path(result.name).name}: "
+            typer.echo(place + _in_words(result, why), err=True)
+            outputs.take(result)
+
+    def _searched(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
+        """Look at any distance where nothing was found, or say why nothing is."""
+        from dopepp.inference.lens import Lens
+        from dopepp.recovery.silence import explained
+
+        own, image, K = self._options, result.image, result.K
+        depth = own["depth"]
+        metres = None if depth is None else Lens(camera).depth(depth, own["depth_scale"], K)
+        where = (own["roi"], own["crop"] is not None)
+        if own["distances"] is None:
+            found = self._estimator.predict(image, K, None, metres, "any", *where)
+            found = [one for one in found if one.score >= own["least_score"]]
+            if found:
+                said = "nothing where training had the parts; found at another distance"
+                typer.echo(said, err=True)
+                return replace(result, detections=found), ""
+        why = self._estimator.explain(image, K, metres, own["distances"], *where)
+        least = f"no score of {own['least_score']:g}; " if own["least_score"] else ""
+        return result, least + explained(why)
+
+    def _print(self, result: PoseResult) -> None:
+        """Print a line of JSON for each detection."""
+        records = result.records()
+        if self._verified is not None:
+            agreements = _agreements(result.image, result.K, result.detections, self._verified)
+            records = [
+                {**one, "agreement": agreement}
+                for one, agreement in zip(records, agreements, strict=True)
+            ]
+        for one in records:
+            typer.echo(json.dumps(one, ensure_ascii=False))
+
+
+def _in_words(result: PoseResult, why: str) -> str:
+    """Say how many poses there are, or why there is none, and where the time went."""
+    from dopepp.inference.results import speed_in_words
+
+    count = len(result.detections)
+    found = f"{count} pose{'s' * (count > 1)}" if count else "nothing found"
+    return f"{found}{': ' * bool(why)}{why}; speed: {speed_in_words(result.speed)}"

@@ -13,14 +13,14 @@ from typing import Final, NoReturn
 NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
 """The disk is full, or the user's share of it."""
 
-_RESUME: Final = "the same command goes on where this one stopped"
+RESUME: Final = "the same command goes on where this one stopped"
 
 
 class StoppedError(RuntimeError):
     """A job that ended early through nobody's mistake, said in one line."""
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"{reason}; {_RESUME}")
+        super().__init__(f"{reason}; {RESUME}")
 
 
 def stopped(error: OSError, root: Path) -> StoppedError:
@@ -33,13 +33,13 @@ def stopped(error: OSError, root: Path) -> StoppedError:
 class Interruption(KeyboardInterrupt):
     """Ctrl-C, or a scheduler's SIGTERM."""
 
-    def __init__(self, number: int, advice: str = _RESUME) -> None:
+    def __init__(self, number: int, advice: str = RESUME) -> None:
         super().__init__(f"interrupted; {advice}")
         self.number, self.exit_code = int(number), 128 + number
 
 
 @contextmanager
-def interruptible(advice: str = _RESUME) -> Iterator[None]:
+def interruptible(advice: str = RESUME) -> Iterator[None]:
     """Raise :class:`Interruption` on SIGINT and SIGTERM while the block runs (main thread only).
 
     ``advice`` is what the interruption tells to do next.

@@ -15,8 +15,6 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import resize_points
@@ -171,9 +169,34 @@ def draw_text(
     place[:] = np.rint(0.5 * place * (1 - coverage) + np.array(colour) * coverage)
 
 
+def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Colour]]) -> None:
+    """Write a line above each of several places IN PLACE, none over another.
+
+    A tag is its text, the (column, row) of what it names, pixels, and its colour; where that lies
+    outside the image, the text stands at the border.
+    """
+    size = max(12, round(max(image.shape[:2]) / 50))
+    taken: list[tuple[int, int, int]] = []
+    for text, (column, row), colour in tags:
+        width = text_coverage(text, size).shape[1]
+        left = int(min(max(column, 0), max(image.shape[1] - width, 0)))
+        top = int(min(max(row - 1.3 * size, 0), max(image.shape[0] - size, 0)))
+        while any(
+            left < right and start < left + width and abs(top - above) < size
+            for start, right, above in taken
+        ):
+            top += size
+        taken.append((left, left + width, top))
+        draw_text(image, text, (left, top), size, colour)
+
+
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
     """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
+    # Its import takes a second, and only text needs it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     # Wide enough for any glyph (an em each), cut to the measured width afterwards.
     width = size_px * (len(text) + 1)
     figure = Figure(figsize=(width / 100, size_px / 100), dpi=100)

@@ -34,6 +34,7 @@ from dopepp.experiment.runs.images import warn_of_other_images
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.refiner import Refine
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.silence import summary
 
@@ -50,7 +51,7 @@ def measure_and_record(
     bop_csv: bool = False,
     all_measures: bool = False,
     protocols: Protocols | None = None,
-    refine: str | None = None,
+    refine: Refine | None = None,
 ) -> list[Report]:
     """Measure methods on a test set; show and write tables, curves and pictures.
 
@@ -177,18 +178,19 @@ def _write_results(
 
 
 def with_refined(
-    estimators: Mapping[str, PoseEstimator], refine: str | None, parts: Parts
+    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
 ) -> dict[str, PoseEstimator]:
     """Return every estimator, and behind it the same one refining: two rows in every table."""
     pairs: dict[str, PoseEstimator] = {}
     for name, one in estimators.items():
         pairs[name] = one
         if refine is not None:
-            pairs[f"{name} + {refine}"] = refining(one, refine, parts)
+            terms = " + ".join([refine] if isinstance(refine, str) else refine)
+            pairs[f"{name} + {terms}"] = refining(one, refine, parts)
     return pairs
 
 
-def refining(estimator: PoseEstimator, refine: str | None, parts: Parts) -> PoseEstimator:
+def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
     """Return an estimator that refines, or for None the same one.
 
     A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.

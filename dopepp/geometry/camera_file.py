@@ -10,6 +10,7 @@ To read a further format, see the modules of :mod:`dopepp.geometry.camera_files`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -28,9 +29,9 @@ from dopepp.geometry.camera import (
     pinhole_matrix,
     resize_camera,
 )
-from dopepp.geometry.camera_files.fields import read_fields
+from dopepp.geometry.camera_files.fields import find_camera, read_fields
 from dopepp.geometry.camera_files.numbers import read_lines
-from dopepp.geometry.camera_files.values import FORMATS, Size
+from dopepp.geometry.camera_files.values import FORMATS, Calibration, Size
 
 Crop = tuple[int, int, int, int]
 """x and y of the upper left pixel, width and height, pixels."""
@@ -129,23 +130,32 @@ def read_camera(path: Path | str) -> Camera:
     """
     path = Path(path)
     text = _text(path)
-    found = read_lines(text, path) or read_fields(text, path)
-    K = pinhole_matrix(found.K, str(path))
+    return _camera(read_lines(text, path) or read_fields(text, path), str(path))
+
+
+def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
+    """Return the camera of named fields, as of a ROS message; a UserError as from a file."""
+    return _camera(find_camera(fields, source), source)
+
+
+def _camera(found: Calibration, source: str) -> Camera:
+    """Check what was found of a camera."""
+    K = pinhole_matrix(found.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
         raise UserError(
-            f"{path}: fx={K[0, 0]:g}, fy={K[1, 1]:g}",
+            f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}",
             "focal lengths above 0 pixels",
-            "calibrate the camera: this file is of one that was not",
+            "calibrate the camera: this one was not",
         )
     if len(found.distortion) not in COEFFICIENTS:
         counts = ", ".join(map(str, COEFFICIENTS))
         raise UserError(
-            f"{path}: {len(found.distortion)} distortion coefficients",
+            f"{source}: {len(found.distortion)} distortion coefficients",
             f"{counts} in OpenCV's order (k1, k2, p1, p2, k3, …)",
             "add zeros for those that the calibration left out",
         )
     lens = found.distortion if any(found.distortion) else ()
-    return Camera(found.size, K, lens, str(path))
+    return Camera(found.size, K, lens, source)
 
 
 def _text(path: Path) -> str:

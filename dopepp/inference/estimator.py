@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, Unpack
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import make_refiner
+from dopepp.inference.refinement.refiner import Refine, Refiner, make_refiner
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.scales import Distances, letterboxes, merged
@@ -37,6 +38,16 @@ from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import RecoveryOptions, explain, recover
 from dopepp.recovery.silence import Reason, rejected_refined
+
+if TYPE_CHECKING:
+    from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.results import PoseResult
+    from dopepp.inference.sources import SourceLike
+    from dopepp.inference.stream import StreamOptions
+
+STEPS: Final = ("pre", "network", "decode", "refine")
+"""What a picture's time is spent on: undistorting and resizing, the network, from its maps to
+poses, and making these precise."""
 
 Decoded = TypeVar("Decoded")
 
@@ -55,15 +66,16 @@ class PoseEstimator:
         network: The trained network.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
-        refine: ``region`` refines poses on the picture (:mod:`dopepp.inference.refinement.region`),
-            ``depth`` with the depth that :meth:`predict` is given; None does not.
+        refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
+            picture; ``depth``, the depth that :meth:`predict` is given; or both, ``("region",
+            "depth")``. None does not.
         parts: The checkpoint's parts with their meshes, where it has none itself (an earlier
             version's).
         max_ms: Milliseconds of refining a picture after which its further detections, the best
             score first, keep the network's poses; None sets no limit.
 
     Raises:
-        UserError: The refinement is unknown, its extra is missing, or a part has no mesh.
+        UserError: The refinement is unknown, or a part has no mesh.
     """
 
     def __init__(
@@ -71,7 +83,7 @@ class PoseEstimator:
         network: PoseNetwork,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> None:
@@ -79,6 +91,10 @@ class PoseEstimator:
         self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
+        self.solid_parts = tuple(parts or checkpoint.parts)
+        """Its parts, with the meshes that it was given."""
+        self.spent_ms = dict.fromkeys(STEPS, 0.0)
+        """Milliseconds since it was made, by step of :data:`STEPS`."""
         self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
@@ -89,7 +105,7 @@ class PoseEstimator:
         cls,
         path: str | Path,
         device: str | torch.device = "cpu",
-        refine: str | None = None,
+        refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
@@ -100,7 +116,7 @@ class PoseEstimator:
         """
         return cls(*load_network(Path(path)), device, refine, parts, max_ms)
 
-    def refining(self, refine: str, parts: Sequence[Part] | None = None) -> PoseEstimator:
+    def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
         return type(self)(self.network, self.checkpoint, self.device, refine, parts, self.max_ms)
 
@@ -174,13 +190,24 @@ class PoseEstimator:
         """
         if self.refiner is None:
             return list(detections)
+        with self._timed("refine"):
+            return self._refined(self.refiner, detections, image, K, depth)
+
+    def _refined(
+        self,
+        refiner: Refiner,
+        detections: Sequence[Detection],
+        image: Picture,
+        K: CameraMatrix,
+        depth: Depth | None,
+    ) -> list[Detection]:
         refined: list[Detection] = []
         start = time.perf_counter()
         for one in detections:
             if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
                 refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
                 continue
-            result = self.refiner(one, image, K, depth)
+            result = refiner(one, image, K, depth)
             if result.covariance is None:
                 refined.append(replace(one, kept=result.reason, agreement=None, support=None))
                 continue
@@ -193,6 +220,22 @@ class PoseEstimator:
                 )
             )  # fmt: skip
         return refined
+
+    def stream(
+        self,
+        source: SourceLike,
+        K: CameraMatrix | None = None,
+        camera: Camera | Path | str | None = None,
+        **options: Unpack[StreamOptions],
+    ) -> Iterator[PoseResult]:
+        """Find the parts on every picture of a source; see :func:`dopepp.inference.stream.stream`.
+
+        The source is a path (a picture, a folder, a video, a ROS bag), a glob pattern, a camera's
+        number or a stream's URL. K, the camera or its file may be left out where a bag has it.
+        """
+        from dopepp.inference.stream import stream  # which follows parts with an estimator
+
+        return stream(self, source, K, camera, **options)
 
     def explain(
         self,
@@ -246,11 +289,24 @@ class PoseEstimator:
         letterbox: Letterbox,
     ) -> list[Decoded]:
         """Give an image's maps to :func:`recover` or :func:`explain`."""
-        belief, field = self.maps(letterboxed(image, letterbox, self.network.size_multiple))
+        with self._timed("pre"):
+            image = letterboxed(image, letterbox, self.network.size_multiple)
+        with self._timed("network"):
+            belief, field = self.maps(image)
         names = [part.name for part in self.parts]
         K, stride = letterbox.camera(K), self.network.stride
         options = self.recovery if self.refiner is None else self.recovery.of_candidates()
-        return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
+        with self._timed("decode"):
+            return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        """Count what a step takes, with what it has left to a GPU to do."""
+        start = time.perf_counter()
+        yield
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        self.spent_ms[step] += 1000 * (time.perf_counter() - start)
 
     def maps(self, image: Picture) -> Maps:
         """Run the network on one image whose sides are multiples of its size multiple."""

@@ -59,8 +59,8 @@ def picture(tmp_path):
 
 
 def test_predict_prints_json_lines_and_draws(checkpoint, picture, tmp_path):
-    drawn = tmp_path / "drawn.png"
-    done = call("predict", checkpoint, picture, *K, "--overlay", drawn)
+    drawn = tmp_path / "drawn" / "picture.png"
+    done = call("predict", checkpoint, picture, *K, "--save", drawn.parent)
     assert done.exit_code == 0, done.output
     for line in done.stdout.splitlines():
         record = json.loads(line)
@@ -78,10 +78,10 @@ def test_predict_says_in_one_line_why_there_is_nothing(write_checkpoint, picture
 
 
 def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
-    pytest.importorskip("small_gicp")
     depth = tmp_path / "depth.png"
     cv2.imwrite(str(depth), np.full((64, 64), 500, np.uint16))
-    for options in (("depth", "--depth", depth), ("region",)):
+    measured = ("--depth", depth)
+    for options in (("depth", *measured), ("region",), ("region,depth", *measured)):
         done = call("predict", checkpoint, picture, *K, "--verify", "--refine", *options)
         assert done.exit_code == 0, done.output
         for line in done.stdout.splitlines():
@@ -94,7 +94,8 @@ def test_predict_verifies_and_refines(checkpoint, picture, tmp_path):
     [
         (["--refine", "depth"], "--refine depth without --depth"),
         (["--depth", "d.png"], "--depth without --refine depth"),
-        (["--refine", "icp"], "refine='icp'"),
+        (["--refine", "icp"], "refine=('icp',)"),
+        (["--refine", "region,"], "refine=('region', '')"),
         (["--track", "--verify"], "--track with --verify"),
         (["--verify", "--part", "x=servoholder"], "no part of the checkpoint"),
         (["--refine", "depth", "--depth", "missing.png"], "missing.png"),
@@ -117,16 +118,16 @@ def test_predict_follows_parts_through_a_folder(tmp_path):
         cv2.imwrite(str(frames / f"{number:03d}.png"), rendered.image[..., ::-1])
     (frames / "notes.txt").write_text("no frame")
     camera = rendered.scene.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    done = call("predict", released, frames, "--K", *camera, "--track", "--overlay", drawn)
+    done = call("predict", released, frames, "--K", *camera, "--track", "--save", drawn)
     assert done.exit_code == 0, done.output
     records = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [one["frame"] for one in records] == ["000.png", "001.png", "002.png"]
+    assert [Path(one["image"]).name for one in records] == ["000.png", "001.png", "002.png"]
     assert {one["identity"] for one in records} == {0}
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
     for one in records:
         assert np.linalg.norm(np.array(one["T_cam_obj"])[:3, 3] - true[:3, 3]) < 0.003
     assert len(list(drawn.iterdir())) == 3
-    assert "with frames" in refused("predict", released, drawn.parent, "--K", *camera, "--track")
+    assert "without a picture" in refused("predict", released, drawn.parent, "--K", *camera)
 
 
 def test_compare_tells_an_unfinished_run(tmp_path):

@@ -116,13 +116,12 @@ def test_resized_and_cut_pictures_give_the_whole_ones_pose(folder, four, rendere
 def test_the_lens_counts(folder, rendered, tmp_path):
     true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[:3, 3]
     picture, refine = folder / "lens.png", ("--refine", "region")
-    lens = ("--camera", folder / "lens.yaml", *refine, "--overlay", tmp_path / "drawn.jpg")
+    lens = ("--camera", folder / "lens.yaml", *refine, "--save", tmp_path)
     (found,) = poses(picture, *lens)
     assert np.linalg.norm(found[:3, 3] - true) < 0.0005
     without = poses(picture, "--camera", folder / "K.txt", *refine)
     assert all(np.linalg.norm(one[:3, 3] - true) > 0.001 for one in without)
-    drawn = tmp_path / "drawn.jpg"
-    assert drawn.read_bytes().startswith(b"\xff\xd8")
+    drawn = tmp_path / "lens.png"
     # Drawn on the picture as a pinhole sees it, which is the rendered one.
     shown = cv2.imread(str(drawn))[200:450, 20:300, ::-1].astype(float)
     assert np.abs(shown - rendered.image[200:450, 20:300]).mean() < 12
@@ -162,23 +161,23 @@ def test_a_device_that_is_not_there(folder, four):
 
 
 @pytest.mark.parametrize(
-    ("name", "more", "message"),
+    ("option", "name", "message"),
     [
-        ("o.gif", (), ".png, .jpg, .jpeg"),
-        ("", (), "which is a folder"),
-        ("/proc/none/o.png", (), "No such file"),
-        ("file", ("--track",), "file"),
+        ("--save", "file", "file"),
+        ("--save", "/proc/none", "No such file"),
+        ("--json", "", "Is a directory"),
+        ("--csv", "poses.txt", ".csv"),
     ],
 )
-def test_a_place_for_the_overlay_is_checked_before_the_work(
-    folder, four, name, more, message, tmp_path, monkeypatch
+def test_a_place_for_what_is_written_is_checked_before_the_work(
+    folder, four, option, name, message, tmp_path, monkeypatch
 ):
     def load(*_: object, **__: object) -> None:
         raise AssertionError("the work has begun")
 
     monkeypatch.setattr("dopepp.inference.estimator.PoseEstimator.load", load)
     (tmp_path / "file").touch()
-    done = predict(folder / "whole.png", *four, "--overlay", tmp_path / name, *more)
+    done = predict(folder / "whole.png", *four, option, tmp_path / name)
     assert message in line(done, 2)
 
 

@@ -202,7 +202,7 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
     with pytest.raises(UserError, match=message) as caught:
         estimator.predict(**{"image": image(640, 480), "K": K_VGA, **bad})
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, or none"):
+    with pytest.raises(UserError, match=r"refine='icp'.*region, depth, several of them, or none"):
         PoseEstimator.load(checkpoint_path, refine="icp")
 
 
@@ -267,7 +267,6 @@ def error(pose):
 
 
 def test_refines_with_depth_where_it_is_given(parts_path):
-    pytest.importorskip("small_gicp")
     estimator, rendered = seen(parts_path, "depth")
     found = estimator.predict(rendered.image, K_VGA, depth=rendered.depth)[0]
     alone = estimator.predict(rendered.image, K_VGA)[0]

@@ -161,7 +161,7 @@ class MeasurementConfig:
         tune: Whether to learn a factor on distances, a score and its threshold first.
         false_positives: What tuning demands: ``num_empty`` and ``false_positive_rate``.
         refine: ``region`` measures, and tunes, with poses refined on the picture as well, ``depth``
-            with poses refined where the images have depth.
+            where the images have depth, a list of the two by both.
         output_dir: Folder of run folders.
     """
 
@@ -169,7 +169,7 @@ class MeasurementConfig:
     protocols: Protocols
     tune: bool
     false_positives: FalsePositiveTarget
-    refine: str | None
+    refine: str | tuple[str, ...] | None
     output_dir: Any
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 from dopepp.core.errors import UserError
@@ -40,7 +40,15 @@ def read_fields(text: str, path: Path) -> Calibration:
         content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), path)
     if not isinstance(content, Mapping):
         raise UserError(f"{path} without any fields", FORMATS, "pass the camera's file")
-    return _Fields(content, path).camera()
+    return find_camera(content, path)
+
+
+def find_camera(content: Mapping[Any, object], source: Path | str) -> Calibration:
+    """Return the camera that named fields speak of; the caller checks the lens.
+
+    ``source`` is where they come from, for messages.
+    """
+    return _Fields(content, source).camera()
 
 
 class _Fields:
@@ -51,7 +59,7 @@ class _Fields:
     SIZE: Final = ("image_size", "resolution")
     MODELS: Final = ("plumb_bob", "rational_polynomial")
 
-    def __init__(self, content: Mapping[object, object], path: Path) -> None:
+    def __init__(self, content: Mapping[Any, object], path: Path | str) -> None:
         self._path = path
         listed = content.get("camera_settings")
         if isinstance(listed, list):

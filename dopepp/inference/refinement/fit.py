@@ -170,7 +170,8 @@ def continues(view: DepthView, overlay: Overlay, reach: float) -> Region:
 
 
 Terms = tuple[PoseMatrix, Float[np.ndarray, "6"]]
-"""Information matrix and vector of (turn about the object's origin, shift): H ξ = g."""
+"""Information matrix and vector of (turn about the object's origin, shift), camera axes: H ξ = g.
+"""
 
 
 def outline_terms(

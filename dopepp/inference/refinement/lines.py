@@ -22,7 +22,8 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.contour import Contour
-from dopepp.inference.refinement.solver import DAMPING, Terms
+from dopepp.inference.refinement.fit import Terms
+from dopepp.inference.refinement.solver import DAMPING
 
 CONFIDENCE: Final = 0.5
 """Exponent of the likelihood of neighbouring pixels, whose colours are not independent."""

@@ -1,6 +1,9 @@
-"""Which evidence makes poses precise: the outline on the picture, or a depth image.
+"""Poses made precise: one solver, and the evidence that ``refine=`` names as its terms.
 
-To add one, write a function from parts to a :data:`Refiner` and one line in :data:`REFINERS`.
+``region`` is the outline on the picture, ``depth`` a depth image. Where both are asked for, the
+picture alone leads to a start, or depth where the picture does not decide; from there both pull at
+once. What does not decide is left out: without depth the picture refines alone, and depth alone
+where part and background are of one colour.
 """
 
 from __future__ import annotations
@@ -9,70 +12,182 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
+import numpy as np
+
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix
-from dopepp.inference.refinement.depth import DepthRefiner, Refinement
-from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.inference.refinement.depth import DepthEvidence
+from dopepp.inference.refinement.fit import make_prior
+from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
+from dopepp.inference.refinement.solver import Refinement, Solution, UndecidedError
 from dopepp.inference.refinement.starts import poses_of_four
-from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.refinement.visible import FEWEST_POINTS, Depth, PoseMatrix, surface_points
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
+
+TERMS: Final = ("region", "depth")
+
+Refine = str | Sequence[str]
+"""What ``refine=`` takes: one of :data:`TERMS`, or several."""
 
 Refiner = Callable[[Detection, Picture, CameraMatrix, Depth | None], Refinement]
 """From a detection on a picture, with its depth where there is one, to the refined pose, or to the
 given one and why it was kept."""
 
 
-def make_refiner(refine: str, parts: Sequence[Part]) -> Refiner:
-    """Return the refiner of that name for these parts.
+def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
+    """Return what refines the poses of these parts by one or several of :data:`TERMS`.
 
-    A :class:`UserError`: there is none of that name, its extra is not installed, or a part has no
-    mesh that it could use.
+    A :class:`UserError`: there is none of that name, or a part has no mesh whose outline it could
+    use.
     """
-    if refine not in REFINERS:
-        allowed = ", ".join(REFINERS)
-        raise UserError(f"refine={refine!r}", f"{allowed}, or none", "choose one of them")
-    return REFINERS[refine](parts)
-
-
-def _by_region(parts: Sequence[Part]) -> Refiner:
-    bare = [part.name for part in parts if part.mesh is None]
-    if bare:
-        raise UserError(
-            f"refine=region and no mesh of {bare[0]}: an earlier version wrote this checkpoint",
-            "a mesh of every part of the checkpoint",
-            f"add --part {bare[0]}=FILE and its --unit (parts=… in Python), or train again",
-        )
+    terms = checked_terms(refine)
+    refiners = {part.name: PartRefiner(part, terms) for part in parts}
     cuboids = {part.name: part.cuboid for part in parts}
-    refiners = {
-        part.name: RegionRefiner(part.mesh.vertices, part.mesh.faces)
-        for part in parts
-        if part.mesh is not None
-    }
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
         # One that was refined before comes from a tracker, which knows how far it may have moved.
         network = one.agreement is None
         elsewhere = partial(poses_of_four, cuboids[one.object], one.peaks, K) if network else None
-        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, elsewhere)
+        return refiners[one.object].refine(
+            image, K, one.T_cam_obj, one.covariance, depth, elsewhere
+        )
 
     return refined
 
 
-def _by_depth(parts: Sequence[Part]) -> Refiner:
-    refiner = DepthRefiner(parts)
+def checked_terms(refine: Refine) -> tuple[str, ...]:
+    """Return the names of the terms; a :class:`UserError` for what is none of them."""
+    terms = (refine,) if isinstance(refine, str) else tuple(refine)
+    if not terms or not set(terms) <= set(TERMS):
+        allowed = f"{', '.join(TERMS)}, several of them, or none"
+        raise UserError(f"refine={refine!r}", allowed, "choose among them")
+    return terms
 
-    def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
+
+class PartRefiner:
+    """Refines the poses of one part.
+
+    Args:
+        part: The part.
+        terms: The evidence, some of :data:`TERMS`.
+
+    Raises:
+        UserError: The picture's outline is asked for, and the part has no mesh.
+    """
+
+    def __init__(self, part: Part, terms: Sequence[str]) -> None:
+        self._region = _region(part) if "region" in terms else None
+        self._by_depth, self._diameter = "depth" in terms, part.diameter
+        large = self._by_depth and len(part.points) >= FEWEST_POINTS
+        self._surface = surface_points(part.points) if large else None
+
+    def refine(
+        self,
+        image: Picture,
+        K: CameraMatrix,
+        T_cam_obj: Transform,
+        covariance: PoseMatrix | None = None,
+        depth: Depth | None = None,
+        starts: Starts | None = None,
+    ) -> Refinement:
+        """Refine one pose.
+
+        Args:
+            image: RGB.
+            K: Its camera matrix, pixels.
+            T_cam_obj: The pose to start from, metres.
+            covariance: Of the given pose: rotation vector about the object's origin and shift, both
+                in camera axes, radians and metres. Without it, a broad one is taken.
+            depth: Metres along z, aligned to the image, 0 where unknown.
+            starts: As :meth:`RegionRefiner.refine` takes it.
+
+        Returns:
+            The refined pose with its covariance, or the given one with the reason why it was kept.
+        """
+        given = np.asarray(T_cam_obj, np.float64)
+        if not np.isfinite(given).all():
+            return Refinement(given, reason="the pose is not finite")
+        alone = None
+        if self._region is not None:
+            alone = self._region.refine(image, K, given, covariance, starts)
+        if alone is not None and (depth is None or not self._by_depth):
+            return alone
+        try:
+            measured = self._measured(K, given, covariance, depth)
+            if self._region is None or alone is None:
+                return _by_depth(measured)
+            return _by_both(self._region, image, K, alone, measured)
+        except UndecidedError as undecided:
+            return alone or Refinement(given, reason=str(undecided))
+
+    def _measured(
+        self,
+        K: CameraMatrix,
+        given: Transform,
+        covariance: PoseMatrix | None,
+        depth: Depth | None,
+    ) -> DepthEvidence:
+        """Return what depth says; an :class:`UndecidedError` where that is nothing."""
         if depth is None:
-            return Refinement(one.T_cam_obj, reason="no depth image was given")
-        return refiner.refine(one.object, one.T_cam_obj, depth, K, one.covariance)
+            raise UndecidedError("no depth image was given")
+        if self._surface is None:
+            raise UndecidedError("the part has too few surface points")
+        prior = make_prior(given, self._diameter, covariance)
+        return DepthEvidence(self._surface, self._diameter, depth, K, prior)
 
-    return refined
+
+def _by_depth(measured: DepthEvidence) -> Refinement:
+    """Refine with depth alone; an :class:`UndecidedError` where it does not decide."""
+    end = measured.descend()
+    measured.check(end.T_cam_obj)
+    return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 
 
-REFINERS: Final[dict[str, Callable[[Sequence[Part]], Refiner]]] = {
-    "region": _by_region,
-    "depth": _by_depth,
-}
-"""What ``refine=`` may name."""
+def _by_both(
+    region: RegionRefiner,
+    image: Picture,
+    K: CameraMatrix,
+    alone: Refinement,
+    measured: DepthEvidence,
+) -> Refinement:
+    """Refine on picture and depth, from where the picture alone has led.
+
+    Where that has not decided, depth leads, and its own end is what both may still improve.
+
+    Raises:
+        UndecidedError: Depth does not decide.
+    """
+    if alone.covariance is not None:
+        start = Solution(alone.T_cam_obj, np.linalg.inv(alone.covariance))
+        return _together(region, image, K, start, measured)
+    start = measured.descend()
+    try:
+        return _together(region, image, K, start, measured)
+    except UndecidedError:
+        measured.check(start.T_cam_obj)
+        return Refinement(start.T_cam_obj, np.linalg.inv(start.information))
+
+
+def _together(
+    region: RegionRefiner,
+    image: Picture,
+    K: CameraMatrix,
+    start: Solution,
+    measured: DepthEvidence,
+) -> Refinement:
+    """Refine on both; an :class:`UndecidedError` where one of them speaks against the end."""
+    end, agreement = region.refine_with(image, K, measured, start)
+    measured.check(end.T_cam_obj)
+    return refinement(end, agreement)
+
+
+def _region(part: Part) -> RegionRefiner:
+    if part.mesh is None:
+        raise UserError(
+            f"refine=region and no mesh of {part.name}: an earlier version wrote this checkpoint",
+            "a mesh of every part of the checkpoint",
+            f"add --part {part.name}=FILE and its --unit (parts=… in Python), or train again",
+        )
+    return RegionRefiner(part.mesh.vertices, part.mesh.faces)

@@ -27,13 +27,13 @@ from jaxtyping import Float, UInt8
 
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.crop import EDGE_PX, crop_around
-from dopepp.inference.refinement.depth import Refinement
+from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import Prior, make_prior
 from dopepp.inference.refinement.lines import outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.rounds import Agreement, Round, Stage, UndecidedError
+from dopepp.inference.refinement.rounds import Agreement, Round, Stage
 from dopepp.inference.refinement.silhouette import posed
-from dopepp.inference.refinement.solver import Solution
+from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, UndecidedError
 from dopepp.inference.refinement.starts import drawn_poses
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
@@ -74,6 +74,9 @@ needs none before it."""
 
 Starts = Callable[[], Sequence[Transform]]
 """Where else a part may be; called where that is asked for."""
+
+Found = tuple[Solution, Agreement]
+"""Where a descent ended, and how well the outline agrees there."""
 
 
 class RegionRefiner:
@@ -117,26 +120,67 @@ class RegionRefiner:
         given = np.asarray(T_cam_obj, np.float64)
         if not np.isfinite(given).all():
             return Refinement(given, reason="the pose is not finite")
+        try:
+            prior = _prior(given, self._diameter, covariance)
+            loose = _loosened(prior, self._diameter)
+            return refinement(*_search(self._rounds(image, K, given), prior, loose, starts))
+        except UndecidedError as undecided:
+            return Refinement(given, reason=str(undecided))
+
+    def refine_with(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        K: CameraMatrix,
+        depth: DepthEvidence,
+        start: Solution,
+    ) -> Found:
+        """Refine a pose on the picture and with depth at once.
+
+        Args:
+            image: RGB.
+            K: Its camera matrix, pixels.
+            depth: What pulls beside the outline.
+            start: Where one of them alone has led.
+
+        Returns:
+            The end, and how well the outline agrees there.
+
+        Raises:
+            UndecidedError: The picture does not decide.
+        """
+        depth.look(start.T_cam_obj)
+        rounds = self._rounds(image, K, start.T_cam_obj, [depth.evidence()])
+        reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
+        end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
+        known = depth.information(end.T_cam_obj)
+        return end, rounds[-1].believed(end, depth.prior, reach, known)
+
+    def _rounds(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        K: CameraMatrix,
+        pose: Transform,
+        more: Sequence[Evidence] = (),
+    ) -> list[Round]:
+        """Return the rounds around a pose; an :class:`UndecidedError` where it is not in view."""
         K = np.asarray(K, np.float64)
-        at = posed(self._mesh, given, K)
+        at = posed(self._mesh, pose, K)
         if at is None:
-            return Refinement(given, reason="the part reaches behind the camera")
+            raise UndecidedError("the part reaches behind the camera")
         corners = np.stack([at.pixels.min(axis=0), at.pixels.max(axis=0)])
         rounds = []
         for stage in (COARSE, MIDDLE, FINE):
             crop = crop_around(image, K, corners, stage.longest_px)
             if isinstance(crop, str):
-                return Refinement(given, reason=crop)
-            rounds.append(Round(self._mesh, crop, stage))
-        prior = _prior(given, self._diameter, covariance)
-        loose = _loosened(prior, self._diameter)
-        try:
-            end, agreement = _search(rounds, prior, loose, starts)
-        except UndecidedError as undecided:
-            return Refinement(given, reason=str(undecided))
-        covariance = np.linalg.inv(end.information)
-        share, support = agreement.share, agreement.support
-        return Refinement(end.T_cam_obj, covariance, agreement=share, support=support)
+                raise UndecidedError(crop)
+            rounds.append(Round(self._mesh, crop, stage, more))
+        return rounds
+
+
+def refinement(end: Solution, agreement: Agreement) -> Refinement:
+    """Return what a descent has made of a pose."""
+    covariance = np.linalg.inv(end.information)
+    return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
 
 
 def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None) -> Prior:
@@ -155,13 +199,8 @@ def _loosened(prior: Prior, diameter: float) -> Prior:
     return Prior(prior.T_cam_obj, np.linalg.inv(covariance))
 
 
-def _search(
-    rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts | None
-) -> tuple[Solution, Agreement]:
+def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts | None) -> Found:
     """Descend from the given pose and, where that is doubtful, from farther away.
-
-    Returns:
-        The end, and how well the outline agrees there.
 
     Raises:
         UndecidedError: No descent is to be believed.
@@ -179,21 +218,14 @@ def _search(
     return near
 
 
-def _near(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, Agreement]:
-    """Descend from the given pose; see :func:`_search`.
-
-    Rounds that look farther than the prior asks for are left out: a tracked part needs the last one
-    only, once.
-    """
+def _near(rounds: Sequence[Round], prior: Prior) -> Found:
+    """Descend from the given pose; see :func:`_search`."""
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
-    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
-        rounds = rounds[1:]
-    if len(rounds) > 1:
-        return _descended(rounds, given, prior, reach)
-    # From where the first time led, the colours are learned better.
-    again = rounds if rounds[0].farthest(reach) < reach else ()
-    return _refined([*rounds, *again], given, prior, reach)
+    rounds = _needed(rounds, reach)
+    if rounds[0].stage is FINE:
+        return _refined(rounds, given, prior, reach)
+    return _from_afar(rounds, given, prior, reach)
 
 
 def _far(
@@ -201,27 +233,25 @@ def _far(
     prior: Prior,
     loose: Prior,
     starts: Sequence[Transform],
-    near: tuple[Solution, Agreement] | None,
-) -> tuple[Solution, Agreement] | None:
+    near: Found | None,
+) -> Found | None:
     """Descend from the likeliest starts; return the end that agrees best.
 
     None where none agrees well, or with no more of the outline than ``near`` or the given pose.
     """
-    best: tuple[Solution, Agreement] | None = None
+    best: Found | None = None
     with contextlib.suppress(UndecidedError):
         reach = _first_reach(rounds[0], loose)
         if near is None:
             rounds[-1].learn(prior.T_cam_obj, reach)
-            before = rounds[-1].agreement(prior.T_cam_obj, reach)
-        else:
-            before = near[1]
+        before = rounds[-1].agreement(prior.T_cam_obj, reach) if near is None else near[1]
         supported = max(SUPPORTED, before.support + MORE)
         rounds[0].learn(prior.T_cam_obj, reach)
         others = [*starts, *drawn_poses(loose, 1 / FAR)]
         others.sort(key=lambda start: -rounds[0].log_likelihood(start, loose))
         for start in (prior.T_cam_obj, *others[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                end, _ = _descended(rounds, start, loose, reach)
+                end, _ = _from_afar(rounds, start, loose, reach)
                 # A prior that admits where that led, and holds the pose no less than it must.
                 away = prior.offset(end.T_cam_obj)
                 surprise = max(1.0, float(away @ prior.information @ away) / len(away))
@@ -235,28 +265,40 @@ def _far(
     return best
 
 
-def _descended(
-    rounds: Sequence[Round], start: Transform, prior: Prior, reach: float
-) -> tuple[Solution, Agreement]:
+def _from_afar(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Found:
     """Descend in all rounds, in the first one with a prior that lets go."""
     rounds[0].learn(start, reach)
     wide = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
     return _refined(rounds[1:], rounds[0].descend(start, wide, reach).T_cam_obj, prior, reach)
 
 
-def _refined(
-    rounds: Sequence[Round], start: Transform, prior: Prior, reach: float
-) -> tuple[Solution, Agreement]:
+def _needed(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
+    """Leave out rounds that look farther than the reach: a tracked part needs the last one only."""
+    while len(rounds) > 1 and rounds[1].farthest(reach) >= ENOUGH * reach:
+        rounds = rounds[1:]
+    if len(rounds) == 1 and rounds[0].farthest(reach) < reach:
+        # From where the first time led, the colours are learned better.
+        return [*rounds, *rounds]
+    return rounds
+
+
+def _refined(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Found:
     """Descend in one round after the other, and see whether to believe where that leads.
 
     Raises:
         UndecidedError: Not to be believed.
     """
+    end = _descended(rounds, start, prior, reach)
+    return end, rounds[-1].believed(end, prior, reach, prior.information)
+
+
+def _descended(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
+    """Descend in one round after the other."""
     end = Solution(start, prior.information)
     for one in rounds:
         one.learn(end.T_cam_obj, reach)
         end = one.descend(end.T_cam_obj, prior, reach)
-    return end, rounds[-1].believed(end, prior, reach)
+    return end
 
 
 def _first_reach(coarse: Round, prior: Prior) -> float:

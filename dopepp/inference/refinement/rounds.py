@@ -1,7 +1,4 @@
-"""One of the rounds in which a pose is refined on the picture: its crop, colours, pull and verdict.
-
-To add evidence that the outline does not give, return one more from :meth:`Round.evidence`.
-"""
+"""A round in which a pose is refined on the picture: its crop, colours, pull and verdict."""
 
 from __future__ import annotations
 
@@ -12,13 +9,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from dopepp.geometry.camera import Transform
 from dopepp.inference.refinement.colour import log_odds
 from dopepp.inference.refinement.contour import Contour, find_contour
 from dopepp.inference.refinement.crop import EDGE_PX, Crop
-from dopepp.inference.refinement.fit import Prior
+from dopepp.inference.refinement.fit import Prior, Terms
 from dopepp.inference.refinement.lines import (
     CONFIDENCE,
     INDEPENDENT_PX,
@@ -30,7 +27,12 @@ from dopepp.inference.refinement.lines import (
 )
 from dopepp.inference.refinement.mesh import OutlineMesh
 from dopepp.inference.refinement.silhouette import Posed, filled_mask, posed
-from dopepp.inference.refinement.solver import Evidence, Solution, Terms, descend
+from dopepp.inference.refinement.solver import (
+    Evidence,
+    Solution,
+    UndecidedError,
+    descend,
+)
 
 RING: Final = 0.2
 """Of the part's extent: width of what counts as its surroundings."""
@@ -53,10 +55,6 @@ TOLD: Final = 0.1
 
 FARTHEST: Final = 4.5
 """Standard deviations (Mahalanobis distance of six numbers) that a pose may be moved."""
-
-
-class UndecidedError(Exception):
-    """Why a picture does not decide about a pose."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +105,13 @@ class Round:
         mesh: The part.
         crop: The picture at the stage's size.
         stage: The stage.
+        more: What pulls beside the outline.
     """
 
-    def __init__(self, mesh: OutlineMesh, crop: Crop, stage: Stage) -> None:
-        self.crop, self.stage, self._mesh = crop, stage, mesh
+    def __init__(
+        self, mesh: OutlineMesh, crop: Crop, stage: Stage, more: Sequence[Evidence] = ()
+    ) -> None:
+        self.crop, self.stage, self._mesh, self._more = crop, stage, mesh, more
         self._spacing = max(1.5, 3.0 * crop.extent / stage.points)
         self._odds: Float32[np.ndarray, "height width"] = np.zeros(crop.size[::-1], np.float32)
         self._soft = self._odds
@@ -150,7 +151,7 @@ class Round:
             shifts = self._shifts(contour, reach)
             return region_terms(rows, shifts, known, self._spacing, self.crop.extent)
 
-        return [outline]
+        return [outline, *self._more]
 
     def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
         """Take the stage's steps; an :class:`UndecidedError` where they leave the picture."""
@@ -180,14 +181,18 @@ class Round:
         share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
         return Agreement(share, float((agrees & (weights > TOLD)).mean()))
 
-    def believed(self, end: Solution, prior: Prior, reach: float) -> Agreement:
+    def believed(
+        self, end: Solution, prior: Prior, reach: float, known: Float[np.ndarray, "6 6"]
+    ) -> Agreement:
         """Return how well the outline agrees where a descent has ended.
+
+        ``known`` is the information that was there without the outline.
 
         Raises:
             UndecidedError: The picture does not decide for this pose.
         """
         agreement = self.agreement(end.T_cam_obj, reach)
-        gain = np.linalg.slogdet(end.information)[1] - np.linalg.slogdet(prior.information)[1]
+        gain = np.linalg.slogdet(end.information)[1] - np.linalg.slogdet(known)[1]
         if gain < LEAST_GAIN:
             raise UndecidedError("colours inside and around the part are too alike")
         if agreement.share < LEAST_AGREEING:

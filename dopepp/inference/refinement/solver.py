@@ -14,11 +14,7 @@ from jaxtyping import Float
 
 from dopepp.geometry.camera import Transform, moved
 from dopepp.geometry.refine import solve_damped
-from dopepp.inference.refinement.fit import Prior
-
-Terms = tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]
-"""Information matrix and vector of (turn about the object's origin, shift), camera axes: H ξ = g.
-"""
+from dopepp.inference.refinement.fit import Prior, Terms
 
 Evidence = Callable[[Transform, Terms], Terms | None]
 """Terms at a pose, given what is known of the step besides; None where there is nothing to say them
@@ -29,6 +25,32 @@ DAMPING: Final = 1e-6
 
 ARRIVED: Final = 0.1
 """Standard deviations; a shorter step ends the descent."""
+
+
+class UndecidedError(Exception):
+    """Why the evidence does not decide about a pose."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What the evidence has made of a pose.
+
+    Attributes:
+        T_cam_obj: The refined pose.
+        covariance: Of the refined pose, as :class:`~dopepp.geometry.pnp.PnPResult` defines it; None
+            where the given pose was kept.
+        reason: Why the given pose was kept; empty where it was refined.
+        agreement: Share of what the picture tells about the refined outline that agrees with it;
+            None without it.
+        support: Share of the refined outline that the picture tells about and that agrees; None
+            without it.
+    """
+
+    T_cam_obj: Transform
+    covariance: Float[np.ndarray, "6 6"] | None = None
+    reason: str = ""
+    agreement: float | None = None
+    support: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

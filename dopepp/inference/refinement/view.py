@@ -162,6 +162,7 @@ class Overlay:
 
     Attributes:
         points: Those within the view, camera frame, metres.
+        normals: Unit normals of their planes, of either sign.
         pixels: Column and row of each.
         distance: Of every pixel of the view to the nearest of them, spacings of the part.
         nearest: Index of that point.
@@ -170,6 +171,7 @@ class Overlay:
     """
 
     points: Points
+    normals: Points
     pixels: Int[np.ndarray, "points 2"]
     distance: Depth
     nearest: Int[np.ndarray, "height width"]
@@ -215,7 +217,7 @@ def lay_over(
     offset = np.empty(view.depth.shape)
     limit = EXTENDED * surface.spacing
     _offsets(view.depth, view.rays, distance, nearest, points, normals, BESIDE, limit, offset)
-    return Overlay(points, pixels, distance, nearest, offset)
+    return Overlay(points, normals, pixels, distance, nearest, offset)
 
 
 @compiled()

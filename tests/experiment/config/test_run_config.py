@@ -71,6 +71,17 @@ def test_a_mistake_in_an_evaluation(override, got, composed):
     assert error.value.got == got
 
 
+@pytest.mark.parametrize(
+    ("override", "terms"),
+    [("refine=null", None), ("refine=depth", "depth"),
+     ("refine=[region,depth]", ("region", "depth"))],
+)  # fmt: skip
+def test_terms_of_a_refinement_are_one_or_a_list(override, terms, composed):
+    assert EvaluationConfig.of(composed(override, config="evaluate")).refine == terms
+    with pytest.raises(UserError, match=r"refine\[0\]=3"):
+        EvaluationConfig.of(composed("refine=[3]", config="evaluate"))
+
+
 def test_values_are_typed_and_the_plain_config_stays(composed):
     plain = composed("data.root=photos", "+trainer.limit_val_batches=2", "ema=0.5", "shading=0.4")
     config = RunConfig.of(plain)

@@ -1,5 +1,4 @@
 import math
-import sys
 
 import cv2
 import numpy as np
@@ -12,8 +11,10 @@ from numpy.testing import assert_allclose
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
-from dopepp.inference.refinement.depth import DepthRefiner
+from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import make_prior, outline_terms
+from dopepp.inference.refinement.planes import plane_terms
+from dopepp.inference.refinement.refiner import PartRefiner
 from dopepp.inference.refinement.view import (
     checked_depth,
     lay_over,
@@ -28,11 +29,11 @@ from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers.raster.rasteriser import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 
-pytest.importorskip("small_gicp")
-
 K = camera_matrix(600, 600, 319.5, 239.5)
 TILTED = rotation_vector_to_matrix(np.array([2.6, 0.3, 0.2]))
 TRUE = make_transform(TILTED, np.array([0.03, -0.02, 0.6]))
+FACING = make_transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+BLACK = np.zeros((480, 640, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -41,17 +42,18 @@ def box() -> Part:
     return make_part("box", Mesh(np.array(whole.vertices), np.array(whole.faces, np.int32)))
 
 
-def depth_of(part: Part, T: np.ndarray, seed: int = 0, wall: float = 0.9) -> np.ndarray:
+def seen(part: Part, T: np.ndarray, wall: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+    """Return picture and noisy depth of a part before a wall."""
     body = make_body(part, is_target=True)
-    scene = Scene(
-        K,
-        np.zeros((480, 640, 3), np.uint8),
-        (SceneObject(body.surface, T, part=part),),
-        plane=Plane((0.0, 0.0, -1.0), -wall),
-    )
-    depth = render(scene).depth
-    noise = np.random.default_rng(seed).normal(size=depth.shape)
-    return (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
+    objects, plane = (SceneObject(body.surface, T, part=part),), Plane((0.0, 0.0, -1.0), -wall)
+    rendered = render(Scene(K, np.full_like(BLACK, (40, 110, 60)), objects, plane=plane))
+    depth = rendered.depth
+    noise = np.random.default_rng(0).normal(size=depth.shape)
+    return rendered.image, (depth + 1e-3 * noise * (depth > 0)).astype(np.float32)
+
+
+def depth_of(part: Part, T: np.ndarray) -> np.ndarray:
+    return seen(part, T)[1]
 
 
 def started(T: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -70,10 +72,10 @@ def add(part: Part, one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize("name", ["box", "plate"])
 def test_finds_the_pose_from_14_mm_away(name, box):
     part = box if name == "box" else pivconnector()
-    refiner, depth = DepthRefiner([part]), depth_of(part, TRUE)
+    refiner, depth = PartRefiner(part, ["depth"]), depth_of(part, TRUE)
     for seed in range(5):
         start = started(TRUE, np.random.default_rng(seed))
-        refined = refiner.refine(part.name, start, depth, K)
+        refined = refiner.refine(BLACK, K, start, depth=depth)
         assert refined.reason == ""
         assert add(part, refined.T_cam_obj, TRUE) < 0.004
         assert add(part, refined.T_cam_obj, TRUE) < add(part, start, TRUE) / 2
@@ -83,13 +85,13 @@ def test_finds_the_pose_from_14_mm_away(name, box):
 
 def test_keeps_the_pose_when_depth_shows_something_else(box):
     start = started(TRUE, np.random.default_rng(0))
-    refiner = DepthRefiner([box])
+    refiner = PartRefiner(box, ["depth"])
     wall = np.full((480, 640), 0.9, np.float32)
     nothing = np.zeros_like(wall)
     near = np.full_like(wall, 0.3)
     noise = np.random.default_rng(0).uniform(0.3, 1.5, wall.shape).astype(np.float32)
-    for depth in (wall, nothing, near, noise):
-        kept = refiner.refine("box", start, depth, K)
+    for depth in (wall, nothing, near, noise, None):
+        kept = refiner.refine(BLACK, K, start, depth=depth)
         assert kept.reason
         assert kept.covariance is None
         assert_allclose(kept.T_cam_obj, start)
@@ -100,28 +102,77 @@ def test_keeps_the_pose_that_the_image_is_sure_of():
     part, aside = pivconnector(), TRUE.copy()
     aside[0, 3] += 0.04
     sure = np.diag([1e-3] * 6) ** 2
-    kept = DepthRefiner([part]).refine(part.name, TRUE, depth_of(part, aside), K, sure)
+    refiner = PartRefiner(part, ["depth"])
+    kept = refiner.refine(BLACK, K, TRUE, sure, depth_of(part, aside))
     assert np.linalg.norm(kept.T_cam_obj[:3, 3] - TRUE[:3, 3]) < 0.012
 
 
 def test_outside_the_view_or_behind_the_camera(box):
-    refiner, depth = DepthRefiner([box]), depth_of(box, TRUE)
-    for x, z in ((5.0, 0.6), (0.0, -0.6), (0.0, 0.05)):
+    refiner, depth = PartRefiner(box, ["depth"]), depth_of(box, TRUE)
+    for x, z in ((5.0, 0.6), (0.0, -0.6), (0.0, 0.05), (np.nan, 0.6)):
         off = make_transform(TILTED, np.array([x, 0.0, z]))
-        assert refiner.refine("box", off, depth, K).reason
+        assert refiner.refine(BLACK, K, off, depth=depth).reason
 
 
 def test_a_part_of_few_points_is_kept():
     corners = np.stack(np.meshgrid(*[[-0.04, 0.04]] * 3), -1).reshape(-1, 3)
-    refiner = DepthRefiner([make_part("few", None, corners)])
+    refiner = PartRefiner(make_part("few", None, corners), ["depth"])
     depth = np.full((480, 640), 0.6, np.float32)
-    assert "few surface points" in refiner.refine("few", TRUE, depth, K).reason
+    assert "few surface points" in refiner.refine(BLACK, K, TRUE, depth=depth).reason
 
 
-def test_without_the_extra(box, monkeypatch):
-    monkeypatch.setitem(sys.modules, "small_gicp", None)
-    with pytest.raises(UserError, match=r"without the package small_gicp.*dopepp\[depth\]"):
-        DepthRefiner([box])
+@pytest.mark.parametrize(
+    ("picture", "measured", "better"),
+    [
+        (True, True, 0.001),
+        (True, False, 0.006),  # an outline says little of the distance
+        (False, True, 0.003),
+    ],
+)
+def test_picture_and_depth_refine_in_one_and_each_without_the_other(picture, measured, better):
+    part = pivconnector()
+    image, depth = seen(part, TRUE)
+    refiner = PartRefiner(part, ["region", "depth"])
+    for seed in range(3):
+        start = started(TRUE, np.random.default_rng(seed))
+        refined = refiner.refine(
+            image if picture else BLACK, K, start, depth=depth if measured else None
+        )
+        assert refined.reason == ""
+        assert (refined.agreement is not None) == picture
+        assert add(part, refined.T_cam_obj, TRUE) < better
+
+
+def test_planes_pull_by_what_is_measured_on_the_part(box):
+    """Of a face that lies 4 mm too far, the step is that, whatever hides it."""
+    off = FACING.copy()
+    off[2, 3] += 0.004
+    surface, depth = surface_points(box.points), depth_of(box, FACING)
+    hidden, holes = depth.copy(), depth.copy()
+    hidden[:, 290:330] = 0.4
+    holes[:220] = 0.0
+    for measured in (depth, hidden, holes):
+        view = view_around(measured, K, transform(off, surface.points))
+        assert view is not None
+        overlay = lay_over(view, surface, visible(surface, off), off)
+        assert overlay is not None
+        H, g = plane_terms(view, overlay, off[:3, 3], surface.spacing, 0.02)
+        assert_allclose(H, H.T)
+        step = np.linalg.solve(H + np.diag([1e-6] * 3 + [1e2] * 3), g)
+        assert_allclose(step[5], -0.004, atol=3e-4)
+
+
+def test_depth_is_as_sure_as_its_independent_errors(box):
+    """A camera with so many more pixels knows a pose no better: their errors are alike."""
+    depth = depth_of(box, FACING)
+    surface, prior = surface_points(box.points), make_prior(FACING, box.diameter)
+    end = DepthEvidence(surface, box.diameter, depth, K, prior).descend()
+    fine = cv2.resize(depth, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    K_fine = camera_matrix(1200, 1200, 639.5, 479.5)
+    again = DepthEvidence(surface, box.diameter, fine, K_fine, prior).descend()
+    deviations = [np.sqrt(np.linalg.inv(one.information)[5, 5]) for one in (end, again)]
+    assert_allclose(deviations[1], deviations[0], rtol=0.2)
+    assert 5e-5 < deviations[0] < 5e-4
 
 
 def test_visible_points_agree_with_the_drawn_depth(box):
@@ -132,8 +183,7 @@ def test_visible_points_agree_with_the_drawn_depth(box):
             R = random_rotation(np.random.default_rng(seed))
             T = make_transform(R, np.array([0.01, 0.02, 0.6]))
             body = make_body(part, is_target=True)
-            image = np.zeros((480, 640, 3), np.uint8)
-            depth = render(Scene(K, image, (SceneObject(body.surface, T),))).depth
+            depth = render(Scene(K, BLACK, (SceneObject(body.surface, T),))).depth
             points = transform(T, surface.points)
             u, v = np.rint(points[:, :2] / points[:, 2:] * 600 + [319.5, 239.5]).astype(int).T
             drawn = depth[v, u]
@@ -153,10 +203,9 @@ def test_normals_of_a_thin_plate_are_those_of_its_faces():
 
 def test_outline_pulls_a_shifted_part_back(box):
     """Seen face on, the pull of the outline is the shift, and nothing where there is none."""
-    T = make_transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
-    depth, surface = depth_of(box, T), surface_points(box.points)
+    depth, surface = depth_of(box, FACING), surface_points(box.points)
     for shift in (0.0, 0.006):
-        off = T.copy()
+        off = FACING.copy()
         off[0, 3] += shift
         points = transform(off, surface.points)
         view = view_around(depth, K, points)

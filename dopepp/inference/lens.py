@@ -1,0 +1,62 @@
+"""Lens: what is known of the camera behind some pictures, and how the pictures came about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.camera_file import Camera, Crop, read_camera
+from dopepp.geometry.camera_files.values import Size
+from dopepp.inference.refinement.view import Depth32, read_depth, undistorted_depth
+from dopepp.inference.sources import Source
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A camera, and what was made of its pictures.
+
+    Attributes:
+        camera: The one that took them.
+        K_size: (width, height) that K belongs to, where the pictures were resized.
+        crop: What of the calibrated picture they are, where they were cut out of it.
+    """
+
+    camera: Camera
+    K_size: Size | None = None
+    crop: Crop | None = None
+
+    def seen(self, picture: Picture) -> tuple[Picture, CameraMatrix]:
+        """Return a picture without distortion and its K; a UserError where K is of another."""
+        size = (picture.shape[1], picture.shape[0])
+        camera = self.camera.for_picture(size, self.K_size, self.crop)
+        return camera.undistorted(picture), camera.K
+
+    def depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
+        """Read a depth image, metres, and return it without distortion."""
+        metres, lens = read_depth(path, scale), self.camera.coefficients
+        return metres if lens is None else undistorted_depth(metres, K, lens)
+
+
+def one_camera(
+    K: CameraMatrix | None, camera: Camera | Path | str | None, source: Source
+) -> Camera:
+    """Return the camera that one of two arguments gives, or else the source's own.
+
+    A :class:`UserError`: both are given, or there is none at all; or as from :func:`read_camera`.
+    """
+    if K is not None and camera is not None:
+        raise UserError("--K and --camera", "one of the two", "leave one of them out")
+    if K is not None:
+        return Camera(None, K, (), "--K")
+    if isinstance(camera, Path | str):
+        return read_camera(camera)
+    known = camera or source.camera
+    if known is None:
+        raise UserError(
+            f"neither --K nor --camera for {source.name}", "one of the two",
+            "pass --K fx fy cx cy (pixels of this picture) or --camera FILE",
+        )  # fmt: skip
+    return known

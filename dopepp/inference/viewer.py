@@ -1,0 +1,287 @@
+"""Viewer: results in Rerun (extra ``rerun``), in a window or a file: what is seen, and where it is.
+
+Shown are the picture with cuboids and silhouettes, the parts' meshes, cuboids and axes in space
+with the ellipsoid of their place's uncertainty, and the network's belief maps, on a timeline.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final
+
+import cv2
+import numpy as np
+
+from dopepp.core.errors import RunError, UserError, require
+from dopepp.core.files import check_target, partial_path
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import crop_camera
+from dopepp.geometry.cuboid import CENTROID, EDGES
+from dopepp.geometry.rotation import matrix_to_quaternion
+from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.overlay import AXIS, COLOURS, silhouette
+from dopepp.inference.results import PoseResult
+from dopepp.inference.scales import letterboxes
+from dopepp.inference.sources import Source
+from dopepp.parts.part import Part
+from dopepp.recovery.detection import Detection
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+MEMORY: Final = "2GB"
+"""Of the viewer's window, which then drops what is oldest."""
+
+GROUPS: Final = ("parts", "meshes", "uncertainty")
+
+CENTRE: Final = 0.5
+"""Of the top-left pixel, in Rerun's pixels."""
+
+LOCALHOST: Final = "127.0.0.1"
+
+START_S: Final = 20.0
+"""Seconds that a window may take to open."""
+
+ELLIPSOID: Final = 2.8
+"""Half axes of the ellipsoid, standard deviations: 95 % of a normal distribution in space."""
+
+JPEG_QUALITY: Final = 90
+
+SINCE_1970: Final = 1e8
+"""Seconds above which a time is a date, not a place in a video."""
+
+
+class Viewer:
+    """A Rerun recording, shown in a window or written to a file.
+
+    Args:
+        estimator: Whose results these are; it draws the belief maps.
+        path: The ``.rrd`` file; None opens a window.
+
+    Raises:
+        UserError: The extra is missing, the file cannot be written, or there is no display to open
+            a window on.
+    """
+
+    def __init__(self, estimator: PoseEstimator, path: Path | None = None) -> None:
+        require("rerun", "the viewer", "rerun")
+        import rerun as rr
+
+        self._estimator, self._path = estimator, path
+        self._parts = {part.name: part for part in estimator.solid_parts}
+        self._recording = rr.RecordingStream("dopepp")
+        self._shown: set[str] = set()
+        self._is_open = False
+        if path is not None:
+            check_target(path, (".rrd",))
+        elif sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+            fix = "--rerun FILE.rrd writes a file, to look at elsewhere"
+            raise UserError("--show without a display", "a desktop session", fix)
+
+    def begin(self, source: Source) -> None:
+        """Go on with another source on the same timeline."""
+
+    def take(self, result: PoseResult) -> None:
+        """Add one result."""
+        import rerun as rr
+
+        log = self._recording.log
+        if not self._is_open:
+            self._open(result)
+        self._recording.set_time("frame", sequence=result.number)
+        if result.time is not None:
+            since = "timestamp" if result.time > SINCE_1970 else "duration"
+            self._recording.set_time("time", **{since: result.time})
+        size = result.image.shape[1::-1]
+        pinhole = rr.Pinhole(
+            image_from_camera=crop_camera(result.K, -CENTRE, -CENTRE), resolution=size,
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=1.5 * _distance(result, self._parts),
+        )  # fmt: skip
+        log("world/camera", pinhole)
+        log("world/camera/picture", rr.Image(result.image).compress(JPEG_QUALITY))
+        log("world/camera/outlines", _outlines(result))
+        for name, belief in belief_pictures(self._estimator, result).items():
+            log(f"beliefs/{name}", rr.Image(belief))
+        names = _names(result)
+        for number, (name, one) in enumerate(zip(names, result.detections, strict=True)):
+            self._log_part(name, one, COLOURS[number % len(COLOURS)])
+        for name in self._shown - set(names):
+            for group in GROUPS:
+                log(f"world/{group}/{name}", rr.Clear(recursive=True))
+        self._shown = set(names)
+
+    def close(self) -> None:
+        """Complete the recording."""
+        if not self._is_open:
+            return
+        self._recording.disconnect()
+        if self._path is not None and (partial := partial_path(self._path)).exists():
+            partial.replace(self._path)
+        self._is_open = False
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self, result: PoseResult) -> None:
+        """Open file or window with a view past the camera at what was found first."""
+        import rerun as rr
+
+        blueprint = _blueprint(_distance(result, self._parts))
+        if self._path is not None:
+            self._recording.save(partial_path(self._path), default_blueprint=blueprint)
+        else:
+            self._show(blueprint)
+        self._is_open = True
+        self._recording.log("world", rr.ViewCoordinates.RDF, static=True)
+
+    def _show(self, blueprint: Any) -> None:
+        """Open a window that nobody but this machine can send anything to, or look into."""
+        viewer = [sys.executable, "-m", "rerun_cli"]
+        # It would report its use; whoever wants that says `rerun analytics enable`.
+        subprocess.run([*viewer, "analytics", "disable"], capture_output=True, check=False)
+        with socket.socket() as free:
+            free.bind((LOCALHOST, 0))
+            port = free.getsockname()[1]
+        viewer += ["--bind", LOCALHOST, "--port", str(port), "--memory-limit", MEMORY]
+        silent = subprocess.DEVNULL
+        subprocess.Popen(viewer, stdout=silent, stderr=silent, start_new_session=True)
+        until = time.monotonic() + START_S
+        while not _listens(port):
+            if time.monotonic() > until:
+                raise RunError("the viewer did not start; --rerun FILE.rrd writes a file")
+            time.sleep(0.1)
+        address = f"rerun+http://{LOCALHOST}:{port}/proxy"
+        self._recording.connect_grpc(address, default_blueprint=blueprint)
+
+    def _log_part(self, name: str, one: Detection, colour: tuple[int, int, int]) -> None:
+        """Show a part at its pose, and where it may be instead."""
+        import rerun as rr
+
+        log, part = self._recording.log, self._parts[one.object]
+        R, t = one.T_cam_obj[:3, :3], one.T_cam_obj[:3, 3]
+        for group in ("parts", "meshes"):
+            log(f"world/{group}/{name}", rr.Transform3D(translation=t, mat3x3=R))
+        if name not in self._shown:
+            log(f"world/parts/{name}", rr.TransformAxes3D(AXIS * part.diameter))
+            half = np.ptp(part.cuboid[:CENTROID], axis=0) / 2
+            box = rr.Boxes3D(
+                centers=[part.cuboid[CENTROID]], half_sizes=[half], colors=[colour],
+                fill_mode=rr.components.FillMode.MajorWireframe,
+            )  # fmt: skip
+            log(f"world/parts/{name}/cuboid", box)
+            if part.mesh is not None:
+                log(f"world/meshes/{name}", _mesh(part.mesh.vertices, part.mesh.faces, colour))
+        spread, axes = np.linalg.eigh(one.covariance[3:, 3:])
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        ellipsoid = rr.Ellipsoids3D(
+            centers=[t], half_sizes=[ELLIPSOID * np.sqrt(spread.clip(0))], colors=[colour],
+            quaternions=[np.roll(matrix_to_quaternion(axes), -1)], labels=[f"{one.score:.2f}"],
+        )  # fmt: skip
+        log(f"world/uncertainty/{name}", ellipsoid)
+
+
+def belief_pictures(estimator: PoseEstimator, result: PoseResult) -> Mapping[str, Picture]:
+    """Return, for every part, the network's strongest belief of its keypoints as colours.
+
+    The network looks again, at the last of the sizes in which it has looked at the picture.
+    """
+    box = letterboxes(estimator.checkpoint, result.K, result.image)[-1]
+    beliefs, _ = estimator.maps(letterboxed(result.image, box, estimator.network.size_multiple))
+    strongest = (
+        beliefs.cpu().numpy().reshape(len(estimator.parts), CENTROID + 1, *beliefs.shape[1:])
+    )
+    levels = np.rint(255 * strongest.max(axis=1).clip(0, 1)).astype(np.uint8)
+    stride = estimator.network.stride
+    rows, columns = -(-box.height // stride), -(-box.width // stride)
+    return {
+        part.name: np.asarray(
+            cv2.applyColorMap(level[:rows, :columns], cv2.COLORMAP_INFERNO)[..., ::-1]
+        )
+        for part, level in zip(estimator.parts, levels, strict=True)
+    }
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((LOCALHOST, port), 0.5).close()
+    except OSError:
+        return False
+    return True
+
+
+def _blueprint(distance: float) -> Any:
+    """Arrange space at the left, picture and beliefs at the right."""
+    import rerun.blueprint as rrb
+
+    eye = rrb.EyeControls3D(
+        position=distance * np.array([0.9, -0.6, -0.5]),
+        look_target=distance * np.array([0.0, 0.0, 0.9]),
+        eye_up=(0, -1, 0),
+    )
+    space = rrb.Spatial3DView(origin="world", name="space", eye_controls=eye)
+    picture = rrb.Spatial2DView(origin="world/camera", contents="world/camera/**", name="picture")
+    beliefs = rrb.Spatial2DView(origin="beliefs", name="belief maps")
+    return rrb.Blueprint(
+        rrb.Horizontal(space, rrb.Vertical(picture, beliefs, row_shares=[2, 1])),
+        rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+    )  # fmt: skip
+
+
+def _outlines(result: PoseResult) -> rr.LineStrips2D:
+    """Return every part's cuboid and silhouette on the picture."""
+    import rerun as rr
+
+    strips, colours = [], []
+    for number, one in enumerate(result.detections):
+        edges = [one.keypoints[[a, b]] for a, b in EDGES]
+        own = [edge + CENTRE for edge in edges if np.isfinite(edge).all()]
+        if (shape := result.shapes.get(one.object)) is not None:
+            contours = silhouette(shape, one.T_cam_obj, result.K, result.image)
+            own += [np.vstack([line, line[:1]])[:, 0] + CENTRE for line in contours]
+        strips += own
+        colours += [COLOURS[number % len(COLOURS)]] * len(own)
+    return rr.LineStrips2D(strips, colors=colours)
+
+
+def _mesh(vertices: Any, faces: Any, colour: tuple[int, int, int]) -> rr.Mesh3D:
+    """Return a mesh with a flat normal on each triangle, by whose shade its shape is seen."""
+    import rerun as rr
+
+    corners = np.asarray(vertices)[np.asarray(faces)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3), vertex_normals=normals.repeat(3, axis=0),
+        triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3), albedo_factor=colour,
+    )  # fmt: skip
+
+
+def _names(result: PoseResult) -> list[str]:
+    """Name each detection, the same in every picture where a tracker follows it."""
+    if result.identities is not None:
+        named = zip(result.detections, result.identities, strict=True)
+        return [f"{one.object}_{identity}" for one, identity in named]
+    return [f"{one.object}_{number}" for number, one in enumerate(result.detections)]
+
+
+def _distance(result: PoseResult, parts: Mapping[str, Part]) -> float:
+    """Return how far the farthest part is, metres; without any, where one fills the picture."""
+    found = [float(one.T_cam_obj[2, 3]) for one in result.detections]
+    if found:
+        return max(found)
+    largest = max(part.diameter for part in parts.values())
+    return float(largest * result.K[0, 0] / min(result.image.shape[:2]))

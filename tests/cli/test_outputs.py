@@ -1,0 +1,172 @@
+"""What ``dopepp predict`` writes, to the end or until something ends it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.data.formats.bop.results import read_results
+from dopepp.inference.sources.video import Video
+from dopepp.parts.catalogue import pivconnector
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    from dopepp.virtual import PRESETS, Factory
+
+    return Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
+
+
+@pytest.fixture(scope="module")
+def files(rendered, tmp_path_factory):
+    """A video of the part standing still, and a picture of it and one without it."""
+    folder = tmp_path_factory.mktemp("files")
+    writer = cv2.VideoWriter(
+        str(folder / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240)
+    )
+    for _ in range(FRAMES):
+        writer.write(rendered.image[..., ::-1])
+    writer.release()
+    cv2.imwrite(str(folder / "000007.jpg"), rendered.image[..., ::-1])
+    cv2.imwrite(str(folder / "000009.png"), np.full_like(rendered.image, 90))
+    np.savetxt(folder / "K.txt", rendered.scene.K)
+    return folder
+
+
+def predict(files: Path, *arguments: object) -> Result:
+    given = ["predict", "pretrained/pivconnector", *arguments, "--camera", files / "K.txt"]
+    return CliRunner().invoke(app, [str(one) for one in given])
+
+
+def frames(path: Path) -> int:
+    capture, count = cv2.VideoCapture(str(path)), 0
+    while capture.grab():
+        count += 1
+    return count
+
+
+def lines(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_everything_about_pictures_and_a_video(files, rendered, tmp_path):
+    out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
+    sources = (f"{files}/0*", files / "clip.avi")
+    done = predict(files, *sources, "--save", out, "--json", poses, "--csv", csv, "--stride", 2)
+    assert done.exit_code == 0, done.output
+    assert sorted(one.name for one in out.iterdir()) == ["000007.jpg", "clip.mp4"]
+    assert frames(out / "clip.mp4") == 3
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
+    found = lines(poses)
+    assert [one["number"] for one in found] == [7, 0, 2, 4]
+    assert [one["time"] for one in found] == [None, 0, pytest.approx(0.2), pytest.approx(0.4)]
+    for one in found:
+        assert "x right, y down, z forward" in one["frame"]
+        T = np.array(one["detections"][0]["T_cam_obj"])
+        assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 0.02
+    rows = read_results(csv, [1])
+    assert [(one.scene_id, one.im_id) for one in rows] == [(0, 7), (1, 0), (1, 2), (1, 4)]
+    for row, one in zip(rows, found, strict=True):
+        np.testing.assert_allclose(row.T_cam_obj, one["detections"][0]["T_cam_obj"], atol=1e-9)
+    assert len(done.stdout.splitlines()) == 4
+    told = done.stderr.splitlines()
+    assert len(told) == 4
+    assert all("speed: pre " in one and one.endswith(" ms") for one in told)
+    assert told[1].startswith("1/3 clip.avi: 1 pose; ")
+
+
+def test_a_picture_without_the_part_is_a_line_of_its_own(files, tmp_path):
+    done = predict(
+        files, files / "000009.png", "--json", tmp_path / "poses.jsonl", "--csv", tmp_path / "p.csv"
+    )
+    assert (done.exit_code, done.stdout) == (0, "")
+    assert done.stderr.startswith("nothing found: pivconnector: ")
+    assert lines(tmp_path / "poses.jsonl")[0]["detections"] == []
+    assert (tmp_path / "p.csv").read_text() == "scene_id,im_id,obj_id,score,R,t,time\n"
+    done = predict(files, files / "000007.jpg", "--conf", "1")
+    assert done.stderr.startswith("nothing found: no score of 1; ")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_leaves_what_was_written(files, tmp_path, monkeypatch, number, code):
+    whole = Video.frames
+
+    def interrupted(self, stride):
+        yield from islice(whole(self, stride), 3)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Video, "frames", interrupted)
+    out, poses, csv = tmp_path / "out", tmp_path / "poses.jsonl", tmp_path / "poses.csv"
+    done = predict(files, files / "clip.avi", "--save", out, "--json", poses, "--csv", csv)
+    assert done.exit_code == code, done.output
+    assert done.stderr.splitlines()[-1] == "interrupted; what was written is complete"
+    assert frames(out / "clip.mp4") == 3
+    assert len(lines(poses)) == len(read_results(csv, [1])) == 3
+    assert sorted(one.name for one in tmp_path.rglob("*")) == [
+        "clip.mp4", "out", "poses.csv", "poses.jsonl",
+    ]  # fmt: skip
+
+
+def test_a_full_disk_is_one_line_and_code_1(files, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=0))
+    poses = tmp_path / "poses.jsonl"
+    done = predict(files, files / "clip.avi", "--save", tmp_path / "out", "--json", poses)
+    assert done.exit_code == 1
+    assert done.stderr.splitlines()[-1].startswith(f"no space left for {tmp_path}/out/clip.mp4")
+    monkeypatch.undo()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("dopepp.core.files.Path.write_bytes", full)
+    done = predict(files, files / "000007.jpg", "--save", tmp_path / "out", "--json", poses)
+    assert done.exit_code == 1
+    assert done.stderr.splitlines()[-1] == f"no space left for {tmp_path}/out: free some"
+    assert poses.exists()
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_pictures_are_not_overwritten_by_their_overlays(files):
+    before = (files / "000007.jpg").read_bytes()
+    done = predict(files, files / "000007.jpg", "--save", files)
+    assert done.exit_code == 2
+    assert "the folder of" in done.stderr.splitlines()[-1]
+    assert (files / "000007.jpg").read_bytes() == before
+
+
+def test_names_that_come_twice_are_both_kept(files, tmp_path):
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "000007.jpg").write_bytes((files / "000007.jpg").read_bytes())
+    done = predict(files, files / "000007.jpg", tmp_path / "b", "--save", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_a_folder_stops_at_a_damaged_picture_with_what_was_written(files, tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "1.jpg").write_bytes((files / "000007.jpg").read_bytes())
+    (tmp_path / "in" / "2.jpg").write_bytes((files / "000007.jpg").read_bytes()[:900])
+    done = predict(files, tmp_path / "in", "--json", tmp_path / "poses.jsonl")
+    assert done.exit_code == 2
+    assert "2.jpg" in done.stderr.splitlines()[-1]
+    assert len(lines(tmp_path / "poses.jsonl")) == 1
+
+
+def test_a_camera_that_is_not_there(files):
+    done = predict(files, 97)
+    assert done.exit_code == 2
+    assert done.stderr.startswith("got camera 97, which does not open")

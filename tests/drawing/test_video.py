@@ -1,0 +1,77 @@
+"""Videos that are written: every picture at its time, playable however the writing ends."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import RunError
+from dopepp.drawing.video import VideoFile
+
+
+def frames(path) -> list[np.ndarray]:
+    capture, found = cv2.VideoCapture(str(path)), []
+    while (one := capture.read())[0]:
+        found.append(one[1][..., ::-1])
+    return found
+
+
+def level(number: int, size: tuple[int, int] = (48, 32)) -> np.ndarray:
+    return np.full((*size[::-1], 3), 20 * number, np.uint8)
+
+
+def test_pictures_stand_at_their_times(tmp_path):
+    with VideoFile(tmp_path / "new" / "clip.mp4", 10) as video:
+        for number, time in enumerate((7.0, 7.1, 7.4, 7.41, 99.0)):
+            video.write(level(number), time)
+        assert not video.path.exists()
+    shown = [round(one.mean() / 20) for one in frames(video.path)]
+    # The third comes late and stands for what it missed; the fourth has no place of its own; the
+    # last stands for two seconds of the minute and a half before it.
+    assert shown == [0, 1, 2, 2, 2, *[4] * 20]
+    assert [one.name for one in video.path.parent.iterdir()] == ["clip.mp4"]
+
+
+@pytest.mark.parametrize("size", [(47, 31), (48, 31)])
+def test_odd_sides_lose_nothing(tmp_path, size):
+    picture = level(2, size)
+    picture[:, -1] = picture[-1] = 240
+    with VideoFile(tmp_path / "clip.mp4", 10) as video:
+        video.write(picture, 0)
+    (shown,) = frames(video.path)
+    assert shown.shape == (32, 48, 3)
+    assert shown[size[1] - 1 :].mean() > 200
+
+
+def test_it_is_playable_after_an_interruption(tmp_path):
+    def interrupted() -> None:
+        with VideoFile(tmp_path / "clip.mp4", 10) as video:
+            for number in range(3):
+                video.write(level(number), number / 10)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert len(frames(tmp_path / "clip.mp4")) == 3
+
+
+def test_a_full_disk_ends_it_in_one_line(tmp_path, monkeypatch):
+    video = VideoFile(tmp_path / "a.mp4", 10)
+    video.write(level(0), 0)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(RunError, match="no space left"):
+        video.write(level(1), 0.1)
+    video.close()
+    assert len(frames(video.path)) == 1
+
+
+def test_what_did_not_arrive_is_told(tmp_path):
+    video = VideoFile(tmp_path / "a.mp4", 10)
+    for number in range(30):
+        video.write(np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8), number)
+    video._written += 5
+    with pytest.raises(RunError, match="disk full"):
+        video.close()

@@ -1,0 +1,191 @@
+"""ROS recordings, as ``rosbags`` writes them: every picture in RGB, and the camera that took it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.inference.sources import open_sources
+
+pytest.importorskip("rosbags")
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+K = [600.0, 0, 31.5, 0, 601.0, 23.5, 0, 0, 1]
+P = [500.0, 0, 31.5, 0, 0, 501.0, 23.5, 0, 0, 0, 1, 0]
+LENS = [-0.2, 0.1, 0.001, 0.002, 0.0]
+PICTURE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+
+
+class Recording:
+    """Messages of ROS 1 or 2 on topics, written to a file or folder."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self._is_ros1 = kind == "bag"
+        self.path = folder / {"bag": "run.bag"}.get(kind, "run")
+        self._store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
+        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
+        self._writer: Any = (
+            rosbag1.Writer(self.path) if self._is_ros1
+            else rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
+        )  # fmt: skip
+        self._topics: dict[str, Any] = {}
+
+    def __enter__(self) -> Recording:
+        self._writer.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    def write(self, topic: str, kind: str, second: int, **fields: Any) -> None:
+        name, types = f"sensor_msgs/msg/{kind}", self._store.types
+        stamp = types["builtin_interfaces/msg/Time"](second, 500_000_000)
+        counted = {"seq": second} if self._is_ros1 else {}
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="optical", **counted)
+        message = types[name](header=header, **fields)
+        if topic not in self._topics:
+            self._topics[topic] = self._writer.add_connection(topic, name, typestore=self._store)
+        encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
+        self._writer.write(self._topics[topic], second * 10**9, encode(message, name))
+
+    def picture(self, topic: str, encoding: str, data: np.ndarray, second: int = 1) -> None:
+        rows = np.pad(data.reshape(len(data), -1), ((0, 0), (0, 3)))  # rows may be padded
+        self.write(
+            topic, "Image", second, height=data.shape[0], width=data.shape[1], encoding=encoding,
+            is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
+        )  # fmt: skip
+
+    def camera(self, topic: str, **changes: Any) -> None:
+        large = {"k": K, "d": LENS, "p": P, "r": np.eye(3).ravel().tolist()}
+        names = {name: name.upper() if self._is_ros1 else name for name in large}
+        roi = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        arrays = {names[one]: np.array(value, np.float64) for one, value in large.items()}
+        fixed = {"height": 48, "width": 64, "distortion_model": "plumb_bob"}
+        self.write(topic, "CameraInfo", 1, binning_x=0, binning_y=0, roi=roi,
+                   **(fixed | arrays | changes))  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "sqlite3"])
+def test_pictures_times_and_camera_of_a_recording(kind, tmp_path):
+    with Recording(kind, tmp_path) as bag:
+        bag.camera("/cam/camera_info")
+        bag.camera("/other/camera_info", width=640)
+        for second in (1, 2, 3):
+            bag.picture("/cam/image_raw", "bgr8", PICTURE[..., ::-1] // second, second)
+    paths = [bag.path] if kind == "bag" else [bag.path, next(bag.path.glob("run*.*3")
+             if kind == "sqlite3" else bag.path.glob("*.mcap"))]  # fmt: skip
+    for path in paths:
+        (source,) = open_sources([path])
+        frames = list(source.frames())
+        assert [one.time for one in frames] == [1.5, 2.5, 3.5]
+        for second, one in enumerate(frames, 1):
+            np.testing.assert_array_equal(one.image, PICTURE // second)
+        assert (source.count, source.rate) == (3, pytest.approx(1, abs=1e-6))
+        assert source.camera.size == (64, 48)
+        np.testing.assert_allclose(source.camera.K.ravel(), K)
+        assert source.camera.distortion == pytest.approx(tuple(LENS))
+        assert [one.number for one in source.frames(stride=2)] == [0, 2]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "rgba8", "bgra8", "mono8", "8UC3", "bayer_rggb8",
+                                      "yuv422_yuy2", "png", "jpeg"])  # fmt: skip
+def test_every_encoding_is_rgb(encoding, tmp_path):
+    smooth = cv2.resize(PICTURE[:6, :8], (64, 48), interpolation=cv2.INTER_CUBIC)
+    expected, tolerance = smooth, 0.0
+    with Recording("mcap", tmp_path) as bag:
+        if encoding in ("png", "jpeg"):
+            coded = cv2.imencode(f".{encoding}", smooth[..., ::-1])[1].ravel()
+            bag.write(
+                "/cam/image_raw/compressed", "CompressedImage", 1, format=encoding, data=coded
+            )
+            bag.camera("/cam/camera_info")
+            tolerance = 0.0 if encoding == "png" else 6.0
+        else:
+            data, expected, tolerance = coded_as(encoding, smooth)
+            bag.picture("/cam/image_raw", encoding, data)
+    (source,) = open_sources([bag.path])
+    (frame,) = source.frames()
+    assert np.abs(frame.image.astype(float) - expected).mean() <= tolerance
+    assert (source.camera is not None) == (encoding in ("png", "jpeg"))
+
+
+def coded_as(encoding: str, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return a picture's bytes, what they show, and how far off a decoder may be on average."""
+    if encoding == "mono8":
+        grey = rgb[..., 1]
+        return grey[..., None], np.repeat(grey[..., None], 3, 2), 0.0
+    if encoding == "bayer_rggb8":
+        mosaic = rgb[..., 1].copy()
+        mosaic[::2, ::2], mosaic[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
+        return mosaic[..., None], rgb, 12.0
+    if encoding == "yuv422_yuy2":
+        yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV)
+        data = np.stack([yuv[..., 0], yuv[..., 1]], axis=-1)
+        data[:, 1::2, 1] = yuv[:, ::2, 2]
+        return data, rgb, 15.0
+    alpha = np.full((*rgb.shape[:2], 1), 9, np.uint8)
+    return {
+        "rgb8": rgb, "8UC3": rgb[..., ::-1], "rgba8": np.dstack([rgb, alpha]),
+        "bgra8": np.dstack([rgb[..., ::-1], alpha]),
+    }[encoding], rgb, 0.0  # fmt: skip
+
+
+def test_rectified_pictures_have_the_lens_of_p(tmp_path):
+    with Recording("mcap", tmp_path) as bag:
+        bag.camera("/cam/camera_info")
+        bag.picture("/cam/image_rect_color", "rgb8", PICTURE)
+    (source,) = open_sources([bag.path])
+    assert source.camera.K[0, 0] == 500
+    assert source.camera.distortion == ()
+
+
+def test_several_topics_must_be_named(tmp_path):
+    with Recording("bag", tmp_path) as bag:
+        bag.picture("/left/image_raw", "rgb8", PICTURE)
+        bag.picture("/right/image_raw", "rgb8", PICTURE // 2)
+        bag.camera("/right/camera_info")
+    (source,) = open_sources([bag.path], "/right/image_raw")
+    np.testing.assert_array_equal(next(source.frames()).image, PICTURE // 2)
+    assert source.camera is not None
+    (left,) = open_sources([bag.path], "/left/image_raw")
+    assert left.camera is None  # the other's would be a guess
+    for topic, said in ((None, "on 2 topics"), ("/nowhere", "without pictures on /nowhere")):
+        with pytest.raises(UserError, match=said) as raised:
+            open_sources([bag.path], topic)
+        assert "/left/image_raw, /right/image_raw" in str(raised.value)
+
+
+def test_damaged_recordings_are_told_in_one_line(tmp_path):
+    with Recording("mcap", tmp_path) as bag:
+        bag.picture("/cam/image_raw", "mono16", PICTURE[..., :2])
+        bag.picture("/odd/image_raw", "rgb8", PICTURE)
+        bag.camera("/cam/camera_info", distortion_model="equidistant")
+    (source,) = open_sources([bag.path], "/cam/image_raw")
+    with pytest.raises(UserError, match="encoding 'mono16'"):
+        list(source.frames())
+    with pytest.raises(UserError, match="equidistant"):
+        _ = source.camera
+    whole = next(bag.path.glob("*.mcap")).read_bytes()
+    contents = {"a.mcap": b"", "b.mcap": b"\x89MCAP0\r\n" * 30, "c.mcap": whole[:300],
+                "d.bag": b"#ROSBAG V2.0\n", "e.db3": b"SQLite format 3\0" * 9}  # fmt: skip
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match=f"{name}.*allowed.*fix"):
+            list(open_sources([tmp_path / name], "/odd/image_raw")[0].frames())
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "metadata.yaml").write_text("!!python/object/apply:os.system [ls]")
+    with pytest.raises(UserError, match="folder"):
+        open_sources([tmp_path / "folder"])
+
+
+def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
+    (tmp_path / "run.mcap").touch()
+    with pytest.raises(UserError, match=r"dopepp\[bags\]"):
+        open_sources([tmp_path / "run.mcap"])

@@ -1,0 +1,156 @@
+"""Pictures, folders, patterns and videos: all frames, in order, or one line that names the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from dopepp.core.errors import UserError
+from dopepp.inference.sources import open_sources
+
+
+def grey(level: int, size: tuple[int, int] = (32, 24)) -> np.ndarray:
+    return np.full((*size[::-1], 3), level, np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for number in (0, 2, 10):
+        cv2.imwrite(str(tmp_path / f"frame{number}.png"), grey(20 * number))
+    (tmp_path / "notes.txt").write_text("no picture")
+    return tmp_path
+
+
+@pytest.fixture
+def clip(tmp_path):
+    path = tmp_path / "clip.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (32, 24))
+    for number in range(12):
+        writer.write(grey(20 * number))
+    writer.release()
+    return path
+
+
+def levels(*given: object, stride: int = 1) -> list[int]:
+    frames = [one for source in open_sources(given) for one in source.frames(stride)]
+    return [round(float(one.image.mean()) / 20) for one in frames]
+
+
+def test_a_folder_a_pattern_and_the_shells_list_are_one_sequence(folder):
+    assert levels(folder) == levels(f"{folder}/*.png") == [0, 2, 10]
+    assert levels(*sorted(folder.glob("*.png"))) == [0, 10, 2]  # the shell's order
+    assert len(open_sources(sorted(folder.glob("*.png")))) == 1
+    assert levels(folder, stride=2) == [0, 10]
+    (source,) = open_sources([str(folder)])
+    assert [Path(one.name).name for one in source.frames()] == [
+        "frame0.png", "frame2.png", "frame10.png",
+    ]  # fmt: skip
+    assert [one.number for one in source.frames()] == [0, 1, 2]
+    assert (source.count, source.rate) == (3, None)
+
+
+def test_pictures_named_by_numbers_have_these(folder):
+    for name in ("000007", "000012"):
+        (folder / "frame0.png").with_stem(name).write_bytes((folder / "frame0.png").read_bytes())
+    (source,) = open_sources([f"{folder}/0*.png"])
+    assert [one.number for one in source.frames()] == [7, 12]
+
+
+def test_a_video_has_numbers_and_times(clip):
+    (source,) = open_sources([clip])
+    assert (source.count, source.rate) == (12, 10)
+    assert levels(clip) == list(range(12))
+    frames = list(source.frames(stride=5))
+    assert [one.number for one in frames] == [0, 5, 10]
+    assert [one.time for one in frames] == pytest.approx([0, 0.5, 1])
+    assert levels(clip, stride=5) == [0, 5, 10]
+
+
+def test_sources_of_several_kinds_keep_their_order(folder, clip):
+    assert levels(folder, clip, folder / "frame2.png") == [0, 2, 10, *range(12), 2]
+
+
+def test_colours_stay_in_their_channels(tmp_path):
+    red = np.zeros((24, 32, 3), np.uint8)
+    red[..., 2] = 200
+    writer = cv2.VideoWriter(
+        str(tmp_path / "red.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (32, 24)
+    )
+    writer.write(red)
+    writer.release()
+    (source,) = open_sources([tmp_path / "red.avi"])
+    (frame,) = source.frames()
+    assert frame.image[..., 0].mean() > 180 > 30 > frame.image[..., 1:].mean()
+
+
+@pytest.mark.parametrize("mode", ["L", "I;16", "RGBA", "CMYK", "P"])
+def test_pictures_of_any_mode_are_rgb(tmp_path, mode):
+    levels = np.arange(64 * 48).reshape(48, 64) % 200
+    image = Image.fromarray(levels.astype(np.uint8)).convert("RGB")
+    if mode == "I;16":
+        image = Image.fromarray((257 * levels).astype(np.uint16))
+    elif mode == "P":
+        image = image.quantize(200)
+    else:
+        image = image.convert(mode)
+    path = tmp_path / ("picture.tif" if mode in ("CMYK", "I;16") else "picture.png")
+    image.save(path)
+    (source,) = open_sources([path])
+    (frame,) = source.frames()
+    assert frame.image.shape == (48, 64, 3)
+    assert frame.image.dtype == np.uint8
+    assert np.abs(frame.image.mean(axis=2) - levels).max() <= 2
+
+
+def test_a_turned_picture_is_upright(tmp_path):
+    picture = Image.fromarray(grey(0, (64, 48)))
+    exif = Image.Exif()
+    exif[274] = 6
+    picture.save(tmp_path / "turned.jpg", exif=exif)
+    (source,) = open_sources([tmp_path / "turned.jpg"])
+    (frame,) = source.frames()
+    assert frame.image.shape == (64, 48, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.png", None, "none.png, no such"),
+        ("*.png", None, "matches no file"),
+        ("rtmp://u:secret@host/x", None, "address rtmp://host/x"),
+        (".", None, "without a picture"),
+        ("empty.mp4", b"", "an empty file"),
+        ("noise.mp4", b"\x01\x02" * 500, "does not begin like a video"),
+        ("list.mp4", b"#EXTM3U\nfile:///etc/passwd\n", "does not begin like a video"),
+        ("cut.mp4", b"\0\0\0\x20ftypisom" + b"\0" * 400, "damaged or cut short"),
+        ("empty.png", b"", "an empty file"),
+        ("text.jpg", b"hello", "cannot identify"),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_line(
+    tmp_path, name, content, message, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        Path(name).write_bytes(content)
+    with pytest.raises(UserError, match=r"got .*allowed.*fix") as raised:
+        levels(name)
+    assert message in str(raised.value)
+    assert "secret" not in str(raised.value)
+    assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg says anything of its own
+
+
+def test_a_video_that_is_cut_short_gives_what_there_is_and_says_so(tmp_path, caplog, capfd):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for number in range(12):
+        writer.write(np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8))
+    writer.release()
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    (source,) = open_sources([path])
+    assert 0 < len(list(source.frames())) < 12
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,129 @@
+"""Cameras: the newest picture each time, whatever OpenCV and the driver have kept."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import RunError, UserError
+from dopepp.inference.sources.live import Live
+
+PERIOD = 1 / 30
+INFERENCE = 0.2
+
+
+class Camera:
+    """Thirty pictures a second by a clock of its own; what nobody has read waits in a buffer."""
+
+    def __init__(self) -> None:
+        self._buffer: queue.Queue[int] = queue.Queue()
+        self._now, self._made, self._reading = 0.0, 0, False
+        self.released = threading.Event()
+
+    def now(self) -> float:
+        return self._now
+
+    def taken(self, image: np.ndarray) -> float:
+        """Return when a picture was taken, which is written on it."""
+        return (int(image[0, 0, 0]) + 256 * int(image[0, 0, 1])) * PERIOD
+
+    def advance(self, seconds: float, wait: bool = True) -> None:
+        """Let time pass, and with ``wait`` whoever reads come to a rest."""
+        self._now += seconds
+        while self._made * PERIOD <= self._now:
+            self._buffer.put(self._made)
+            self._made += 1
+        if wait:
+            self._buffer.join()
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def get(self, _: int) -> float:
+        return 1 / PERIOD
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        if self._reading:
+            self._buffer.task_done()
+        self._reading = False
+        try:
+            number = self._buffer.get(timeout=0.2)
+        except queue.Empty:
+            return False, None
+        self._reading = True
+        return True, np.full((2, 2, 3), (0, number // 256, number % 256), np.uint8)
+
+    def release(self) -> None:
+        self.released.set()
+
+
+def test_a_slow_reader_sees_the_present():
+    """A minute of a camera and of inference that takes six of its periods."""
+    camera = Camera()
+    camera.advance(0, wait=False)
+    source = Live(0, lambda _: camera, camera.now)
+    ages, frames = [], source.frames()
+    for frame in islice(frames, 300):
+        camera.advance(INFERENCE)
+        ages.append(camera.now() - camera.taken(frame.image))
+    assert camera.now() > 59
+    assert max(ages) < 2 * INFERENCE
+    frames.close()
+    assert camera.released.wait(5)
+    assert source.rate == pytest.approx(30)
+
+
+def test_the_same_camera_read_in_turn_falls_behind():
+    camera = Camera()
+    for _ in range(300):
+        camera.advance(INFERENCE, wait=False)
+        _, image = camera.read()
+    assert camera.now() - camera.taken(image[..., ::-1]) > 40
+
+
+def test_frames_tell_when_they_came():
+    camera = Camera()
+    camera.advance(0, wait=False)
+    times = []
+    for frame in islice(Live(0, lambda _: camera, camera.now).frames(), 3):
+        times.append(frame.time)
+        camera.advance(1.0)
+    assert times == pytest.approx([0, 1, 2])
+
+
+class Dead(Camera):
+    """Delivers ``alive`` pictures and then nothing, or never answers."""
+
+    def __init__(self, alive: int, hangs: bool) -> None:
+        super().__init__()
+        self._alive, self._hangs = alive, hangs
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self._alive -= 1
+        if self._alive >= 0:
+            return True, np.zeros((2, 2, 3), np.uint8)
+        if self._hangs:
+            threading.Event().wait()
+        return False, None
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+@pytest.mark.parametrize(("alive", "said"), [(0, "since it was opened"), (1, "no picture for")])
+def test_a_camera_that_delivers_no_more_is_told(hangs, alive, said):
+    source = Live(3, lambda _: Dead(alive, hangs), first_s=0.2, stalled_s=0.2)
+    with pytest.raises(RunError, match=said) as raised:
+        list(source.frames())
+    assert str(raised.value).startswith("camera 3: no picture for 0.2 s")
+
+
+def test_what_does_not_open_is_one_line_without_the_password(capfd):
+    for address, name in ((97, "camera 97"), ("rtsp://me:secret@127.0.0.1:9/x", "127.0.0.1:9")):
+        with pytest.raises(UserError, match=name) as raised:
+            next(Live(address).frames())
+        assert "secret" not in str(raised.value)
+    assert Live("rtsp://me:secret@127.0.0.1:9/x").stem == "rtsp_127.0.0.1_9_x"
+    assert capfd.readouterr().err == ""

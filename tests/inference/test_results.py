@@ -1,0 +1,137 @@
+"""PoseResult: what is drawn lies where the part is, and what is handed on says all."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
+from dopepp.inference.overlay import COLOURS, make_shape, silhouette
+from dopepp.inference.results import PoseResult
+from dopepp.parts.catalogue import pivconnector
+from dopepp.recovery.detection import Detection
+
+PART = pivconnector()
+SHAPES = {PART.name: make_shape(PART)}
+K = camera_matrix(560, 560, 319.5, 239.5)
+FRAME = "camera, OpenCV: x right, y down, z forward; metres"
+
+
+def detection(T: np.ndarray, score: float = 0.9) -> Detection:
+    keypoints = project_keypoints(PART.cuboid, T, K)
+    return Detection(PART.name, score, score, T, keypoints, keypoints, 0.5, np.eye(6) * 1e-6)
+
+
+def pose(x: float = 0.0, z: float = 0.3, turn: float = 0.5) -> np.ndarray:
+    return make_transform(Rotation.from_rotvec([turn, 0.3, 0.2]).as_matrix(), np.array([x, 0, z]))
+
+
+def result(*poses: np.ndarray, size: tuple[int, int] = (640, 480), **fields: object) -> PoseResult:
+    image = np.full((*size[::-1], 3), 128, np.uint8)
+    speed = {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
+    found = [detection(one, 0.9 - 0.1 * number) for number, one in enumerate(poses)]
+    given = {"name": "a.png", "shapes": SHAPES} | fields
+    return PoseResult(image, K, found, speed, **given)
+
+
+@pytest.mark.parametrize("image", range(4))
+def test_the_silhouette_is_the_renderers(image):
+    from dopepp.virtual import PRESETS, Factory
+
+    rendered = Factory([PART], PRESETS["quickstart"].reframed(320, 240), 5).render(0, image)
+    target = rendered.scene.targets[0]
+    T, picture = rendered.scene.objects[target].T_cam_obj, np.zeros_like(rendered.image)
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    cv2.drawContours(mask, silhouette(SHAPES[PART.name], T, rendered.scene.K, picture), -1, 1, -1)
+    truth = rendered.instances == target
+    assert (mask.astype(bool) & truth).sum() / (mask.astype(bool) | truth).sum() > 0.97
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 4.0])
+def test_lines_and_text_grow_with_the_picture(factor):
+    """The same scene in another size is the same drawing, of any size that is not enlarged."""
+    width, height = round(640 * factor), round(480 * factor)
+    own_K = K.copy()
+    own_K[:2] *= factor
+    small = result(pose(), pose(0.06))
+    large = replace(
+        small, image=np.full((height, width, 3), 128, np.uint8), K=own_K,
+        detections=[replace(one, keypoints=one.keypoints * factor) for one in small.detections],
+    )  # fmt: skip
+    drawn, expected = large.plot(), small.plot()
+    assert drawn.shape[1] >= 640
+    shrunk = cv2.resize(drawn, (640, 480), interpolation=cv2.INTER_AREA)
+    touched, own = ((np.abs(one - 128.0) > 40).any(axis=2) for one in (expected, shrunk))
+    near = [cv2.dilate(one.astype(np.uint8), np.ones((9, 9))) > 0 for one in (touched, own)]
+    assert (touched & near[1]).sum() > 0.9 * touched.sum()
+    assert (own & near[0]).sum() > 0.9 * own.sum()
+    assert own.sum() == pytest.approx(touched.sum(), rel=0.5)
+
+
+def test_neighbours_have_their_own_colours_and_nothing_is_drawn_far_away():
+    drawn = result(pose(-0.03), pose(0.03)).plot()
+    for colour in COLOURS[:2]:
+        assert (np.abs(drawn.astype(int) - colour).sum(axis=2) < 12).sum() > 200
+    assert (drawn[:60] == 128).all()
+    assert (drawn[-60:] == 128).all()
+
+
+def test_no_pose_is_too_odd_to_be_drawn():
+    behind, through = pose(z=-0.3), pose(z=0.01)
+    aside, far = pose(x=5.0), pose(z=90.0)
+    drawn = result(behind, through, aside, far, size=(40, 30)).plot()
+    assert drawn.shape == (480, 640, 3)
+    bare = result(pose(), shapes={})
+    assert (bare.plot() != 128).any()
+
+
+def test_a_picture_is_saved_as_its_suffix_says(tmp_path):
+    for name in ("a.png", "new/b.JPG"):
+        result(pose()).save(tmp_path / name)
+        assert cv2.imread(str(tmp_path / name)).shape == (480, 640, 3)
+    with pytest.raises(UserError, match=r"\.png, \.jpg"):
+        result(pose()).save(tmp_path / "a.gif")
+
+
+def test_json_names_frame_units_and_what_is_no_number():
+    whole = json.loads(result(pose(), pose(0.1), time=0.4, number=7, identities=[3, 5]).to_json())
+    assert (whole["image"], whole["number"], whole["time"], whole["frame"]) == (
+        "a.png", 7, 0.4, FRAME,
+    )  # fmt: skip
+    np.testing.assert_allclose(whole["K"], K)
+    assert whole["speed_ms"] == {"pre": 1.0, "network": 2.0, "decode": 3.0, "refine": 0.0}
+    assert [one["identity"] for one in whole["detections"]] == [3, 5]
+    np.testing.assert_allclose(whole["detections"][1]["T_cam_obj"], pose(0.1))
+    assert np.shape(whole["detections"][0]["covariance"]) == (6, 6)
+    behind = json.loads(result(pose(z=-0.3)).to_json())["detections"][0]
+    assert behind["keypoints"][0] == [None, None]
+    assert json.loads(result().to_json())["detections"] == []
+    (line,) = result(pose()).records()
+    assert (line["image"], line["frame"], line["object"]) == ("a.png", FRAME, PART.name)
+    assert "time" not in line
+    assert "identity" not in line
+
+
+def test_the_table_is_the_poses():
+    pytest.importorskip("pandas")
+    table = result(pose(), pose(0.1, turn=2.0)).to_dataframe()
+    turns = Rotation.from_quat(table[["qw", "qx", "qy", "qz"]].to_numpy(), scalar_first=True)
+    for row, T in zip(turns.as_matrix(), (pose(), pose(0.1, turn=2.0)), strict=True):
+        np.testing.assert_allclose(row, T[:3, :3], atol=1e-12)
+    assert table[["x", "y", "z"]].to_numpy().tolist() == [[0, 0, 0.3], [0.1, 0, 0.3]]
+    assert table["frame"].unique().tolist() == [FRAME]
+    assert list(table.columns) == list(result().to_dataframe().columns)
+    assert math.isclose(table["score"][1], 0.8)
+
+
+def test_without_pandas_it_is_named(monkeypatch):
+    monkeypatch.setattr("dopepp.inference.results.find_spec", lambda _: None)
+    with pytest.raises(UserError, match="pip install pandas, or use to_json"):
+        result(pose()).to_dataframe()

@@ -1,0 +1,91 @@
+"""``estimator.stream``: what ``predict`` gives, from any source, with where the time went."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp import PoseEstimator
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera_file import Camera
+from dopepp.parts.catalogue import pivconnector
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    from dopepp.virtual import PRESETS, Factory
+
+    return Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
+
+
+@pytest.fixture(scope="module")
+def K(rendered):  # noqa: N802
+    return rendered.scene.K
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return PoseEstimator.load("pretrained/pivconnector", refine="region")
+
+
+@pytest.fixture(scope="module")
+def clip(rendered, tmp_path_factory):
+    path = tmp_path_factory.mktemp("clip") / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (320, 240))
+    for shift in range(4):
+        writer.write(np.roll(rendered.image[..., ::-1], shift, axis=1))
+    writer.release()
+    return path
+
+
+def test_a_picture_gives_what_predict_gives(estimator, rendered, K, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), rendered.image[..., ::-1])
+    (expected,) = estimator.predict(rendered.image, K)
+    (result,) = estimator.stream(tmp_path / "a.png", K)
+    np.testing.assert_array_equal(result.image, rendered.image)
+    np.testing.assert_allclose(result.detections[0].T_cam_obj, expected.T_cam_obj)
+    assert result.name == str(tmp_path / "a.png")
+    assert (result.time, result.identities) == (None, None)
+    assert list(result.speed) == ["pre", "network", "decode", "refine"]
+    assert min(result.speed.values()) > 0
+    (none,) = estimator.stream(tmp_path / "a.png", K, least_score=1.0)
+    assert none.detections == []
+
+
+def test_a_lens_is_taken_out_first(estimator, rendered, K, tmp_path):
+    lens = np.array([-0.25, 0.1, 0.001, -0.002, 0.0])
+    pixels = np.stack(np.meshgrid(np.arange(320.0), np.arange(240.0)), -1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels, K, lens, P=K).reshape(240, 320, 2).astype(np.float32)
+    bent = cv2.remap(rendered.image, straight, None, cv2.INTER_LINEAR)
+    cv2.imwrite(str(tmp_path / "bent.png"), bent[..., ::-1])
+    camera = Camera((320, 240), K, tuple(lens), "test")
+    (result,) = estimator.stream(tmp_path / "bent.png", camera=camera)
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
+    assert np.linalg.norm(result.detections[0].T_cam_obj[:3, 3] - true[:3, 3]) < 0.002
+
+
+def test_a_video_is_followed(estimator, clip, K):
+    results = list(estimator.stream(clip, K, track=True))
+    assert [one.time for one in results] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert [list(one.identities) for one in results] == [[0]] * 4
+    moved = [one.detections[0].keypoints[-1, 0] for one in results]
+    assert 1 < moved[-1] - moved[0] < 4  # of three pixels; a tracker's first steps are careful
+    assert [one.number for one in estimator.stream(clip, K, stride=3)] == [0, 3]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "neither --K nor --camera"),
+        ({"K": np.eye(3), "camera": "cam.yaml"}, "--K and --camera"),
+        ({"K": np.eye(3)}, "field of view"),
+        ({"K": np.eye(3), "stride": 0}, "stride=0"),
+        ({"K": np.eye(3), "least_score": 2}, "least_score=2"),
+        ({"K": np.eye(3), "track": True, "roi": (0, 0, 9, 9)}, "--track alone"),
+        ({"K": np.eye(3), "depth": "d.png"}, "--depth with 4 pictures"),
+    ],
+)
+def test_what_cannot_be_is_refused(estimator, clip, options, message):
+    with pytest.raises(UserError, match=message):
+        list(estimator.stream(clip, **options))

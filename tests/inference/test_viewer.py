@@ -1,0 +1,78 @@
+"""The Rerun recording: it has what was seen and where it is, and is there whole or not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dopepp import PoseEstimator
+from dopepp.core.errors import UserError
+from dopepp.inference.overlay import make_shape
+from dopepp.inference.results import PoseResult
+from dopepp.inference.viewer import Viewer, belief_pictures
+from dopepp.parts.catalogue import pivconnector
+
+rerun = pytest.importorskip("rerun")
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return PoseEstimator.load("pretrained/pivconnector")
+
+
+@pytest.fixture(scope="module")
+def result(estimator):
+    from dopepp.virtual import PRESETS, Factory
+
+    one = Factory([pivconnector()], PRESETS["quickstart"].reframed(320, 240), 2).render(0, 9)
+    shapes = {part.name: make_shape(part) for part in estimator.parts}
+    found = estimator.predict(one.image, one.scene.K)
+    assert found
+    return PoseResult(one.image, one.scene.K, found, {}, "clip.mp4", 3, 0.3, shapes=shapes)
+
+
+def test_a_recording_has_everything(estimator, result, tmp_path):
+    path = tmp_path / "new" / "out.rrd"
+    with Viewer(estimator, path) as viewer:
+        viewer.take(result)
+        nothing = PoseResult(result.image, result.K, [], {}, "clip.mp4", 4, 0.4)
+        viewer.take(nothing)
+        assert not path.exists()
+    assert [one.name for one in path.parent.iterdir()] == ["out.rrd"]
+    chunks = rerun.chunk.RrdReader(path).stream().to_chunks()
+    logged = {chunk.entity_path for chunk in chunks}
+    name = "pivconnector_0"
+    assert logged >= {
+        "/world", "/world/camera", "/world/camera/picture", "/world/camera/outlines",
+        "/beliefs/pivconnector",
+        f"/world/parts/{name}", f"/world/parts/{name}/cuboid", f"/world/meshes/{name}",
+        f"/world/uncertainty/{name}",
+    }  # fmt: skip
+    assert {name for chunk in chunks for name in chunk.timeline_names} >= {"frame", "time"}
+
+
+def test_beliefs_peak_where_the_part_is(estimator, result):
+    (picture,) = belief_pictures(estimator, result).values()
+    hottest = np.array(np.unravel_index(picture.sum(axis=2).argmax(), picture.shape[:2]))[::-1]
+    scale = np.array(result.image.shape[1::-1]) / picture.shape[1::-1]
+    nearest = np.abs((hottest + 0.5) * scale - result.detections[0].keypoints).sum(axis=1).min()
+    assert nearest < 2 * scale.max()
+
+
+def test_a_place_that_cannot_be_is_refused(estimator, tmp_path):
+    with pytest.raises(UserError, match=r"\.rrd"):
+        Viewer(estimator, tmp_path / "out.mp4")
+
+
+def test_without_the_extra_it_is_named(estimator, tmp_path, monkeypatch):
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"dopepp\[rerun\]"):
+        Viewer(estimator, tmp_path / "out.rrd")
+
+
+def test_without_a_display_a_file_is_offered(estimator, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(UserError, match=r"--rerun FILE\.rrd"):
+        Viewer(estimator)
