@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from dopepp.virtual import PRESETS, Factory
 
 CELLS, STRIDE, REPEATS = 50, 8, 100
 IMAGES = 12
+NOISY = 60
 RELEASED = {"pivconnector": "quickstart", "pivconnector_wide": "wide", "servoholder": "quickstart"}
 K = camera_matrix(600, 600, 199.5, 199.5)
 CRACKER_BOX = cuboid_keypoints(
@@ -52,11 +54,30 @@ def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Ten
     return belief[0], field[0]
 
 
-def milliseconds(call: Callable[[], object]) -> float:
+def noisy(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Maps of one instance with noise, of right keypoints or of wrong ones."""
+    t = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.8, 1.2)])
+    T = make_transform(Rotation.random(random_state=rng).as_matrix(), t)
+    keypoints = project_keypoints(CRACKER_BOX, T, K)[None]
+    if wrong:
+        keypoints += rng.normal(0, 3, keypoints.shape)
+        keypoints[0, rng.integers(8)] += rng.uniform(-40, 40, 2)
+    index, cells = torch.zeros(1, 1, dtype=torch.long), (CELLS, CELLS)
+    maps = encode(torch.tensor(keypoints)[None], index, 1, cells, MapGeometry(STRIDE))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    noises = (0.005, 0.05) if wrong else (0.02, 0.05)
+    belief, field = (
+        one[0] + noise * torch.randn(one[0].shape, generator=generator)
+        for one, noise in zip(maps, noises, strict=True)
+    )
+    return belief, field
+
+
+def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> float:
     """Median over repeats, after two to warm up."""
     call(), call()
     times = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         start = time.process_time_ns()
         call()
         times.append(time.process_time_ns() - start)
@@ -74,6 +95,17 @@ def main() -> None:
     print("".join(f"{word:>11}" for word in head))
     for count in (1, 3, 10):
         print("".join(f"{value:>11}" for value in row(count, *scene(count, rng))))
+    print(
+        "\nOne instance: noise on its maps (belief 0.02, field 0.05), and keypoints that are wrong:"
+    )
+    print("each by 3 px (standard deviation), one by up to 40 px more; milliseconds")
+    print(f"{'':>16}{'median':>10}{'9 of 10':>10}")
+    for name, wrong in (("noisy maps", False), ("wrong keypoints", True)):
+        spent = [
+            milliseconds(partial(recover, *maps, CRACKER_BOX[None], K, STRIDE), repeats=3)
+            for maps in (noisy(rng, wrong) for _ in range(NOISY))
+        ]
+        print(f"{name:>16}{np.median(spent):10.2f}{np.quantile(spent, 0.9):10.2f}")
     print("\nTest images: on the network's own maps, and on true ones with the noise of job=cost")
     print(f"{'network':>20}{'own ms':>10}{'peaks':>8}{'noisy ms':>10}{'peaks':>8}")
     for name, preset in RELEASED.items():

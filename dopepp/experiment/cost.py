@@ -172,7 +172,9 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
         network_ms=1000 * float(np.median(frames.network_seconds)),
         recovery_ms=1000 * float(np.median(frames.recovery_seconds)),
         batch_size=config.cost.batch_size,
-        frames_per_s=_frames_per_s(network, config.cost.batch_size, description.input_size),
+        frames_per_s=_frames_per_s(
+            estimator.network, config.cost.batch_size, description.input_size
+        ),
     )
     record.write_config(run_dir, config.plain)
     record.write_json(run_dir / COST_FILE, asdict(cost))

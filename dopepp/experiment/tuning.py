@@ -23,6 +23,7 @@ from dopepp.data.transforms.shading import shade
 from dopepp.experiment.build import sources
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
+from dopepp.experiment.memory import Memory
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import add, add_s, expected_calibration_error
@@ -114,43 +115,41 @@ def tune(
 
     A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
     """
-    old, refiner = estimator.recovery, estimator.refiner
-    validation = sources.held_out_source(data, parts, "val")
-    test = sources.held_out_source(data, parts, "test")
-    empty = sources.build_source_without_objects(data, parts, "val", target.num_empty)
-    empty_test = sources.build_source_without_objects(data, parts, "test", target.num_empty)
-    rate = target.false_positive_rate
+    old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
+    estimator = memory.behind(estimator)
+    validation = memory.of(sources.held_out_source(data, parts, "val"))
+    test = memory.of(sources.held_out_source(data, parts, "test"))
+    count, rate = target.num_empty, target.false_positive_rate
+    empty = memory.of(sources.build_source_without_objects(data, parts, "val", count))
+    empty_test = memory.of(sources.build_source_without_objects(data, parts, "test", count))
 
     def scored(options: RecoveryOptions, source: Source) -> Scored:
         estimator.recovery = options
         return score_images(estimator, parts, source)
 
-    try:
-        estimator.refiner = None
-        # Every detection counts here, whatever its score.
-        heard = replace(old, min_score=0.0, covariance_factor=1.0)
-        before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
-        estimator.recovery = replace(heard, distance_factor=1.0)
-        factors = fit_factors(matched_poses(estimator, parts, validation))
-        heard = replace(heard, distance_factor=factors["distance_factor"])
-        chosen = choose(scored(heard, validation), scored(heard, empty), rate)
-        new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
-        threshold = new.min_score
-        heard = replace(new, min_score=0.0)
-        if refiner is not None:
-            estimator.refiner = refiner
-            # Features are of the network's score, which an earlier tuning's would hide.
-            candidate = min(new.min_score, calibration.CANDIDATE)
-            heard = replace(new.unrefined(), min_score=candidate)
-            shown = joined(scored(heard, validation), scored(heard, Hidden(validation)))
-            refined = choose(shown, scored(heard, empty), rate, refined=True)
-            chosen |= refined
-            threshold = refined.pop("refined_min_score")
-            heard = replace(new, **refined)  # type: ignore[arg-type]
-        after = _figures(scored(heard, test), scored(heard, empty_test), threshold)
-    finally:
-        estimator.recovery, estimator.refiner = old, refiner
-    return Tuning(factors | chosen, before, after, (len(test), target.num_empty))
+    estimator.refiner = None
+    # Every detection counts here, whatever its score.
+    heard = replace(old, min_score=0.0, covariance_factor=1.0)
+    before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
+    estimator.recovery = replace(heard, distance_factor=1.0)
+    factors = fit_factors(matched_poses(estimator, parts, validation))
+    heard = replace(heard, distance_factor=factors["distance_factor"])
+    chosen = choose(scored(heard, validation), scored(heard, empty), rate)
+    new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
+    threshold = new.min_score
+    heard = replace(new, min_score=0.0)
+    if refiner is not None:
+        estimator.refiner = refiner
+        # Features are of the network's score, which an earlier tuning's would hide.
+        candidate = min(new.min_score, calibration.CANDIDATE)
+        heard = replace(new.unrefined(), min_score=candidate)
+        shown = joined(scored(heard, validation), scored(heard, Hidden(validation)))
+        refined = choose(shown, scored(heard, empty), rate, refined=True)
+        chosen |= refined
+        threshold = refined.pop("refined_min_score")
+        heard = replace(new, **refined)  # type: ignore[arg-type]
+    after = _figures(scored(heard, test), scored(heard, empty_test), threshold)
+    return Tuning(factors | chosen, before, after, (len(test), count))
 
 
 def fit_factors(

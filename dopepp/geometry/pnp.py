@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
-from typing import Final
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
@@ -25,13 +27,12 @@ from dopepp.geometry.refine import (
     GATE,
     NO_GATE,
     Correspondences,
-    Poses,
     normal_equations,
-    refine,
     refine_pose,
     reproject,
+    turn,
 )
-from dopepp.geometry.rotation import Vector
+from dopepp.geometry.rotation import RotationMatrix, Vector
 
 MOST_LEFT_OUT: Final = 2
 """Outliers looked for by leaving points out; the robust cost bears more where these are mild."""
@@ -53,6 +54,12 @@ PLATE: Final = 0.3
 
 _NO_CAMERA: Final = np.eye(3)
 _UNIT: Final = np.eye(2)
+
+
+Solved: TypeAlias = tuple[
+    Transform | None, float, Bool[np.ndarray, "n"], str, Float[np.ndarray, "6 6"] | None
+]
+"""The attributes of a :class:`PnPResult`, of the points that can be used."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,7 @@ def solve_pnp(
     K: CameraMatrix,
     sigma_px: Float[np.ndarray, "n"] | float = 1.0,
     covariance_px: Float[np.ndarray, "n 2 2"] | None = None,
+    widenings: Sequence[float] = (1.0,),
 ) -> PnPResult:
     """Estimate a pose from point correspondences, tolerating missing and wild points.
 
@@ -94,6 +102,8 @@ def solve_pnp(
             deviation is not finite and positive is missing.
         covariance_px: Covariance of each pixel position, pixels²; where given it replaces
             ``sigma_px``. A point whose covariance is not finite and positive definite is missing.
+        widenings: Factors on the standard deviations, the least first, tried in turn until two
+            thirds of the points agree on a pose; of those tried, most points agree on the best.
 
     Returned is the pose with the smallest robust cost among the refined starts: SQPnP on all
     points, its mirror image for a plate and, where outliers show, SQPnP on all but one and all but
@@ -105,8 +115,9 @@ def solve_pnp(
         raise ValueError(
             f"got {len(object_points)} object points, {len(image_points)} image points"
         )
-    K = _checked_pinhole(K)
-    n = len(object_points)
+    K, n = np.ascontiguousarray(K, np.float64), len(object_points)
+    if not (K.shape == (3, 3) and _is_pinhole(K)):
+        raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
     if covariance_px is None:
         sigma = np.broadcast_to(np.asarray(sigma_px, np.float64), n)
         # NaN for what is no deviation; an infinite one has no finite square.
@@ -114,53 +125,58 @@ def solve_pnp(
             covariance_px = np.where(sigma > 0, sigma, np.nan)[:, None, None] ** 2 * _UNIT
     covariance_px = np.asarray(covariance_px, np.float64).reshape(n, 2, 2)
     rays, whitening, usable = _prepared(object_points, image_points, K, covariance_px)
-    result = _solve(object_points[usable], rays[usable], K[:2, :2], whitening[usable])
+    T, error, agree, reason, covariance = _solve(
+        object_points[usable], rays, K[:2, :2].copy(), whitening, widenings
+    )
     inliers = np.zeros(n, bool)
-    inliers[usable] = result.inliers
-    return replace(result, inliers=inliers)
+    inliers[usable] = agree
+    return PnPResult(T, error, inliers, reason, covariance)
 
 
 @compiled()
 def _prepared(
     object_points: Array, image_points: Array, K: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rays, whitenings and which points can be used.
+    """Return the rays and whitenings of the points that can be used, and which these are.
 
     A whitening is W with WᵀW = Σ⁻¹: the inverse of Cholesky's L with Σ = LLᵀ. Any number may come
     in and squares may overflow: what comes of it is looked at instead.
     """
-    n = len(object_points)
+    n, count = len(object_points), 0
     rays, whitening, usable = np.empty((n, 2)), np.zeros((n, 2, 2)), np.empty(n, np.bool_)
     determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
     for i in range(n):
         u, v = image_points[i, 0] - K[0, 2], image_points[i, 1] - K[1, 2]
-        rays[i, 0] = (K[1, 1] * u - K[0, 1] * v) / determinant
-        rays[i, 1] = (K[0, 0] * v - K[1, 0] * u) / determinant
+        x = (K[1, 1] * u - K[0, 1] * v) / determinant
+        y = (K[0, 0] * v - K[1, 0] * u) / determinant
         a, b, c = covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]
         first = math.sqrt(a) if a > 0.0 else math.nan
         rest = c - (b / first) ** 2
         second = math.sqrt(rest) if rest > 0.0 else math.nan
-        whitening[i, 0, 0] = 1.0 / first
-        whitening[i, 1, 0] = -b / (a * second)
-        whitening[i, 1, 1] = 1.0 / second
+        across = -b / (a * second)
         usable[i] = (
             np.isfinite(object_points[i]).all()
-            and np.abs(rays[i]).max() < MAX_TANGENT
-            and np.isfinite(whitening[i]).all()
-            and whitening[i, 0, 0] > 0.0
-            and whitening[i, 1, 1] > 0.0
+            and abs(x) < MAX_TANGENT
+            and abs(y) < MAX_TANGENT
+            and math.isfinite(across)
+            and 0.0 < 1.0 / first < math.inf
+            and 0.0 < 1.0 / second < math.inf
         )
-    return rays, whitening, usable
+        if usable[i]:
+            rays[count, 0], rays[count, 1] = x, y
+            whitening[count, 0, 0], whitening[count, 1, 0] = 1.0 / first, across
+            whitening[count, 1, 1] = 1.0 / second
+            count += 1
+    return rays[:count], whitening[:count], usable
 
 
-def _checked_pinhole(K: CameraMatrix) -> CameraMatrix:
-    K = np.asarray(K, np.float64)
-    proper = K.shape == (3, 3) and bool(np.isfinite(K).all()) and K[2].tolist() == [0, 0, 1]
-    with np.errstate(over="ignore", invalid="ignore"):
-        determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0] if proper else 0.0
-    if not (np.isfinite(determinant) and determinant != 0):
-        raise ValueError(f"K must be a finite, invertible pinhole matrix, got {K.tolist()}")
-    return K
+@compiled()
+def _is_pinhole(K: Array) -> bool:
+    """Tell a finite, invertible pinhole matrix."""
+    determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
+    last = K[2, 0] == 0.0 and K[2, 1] == 0.0 and K[2, 2] == 1.0
+    finite = np.isfinite(K).all() and math.isfinite(determinant)
+    return bool(last and finite and determinant != 0.0)
 
 
 def _solve(
@@ -168,30 +184,38 @@ def _solve(
     rays: Float[np.ndarray, "n 2"],
     to_px: Float[np.ndarray, "2 2"],
     whitening: Float[np.ndarray, "n 2 2"],
-) -> PnPResult:
+    widenings: Sequence[float],
+) -> Solved:
     """Solve for points that are all there; rays are their (x/z, y/z)."""
-    nothing = PnPResult(None, np.inf, np.zeros(len(rays), bool))
-    # The mean deviation over both directions: (det W)^(−1/2).
-    sigma = (whitening[:, 0, 0] * whitening[:, 1, 1]) ** -0.5
-    reason = degenerate(object_points, rays @ to_px.T, sigma)
+    nobody = np.zeros(len(rays), bool)
+    reason = degenerate(object_points, rays, to_px, whitening)
     if reason:
-        return replace(nothing, reason=reason)
+        return None, math.inf, nobody, reason, None
     centre = object_points.mean(0)
     size = math.hypot(*(object_points.max(0) - object_points.min(0)).tolist())
-    points = Correspondences((object_points - centre) / size, rays, whitening @ to_px)
-    poses = _best_first(points)
-    if not len(poses):
-        return replace(nothing, reason="no start led to a pose in front of the camera")
-    agree = _agreeing(points, poses)
-    if agree.sum() < MIN_POINTS:
-        reason = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
-        return replace(nothing, reason=reason)
-    best = poses[:1]
-    T, error, covariance = _concluded(
-        points.object_points[agree], points.rays[agree], points.whitening[agree], to_px,
-        best.rotations[0], best.translations[0], size, centre,
-    )  # fmt: skip
-    return PnPResult(T, error, agree, covariance=covariance)
+    centred = (object_points - centre) / size
+    starts = _Starts(centred, rays)
+    best: Solved | None = None
+    for widening in widenings:
+        points = Correspondences(centred, rays, whitening @ to_px / widening)
+        pose, agree = _best_pose(points, starts)
+        solved: Solved
+        if pose is None:
+            solved = (None, math.inf, nobody, "no start led to a pose in front of the camera", None)
+        elif agree.sum() < MIN_POINTS:
+            few = f"only {int(agree.sum())} points agree on one pose, {MIN_POINTS} are needed"
+            solved = (None, math.inf, nobody, few, None)
+        else:
+            T, error, covariance = _concluded(
+                centred[agree], rays[agree], points.whitening[agree], to_px, *pose, size, centre
+            )
+            solved = (T, error, agree, "", covariance)
+        if best is None or solved[2].sum() > best[2].sum():
+            best = solved
+        if 3 * best[2].sum() >= 2 * len(rays):
+            break
+    assert best is not None
+    return best
 
 
 @compiled()
@@ -238,45 +262,118 @@ def _concluded(
     return T, error, covariance
 
 
-def _best_first(points: Correspondences) -> Poses:
-    """Return the plausible refined poses, the smallest truncated cost first.
+class _Starts:
+    """Closed-form poses of all points, all but one and all but two, each solved when asked for.
+
+    They know no deviations, so that they serve every widening.
+    """
+
+    def __init__(
+        self, object_points: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2"]
+    ) -> None:
+        self.object_points, self.rays = object_points, rays
+        extents, axes = _principal_axes(object_points)
+        self.normal, self.is_plate = axes[2], bool(extents[2] < PLATE * extents[0])
+        self._steps: list[Float[np.ndarray, "s 6"]] = []
+
+    def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
+        """Return SQPnP's poses (rotation vector, translation) of all points but so many.
+
+        They are NaN where it raises or finds none.
+        """
+        while len(self._steps) <= left_out:
+            kept = _kept(len(self.rays), len(self._steps))
+            steps = np.full((len(kept), 6), np.nan)
+            for step, rows in zip(steps, kept, strict=True):
+                with suppress(cv2.error):  # OpenCV 5 raises on coincident points
+                    found, vector, move = cv2.solvePnP(
+                        self.object_points[rows], self.rays[rows], _NO_CAMERA, None,
+                        flags=cv2.SOLVEPNP_SQPNP,
+                    )  # fmt: skip
+                    if found:
+                        step[:3], step[3:] = vector[:, 0], move[:, 0]
+            self._steps.append(steps)
+        return self._steps[left_out]
+
+
+@cache
+def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
+    """Return the rows that stay where so many of them are left out, all ways."""
+    return [np.array(rows) for rows in combinations(range(count), count - left_out)][::-1]
+
+
+def _best_pose(
+    points: Correspondences, starts: _Starts
+) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
+    """Return the refined pose with the smallest truncated cost, and which points agree with it.
 
     All points are tried together, then all but one, then all but two, until as many agree.
     """
+    R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
     count = len(points.rays)
-    extents, axes = _principal_axes(points.object_points)
-    poses = Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
+    agree = np.zeros(count, bool)
     for left_out in range(min(MOST_LEFT_OUT, count - MIN_POINTS) + 1):
-        starts = _sqpnp(points, list(combinations(range(count), left_out)))
-        if len(starts) > NUM_STARTS:
-            starts = starts[_truncated_cost(points, starts).argsort()[:NUM_STARTS]]
-        if extents[2] < PLATE * extents[0]:  # a thicker part has no second tilt
-            starts += _mirrored(starts, axes[2])
-        refined = refine(points, starts)
-        poses += refined[_plausible(points, refined)]
-        if len(poses) > 1:
-            poses = poses[_truncated_cost(points, poses).argsort()]
-        if len(poses) and _agreeing(points, poses).sum() >= count - left_out:
+        cost = _improved(
+            points.object_points, points.rays, points.whitening, starts.without(left_out),
+            starts.normal, starts.is_plate, R, t, cost, agree,
+        )  # fmt: skip
+        if cost < math.inf and agree.sum() >= count - left_out:
             break
-    return poses
+    return (None if cost == math.inf else (R, t)), agree
 
 
-def _agreeing(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "n"]:
-    """Tell which points lie within the gate of the first pose."""
-    squared = points.residuals(poses[:1])[0] ** 2
-    return np.asarray(squared[:, 0] + squared[:, 1] <= GATE**2)
+@compiled()
+def _improved(
+    object_points: Array,
+    rays: Array,
+    whitening: Array,
+    starts: Array,
+    normal: Array,
+    is_plate: bool,
+    best_R: Array,
+    best_t: Array,
+    best: float,
+    agree: Array,
+) -> float:
+    """Refine the likeliest starts, and replace the best pose where one is better.
+
+    Returned is its truncated cost; ``agree`` tells which points lie within the gate. Besides each
+    start of a plate, its other tilt is refined; a thicker part has none. A pose is dropped that is
+    no rotation, has points behind the camera or is at an unbelievable distance.
+    """
+    count = len(starts)
+    residuals = np.empty((len(rays), 2))
+    rotations, costs = np.empty((count, 3, 3)), np.empty(count)
+    for s in range(count):
+        turn(starts[s], np.eye(3), rotations[s])
+        reproject(object_points, rays, whitening, rotations[s], starts[s, 3:], residuals)
+        costs[s] = _truncated_cost(residuals)
+    R, t = np.empty((3, 3)), np.empty(3)
+    for s in costs.argsort()[:NUM_STARTS]:
+        for tilt in range(2 if is_plate else 1):
+            R[:], t[:] = rotations[s], starts[s, 3:]
+            if tilt:
+                _mirror(R, t, normal)
+            refine_pose(object_points, rays, whitening, R, t, GATE)
+            if not _is_plausible(object_points, R, t):
+                continue
+            reproject(object_points, rays, whitening, R, t, residuals)
+            cost = _truncated_cost(residuals)
+            if cost < best:
+                best, best_R[:], best_t[:] = cost, R, t
+                for i in range(len(rays)):
+                    agree[i] = residuals[i, 0] ** 2 + residuals[i, 1] ** 2 <= GATE**2
+    return best
 
 
-def _truncated_cost(points: Correspondences, poses: Poses) -> Float[np.ndarray, "s"]:
+@compiled()
+def _truncated_cost(residuals: Array) -> float:
     """Return the MSAC cost that poses are compared by: an outlier costs the gate."""
-    squared = (points.residuals(poses) ** 2).sum(-1)
-    return np.asarray(np.fmin(squared, GATE**2).sum(-1))
-
-
-def _plausible(points: Correspondences, poses: Poses) -> Bool[np.ndarray, "s"]:
-    """Tell sound poses: rotations, all points in front of the camera, at a believable distance."""
-    pairs = zip(poses.rotations, poses.translations, strict=True)
-    return np.array([_is_plausible(points.object_points, R, t) for R, t in pairs], bool)
+    cost = 0.0
+    for i in range(len(residuals)):
+        squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        cost += squared if squared < GATE**2 else GATE**2
+    return cost
 
 
 @compiled()
@@ -297,25 +394,6 @@ def _is_plausible(object_points: Array, R: Array, t: Array) -> bool:
     return True
 
 
-def _sqpnp(points: Correspondences, left_out: Sequence[tuple[int, ...]]) -> Poses:
-    """Solve all points but some with OpenCV's SQPnP; NaN where it raises or finds no pose."""
-    rotations = np.full((len(left_out), 3, 3), np.nan)
-    translations = np.full((len(left_out), 3), np.nan)
-    for R, t, missing in zip(rotations, translations, left_out, strict=True):
-        kept = [k for k in range(len(points.rays)) if k not in missing]
-        with suppress(cv2.error):  # OpenCV 5 raises on coincident points
-            found, turn, move = cv2.solvePnP(
-                points.object_points[kept],
-                points.rays[kept],
-                _NO_CAMERA,
-                None,
-                flags=cv2.SOLVEPNP_SQPNP,
-            )
-            if found:
-                R[:], t[:] = cv2.Rodrigues(turn)[0], move[:, 0]
-    return Poses(rotations, translations)
-
-
 @compiled()
 def _principal_axes(points: Array) -> tuple[Array, Array]:
     """Return the singular values of centred points and their axes, longest first."""
@@ -328,15 +406,20 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
     return extents, axes
 
 
-def _mirrored(poses: Poses, normal: Vector) -> Poses:
-    """Return the other tilt under which a plate looks almost the same.
+@compiled()
+def _mirror(R: Array, t: Array, normal: Array) -> None:
+    """Turn a pose into the other tilt under which a plate looks almost the same.
 
     Seen from far away, a plate tilted by +θ and by −θ about the same axis have the same image. The
     second is the first reflected in the plane across the viewing ray r and, since a reflection is
     no rotation, also in the plate's own plane with normal n: R' = (I − 2rrᵀ) R (I − 2nnᵀ).
     """
-    rays = poses.translations / np.linalg.norm(poses.translations, axis=-1, keepdims=True)
-    across = np.eye(3) - 2 * rays[:, :, None] * rays[:, None, :]
-    return Poses(
-        across @ poses.rotations @ (np.eye(3) - 2 * np.outer(normal, normal)), poses.translations
-    )
+    squared = t[0] ** 2 + t[1] ** 2 + t[2] ** 2
+    for column in range(3):
+        along = 2 * (t[0] * R[0, column] + t[1] * R[1, column] + t[2] * R[2, column]) / squared
+        for row in range(3):
+            R[row, column] -= along * t[row]
+    for row in range(3):
+        along = 2 * (R[row, 0] * normal[0] + R[row, 1] * normal[1] + R[row, 2] * normal[2])
+        for column in range(3):
+            R[row, column] -= along * normal[column]

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from dopepp.core.compiled import Array, compiled
 
@@ -42,26 +41,6 @@ _TINY_ANGLE: Final = 1e-8
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Several poses: R of each, and t of each in object sizes."""
-
-    rotations: Float[np.ndarray, "s 3 3"]
-    translations: Float[np.ndarray, "s 3"]
-
-    def __len__(self) -> int:
-        return len(self.translations)
-
-    def __getitem__(self, chosen: NDArray[Any] | slice) -> Poses:
-        return Poses(self.rotations[chosen], self.translations[chosen])
-
-    def __add__(self, more: Poses) -> Poses:
-        return Poses(
-            np.concatenate([self.rotations, more.rotations]),
-            np.concatenate([self.translations, more.translations]),
-        )
-
-
-@dataclass(frozen=True)
 class Correspondences:
     """Object points, the rays they are seen along, and how well these are known.
 
@@ -73,47 +52,28 @@ class Correspondences:
     rays: Float[np.ndarray, "n 2"]
     whitening: Float[np.ndarray, "n 2 2"]
 
-    def residuals(self, poses: Poses) -> Float[np.ndarray, "s n 2"]:
-        """Return reprojection errors in standard deviations; NaN behind the camera."""
-        residuals = np.empty((len(poses), len(self.rays), 2))
-        for number in range(len(poses)):
-            reproject(
-                self.object_points, self.rays, self.whitening, poses.rotations[number],
-                poses.translations[number], residuals[number],
-            )  # fmt: skip
-        return residuals
-
-
-def refine(points: Correspondences, poses: Poses) -> Poses:
-    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from each start; r in deviations.
-
-    A step that does not lower the cost is undone and damped more (Levenberg–Marquardt). A start
-    with points behind the camera is returned as it is.
-    """
-    refined = Poses(poses.rotations.copy(), poses.translations.copy())
-    for rotation, translation in zip(refined.rotations, refined.translations, strict=True):
-        refine_pose(
-            points.object_points, points.rays, points.whitening, rotation, translation, GATE
-        )
-    return refined
-
 
 @compiled()
 def refine_pose(
     object_points: Array, rays: Array, whitening: Array, R: Array, t: Array, gate: float
 ) -> None:
-    """Refine one pose in place."""
+    """Minimise the Geman–McClure cost Σ r²/(r² + g²) from one pose, in place; r in deviations.
+
+    A step that does not lower the cost is undone and damped more (Levenberg–Marquardt). A pose
+    with points behind the camera stays as it is.
+    """
     n = len(rays)
     residuals, moved_residuals = np.empty((n, 2)), np.empty((n, 2))
     moved_R, moved_t = np.empty((3, 3)), np.empty(3)
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    room = np.empty((7, 6))
     if not reproject(object_points, rays, whitening, R, t, residuals):
         return
     cost, damping = _robust_cost(residuals, gate), FIRST_DAMPING
     normal_equations(object_points, rays, whitening, R, t, residuals, gate, hessian, gradient)
     for _ in range(MAX_STEPS):
-        solve_damped(hessian, gradient, damping, step)
-        _turn(step, R, moved_R)
+        solve_inside(hessian, gradient, damping, step, room)
+        turn(step, R, moved_R)
         for r in range(3):
             moved_t[r] = t[r] + step[3 + r]
         reproject(object_points, rays, whitening, moved_R, moved_t, moved_residuals)
@@ -217,7 +177,13 @@ def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -
 
     Scaled to a unit diagonal, rotations and translations of any size are damped alike.
     """
-    L, scale = np.zeros((6, 6)), np.empty(6)
+    solve_inside(hessian, gradient, damping, step, np.empty((7, 6)))
+
+
+@compiled()
+def solve_inside(hessian: Array, gradient: Array, damping: float, step: Array, room: Array) -> None:
+    """Do the same within a (7, 6) array, so that a loop need not ask for memory each time."""
+    L, scale = room[:6], room[6]
     for i in range(6):
         scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
     for i in range(6):
@@ -243,7 +209,7 @@ def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -
 
 
 @compiled()
-def _turn(step: Array, R: Array, out: Array) -> None:
+def turn(step: Array, R: Array, out: Array) -> None:
     """Write Exp(ω) R for the rotation vector ω in the first three numbers of a step."""
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)

@@ -95,7 +95,7 @@ class PoseEstimator:
         """Its parts, with the meshes that it was given."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Milliseconds since it was made, by step of :data:`STEPS`."""
-        self.network = network.eval().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = network.for_inference().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.refine import solve_damped
+from dopepp.geometry.refine import solve_inside
 
 FLOOR: Final = 1e-6
 """Belief over its peak below which a cell's logarithm says nothing; a peak of σ = 0.5 on the border
@@ -25,6 +25,9 @@ within their own cells. Of 1 to 4, 3 gave the smallest errors on pairs of peaks 
 
 MARGIN: Final = 1.0
 """The same once both positions are fitted."""
+
+SURELY: Final = 1e-6
+"""Squared cells beyond which a comparison of distances is none of rounding."""
 
 PLATEAU: Final = 3
 """Cells as high as the peak's from which on its top is cut off; an exact tie of two is none."""
@@ -53,76 +56,109 @@ UNCERTAIN: Final = 4.0
 
 @compiled()
 def fit_peaks(
-    table: Array,
-    width: int,
-    half: int,
-    sigma: float,
-    radius: float,
-    position: Array,
-    covariance: Array,
-    toward: Array,
+    belief: Array, cells: Array, half: int, sigma: float, position: Array, covariance: Array
 ) -> None:
-    """Fit the peaks of every channel and average the field around them.
+    """Fit all peaks of one channel, first their logarithms, then the beliefs themselves.
+
+    The logarithm makes the first fit linear and exact for a clean Gaussian, at the border too,
+    where the neighbourhood is cut; weights b² undo the logarithm's amplification of noise (Guo,
+    IEEE SPM 2011). Gauss–Newton on b itself then removes the bias that noise leaves in logarithms.
 
     Args:
-        table: Of each peak its cell's index, its belief (−∞: no peak; the channel's peaks come
-            first), the (2·half + 1)² cells around it, NaN outside of the map, and where there is
-            a field the x, then the y of the vectors around it; (channels, peaks, columns).
-        width: Of the map, cells.
-        half: Half-width of a window, cells.
+        belief: The channel's map.
+        cells: (column, row) of each peak.
+        half: Half-width of the window around a peak that it is fitted to, cells.
         sigma: Standard deviation of a perfect peak, cells.
-        radius: Of the disc around a corner that carries its vector, cells.
         position: Filled with (x, y) of each peak, cells.
         covariance: Filled with the covariance of each position, cells²: the fitted Gaussian's less
             the target's, as far as the map's noise does not explain it, and that of the fit.
-        toward: Filled with the mean vectors, unless there is no field.
     """
-    side = 2 * half + 1
-    columns = table.shape[2]
-    for channel in range(len(table)):
-        count = 0
-        while count < table.shape[1] and table[channel, count, 1] > -math.inf:
-            count += 1
-        if not count:
-            continue
-        rows = table[channel, :count]
-        cells = np.empty((count, 2))
-        windows = np.empty((count, side, side))
-        for i in range(count):
-            cells[i] = rows[i, 0] % width, rows[i, 0] // width
-            windows[i] = rows[i, 2 : 2 + side * side].copy().reshape(side, side)
-        _fit_channel(windows, cells, sigma, position[channel, :count], covariance[channel, :count])
-        if columns > 2 + side * side:
-            vectors = rows[:, 2 + side * side :]
-            _mean_vectors(vectors, cells, position[channel, :count], radius, toward[channel])
+    count, side = len(cells), 2 * half + 1
+    theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    noise, freedom = 0.0, 0.0
+    scores, work, room = np.empty(count), np.empty((5, 10)), np.empty((11, 6))
+    windows, own = np.empty((count, side, side)), np.empty((count, side, side), np.bool_)
+    logarithms = np.empty((count, side, side))
+    for i in range(count):
+        scores[i] = belief[cells[i, 1], cells[i, 0]]
+        _read_window(belief, cells[i, 0] - half, cells[i, 1] - half, scores[i], windows[i])
+        for y in range(side):
+            for x in range(side):
+                logarithms[i, y, x] = math.log(max(windows[i, y, x], FLOOR))
+        position[i, 0], position[i, 1] = cells[i, 0], cells[i, 1]
+    for i in range(count):
+        _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
+    for i in range(count):
+        _fit_logarithm(windows[i], logarithms[i], own[i], sigma, 0.0, work, room, theta[i])
+        x, y, _ = _mode(windows[i], theta[i])
+        position[i, 0], position[i, 1] = cells[i, 0] + x, cells[i, 1] + y
+    for i in range(count):
+        _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
+        squared, used, _ = _step(
+            windows[i], own[i], theta[i], 0.0, sigma, work, room, hessian[i], False
+        )
+        noise += squared * scores[i] ** 2
+        freedom += max(used - 6.0, 0.0)
+    noise /= max(freedom, 1.0)
+    for i in range(count):
+        relative = noise / scores[i] ** 2
+        _fit_logarithm(windows[i], logarithms[i], own[i], sigma, relative, work, room, theta[i])
+        for _ in range(STEPS if theta[i].any() else 0):
+            _, _, move = _step(
+                windows[i], own[i], theta[i], relative, sigma, work, room, hessian[i], True
+            )
+            if move < ARRIVED:
+                break
+        x, y, sound = _mode(windows[i], theta[i])
+        position[i, 0], position[i, 1] = cells[i, 0] + x, cells[i, 1] + y
+        if sound:
+            _covariance(theta[i], x, y, hessian[i], relative, sigma, room, covariance[i])
+        else:
+            covariance[i] = 0.0
+            covariance[i, 0, 0] = covariance[i, 1, 1] = UNCERTAIN
 
 
 @compiled()
-def _mean_vectors(
+def _read_window(belief: Array, left: int, top: int, score: float, window: Array) -> None:
+    """Write the cells around a peak over its belief, NaN outside of the map."""
+    height, width = belief.shape
+    for y in range(len(window)):
+        for x in range(len(window)):
+            row, column = top + y, left + x
+            inside = 0 <= row < height and 0 <= column < width
+            window[y, x] = belief[row, column] / score if inside else math.nan
+
+
+@compiled()
+def mean_vectors(
     vectors: Array, cells: Array, position: Array, radius: float, toward: Array
 ) -> None:
     """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
 
     Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, which no position is exact enough to tell.
+    fall to 0 at the edges of discs, which no position is exact enough to tell. ``vectors`` are the
+    corner's two channels of the field; the radius is in cells.
     """
-    area = vectors.shape[1] // 2
-    side = 1
-    while side * side < area:
-        side += 1
-    half = side // 2
+    height, width = vectors.shape[1:]
+    half = math.ceil(radius)
+    near = np.empty(len(cells), np.int64)
     for i in range(len(cells)):
+        count = 0
+        for j in range(len(cells)):
+            dx, dy = position[j, 0] - position[i, 0], position[j, 1] - position[i, 1]
+            if j != i and dx * dx + dy * dy < 4.1 * radius**2:  # farther discs do not overlap
+                near[count] = j
+                count += 1
         total = 0.0
-        for y in range(side):
-            for x in range(side):
-                column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
+        for row in range(max(cells[i, 1] - half, 0), min(cells[i, 1] + half + 1, height)):
+            for column in range(max(cells[i, 0] - half, 0), min(cells[i, 0] + half + 1, width)):
                 squared = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
                 weight = 1 - squared / radius**2
-                u, v = vectors[i, y * side + x], vectors[i, area + y * side + x]
+                u, v = vectors[0, row, column], vectors[1, row, column]
                 if not (weight > 0.0 and math.isfinite(u) and math.isfinite(v)):
                     continue
                 nearest = True
-                for j in range(len(cells)):
+                for j in near[:count]:
                     if (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2 < squared:
                         nearest = False
                         break
@@ -132,48 +168,6 @@ def _mean_vectors(
                     toward[i, 1] += weight * v
         if total > 0.0:
             toward[i] /= total
-
-
-@compiled()
-def _fit_channel(
-    windows: Array, cells: Array, sigma: float, position: Array, covariance: Array
-) -> None:
-    """Fit all peaks of one channel, first their logarithms, then the beliefs themselves.
-
-    The logarithm makes the first fit linear and exact for a clean Gaussian, at the border too,
-    where the neighbourhood is cut; weights b² undo the logarithm's amplification of noise (Guo,
-    IEEE SPM 2011). Gauss–Newton on b itself then removes the bias that noise leaves in logarithms.
-    """
-    count = len(cells)
-    theta, hessian = np.zeros((count, 6)), np.zeros((count, 6, 6))
-    noise, freedom = 0.0, 0.0
-    scores, work = np.empty(count), np.empty((5, 10))
-    half = windows.shape[1] // 2
-    for i in range(count):
-        scores[i] = windows[i, half, half]
-        position[i] = cells[i]
-    own = np.empty((count, windows.shape[1], windows.shape[1]), np.bool_)
-    for i in range(count):
-        _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
-    for i in range(count):
-        _fit_logarithm(windows[i], own[i], sigma, 0.0, work, theta[i])
-        position[i] = cells[i] + _mode(windows[i], theta[i])[0]
-    for i in range(count):
-        _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
-        squared, used, _ = _step(windows[i], own[i], theta[i], 0.0, sigma, work, hessian[i], False)
-        noise += squared * scores[i] ** 2
-        freedom += max(used - 6.0, 0.0)
-    noise /= max(freedom, 1.0)
-    for i in range(count):
-        relative = noise / scores[i] ** 2
-        _fit_logarithm(windows[i], own[i], sigma, relative, work, theta[i])
-        for _ in range(STEPS if theta[i].any() else 0):
-            move = _step(windows[i], own[i], theta[i], relative, sigma, work, hessian[i], True)[2]
-            if move < ARRIVED:
-                break
-        offset, sound = _mode(windows[i], theta[i])
-        position[i] = cells[i] + offset
-        _covariance(theta[i], offset, sound, hessian[i], relative, sigma, covariance[i])
 
 
 @compiled()
@@ -197,12 +191,19 @@ def _own_cells(
     for y in range(side):
         for x in range(side):
             own[y, x] = math.isfinite(windows[i, y, x])
-            highest += windows[i, y, x] == scores[i]
+            highest += windows[i, y, x] == 1.0
     for j in range(len(cells)):
         far = max(abs(position[j, 0] - position[i, 0]), abs(position[j, 1] - position[i, 1]))
         if j == i or far > 4 * half + 2:
             continue
         handicap = 2 * sigma**2 * math.log(scores[i] / scores[j]) - margin
+        # The difference of the squared distances is linear, so a corner has the least of it.
+        column = cells[i, 0] + (half if position[j, 0] > position[i, 0] else -half)
+        row = cells[i, 1] + (half if position[j, 1] > position[i, 1] else -half)
+        mine = (column - position[i, 0]) ** 2 + (row - position[i, 1]) ** 2
+        other = (column - position[j, 0]) ** 2 + (row - position[j, 1]) ** 2
+        if mine - handicap < other - SURELY:
+            continue
         for y in range(side):
             for x in range(side):
                 column, row = cells[i, 0] + x - half, cells[i, 1] + y - half
@@ -213,12 +214,19 @@ def _own_cells(
     if highest >= PLATEAU:
         for y in range(side):
             for x in range(side):
-                own[y, x] &= windows[i, y, x] != scores[i]
+                own[y, x] &= windows[i, y, x] != 1.0
 
 
 @compiled()
 def _fit_logarithm(
-    window: Array, own: Array, sigma: float, noise: float, work: Array, theta: Array
+    window: Array,
+    logarithm: Array,
+    own: Array,
+    sigma: float,
+    noise: float,
+    work: Array,
+    room: Array,
+    theta: Array,
 ) -> None:
     """Write the weighted linear least-squares fit of log b over its peak, with the prior's pull."""
     side = len(window)
@@ -229,16 +237,16 @@ def _fit_logarithm(
     work[:] = 0.0
     for y in range(side):
         for x in range(side):
-            value = window[y, x] / window[half, half]
+            value = window[y, x]
             if own[y, x] and value > FLOOR:
                 expected = -curvature * ((x - half) ** 2 + (y - half) ** 2)
                 weight = value * value
-                _add(work, x - half, weight, weight * (expected - math.log(value)))
+                _add(work, x - half, weight, weight * (expected - logarithm[y, x]))
         _end_row(work, y - half)
-    hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
-    _system(work, theta, noise, sigma, hessian, gradient)
-    solve_damped(hessian, gradient, 0.0, step)
-    theta += step
+    hessian = np.empty((6, 6))
+    _system(work, theta, noise, sigma, hessian, room[0])
+    solve_inside(hessian, room[0], 0.0, room[1], room[4:])
+    theta += room[1]
     if work[0, 0] == 0.0:  # nothing but a cut-off top: no slope, no peak
         theta[:] = 0.0
 
@@ -251,6 +259,7 @@ def _step(
     noise: float,
     sigma: float,
     work: Array,
+    room: Array,
     hessian: Array,
     move: bool,
 ) -> tuple[float, float, float]:
@@ -271,17 +280,19 @@ def _step(
                 u = float(x - half)
                 # Beyond it the fit is far off already, and its square must stay a number.
                 model = math.exp(min(level + u * (slope - theta[3] * u), STEEPEST))
-                residual = model - window[y, x] / window[half, half]
+                residual = model - window[y, x]
                 squared += residual * residual
                 used += 1.0
                 _add(work, x - half, model * model, model * residual)
         _end_row(work, y - half)
-    gradient, step = np.empty(6), np.zeros(6)
-    _system(work, theta, noise, sigma, hessian, gradient)
+    _system(work, theta, noise, sigma, hessian, room[0])
+    farthest = 0.0
     if move:
-        solve_damped(hessian, gradient, 0.0, step)
-        theta += step
-    return squared, used, np.abs(step).max()
+        solve_inside(hessian, room[0], 0.0, room[1], room[4:])
+        for k in range(6):
+            theta[k] += room[1, k]
+            farthest = max(farthest, abs(room[1, k]))
+    return squared, used, farthest
 
 
 @compiled()
@@ -329,66 +340,83 @@ def _system(
 
 
 @compiled()
-def _mode(window: Array, theta: Array) -> tuple[Array, bool]:
+def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
     """Return where a fitted Gaussian is highest, and whether it is a peak within its own cells.
 
     If it is none, the middle of the window's highest cells stands for it.
     """
-    side = len(window)
-    half = side // 2
-    middle, count = np.zeros(2), 0
-    for y in range(half - 2, half + 3):
-        for x in range(half - 2, half + 3):
-            if window[y, x] == window[half, half]:
-                middle[0] += x - half
-                middle[1] += y - half
+    half = len(window) // 2
+    across, down, count = 0.0, 0.0, 0
+    for v in range(-2, 3):
+        for u in range(-2, 3):
+            if window[half + v, half + u] == 1.0:
+                across += u
+                down += v
                 count += 1
-    middle /= count
+    across, down = across / count, down / count
     a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
     determinant = a * c - b * b
-    offset = np.array([c * theta[1] - b * theta[2], a * theta[2] - b * theta[1]]) / determinant
+    x = (c * theta[1] - b * theta[2]) / determinant
+    y = (a * theta[2] - b * theta[1]) / determinant
     smallest = 0.5 * (a + c - math.sqrt((a - c) ** 2 + 4 * b * b))
     # A cut-off top's cell may be any of it.
     reach = 1.0 if count < PLATEAU else 2.0
-    sound = smallest > FLATTEST and np.abs(offset - middle).max() <= reach
-    return (offset if sound else middle), sound
+    if smallest > FLATTEST and abs(x - across) <= reach and abs(y - down) <= reach:
+        return x, y, True
+    return across, down, False
 
 
 @compiled()
 def _covariance(
-    theta: Array, offset: Array, sound: bool, hessian: Array, noise: float, sigma: float, out: Array
+    theta: Array,
+    x: float,
+    y: float,
+    hessian: Array,
+    noise: float,
+    sigma: float,
+    room: Array,
+    out: Array,
 ) -> None:
-    """Write a position's covariance; see :func:`fit_peaks`.
+    """Write the covariance of a sound peak's position; see :func:`fit_peaks`.
 
     The offset is P⁻¹(p, q) with the precision P = [[2r, t], [t, 2s]] of the Gaussian, so it moves
     by P⁻¹(dp − 2x·dr − y·dt, dq − x·dt − 2y·ds).
     """
-    out[:] = 0.0
-    if not sound:
-        out[0, 0] = out[1, 1] = UNCERTAIN
-        return
     a, b, c = 2 * theta[3], theta[4], 2 * theta[5]
     determinant = a * c - b * b
-    shape = np.array([[c, -b], [-b, a]]) / determinant
-    x, y = offset[0], offset[1]
-    slopes = np.array([[0.0, 1.0, 0.0, -2 * x, -y, 0.0], [0.0, 0.0, 1.0, 0.0, -x, -2 * y]])
-    slopes = shape @ slopes
-    moved = np.empty(6)
+    xx, xy, yy = c / determinant, -b / determinant, a / determinant
+    slopes, moved, mean = room[:2], room[2], room[3]
     for k in range(2):
-        solve_damped(hessian, -slopes[k], 0.0, moved)
+        # Down to the minus sign, as the equations are solved for the negative.
+        one, other = (-xx, -xy) if k == 0 else (-xy, -yy)
+        slopes[k, 0], slopes[k, 1], slopes[k, 2] = 0.0, one, other
+        slopes[k, 3] = -2 * x * one
+        slopes[k, 4] = -y * one - x * other
+        slopes[k, 5] = -2 * y * other
+    for k in range(2):
+        solve_inside(hessian, slopes[k], 0.0, moved, room[4:])
         for m in range(2):
-            out[k, m] = noise * np.sum(slopes[m] * moved)
+            out[k, m] = -noise * _product(slopes[m], moved)
     out[0, 1] = out[1, 0]
     # How uncertain the variance is: that of (r + s)/2 relative to it.
-    mean = np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.5])
-    solve_damped(hessian, -mean, 0.0, moved)
-    relative = math.sqrt(noise * np.sum(mean * moved)) / (0.25 * (a + c))
-    angle = 0.5 * math.atan2(2 * shape[0, 1], shape[0, 0] - shape[1, 1])
+    mean[:] = 0.0
+    mean[3] = mean[5] = -0.5
+    solve_inside(hessian, mean, 0.0, moved, room[4:])
+    relative = math.sqrt(-noise * _product(mean, moved)) / (0.25 * (a + c))
+    angle = 0.5 * math.atan2(2 * xy, xx - yy)
     cosine, sine = math.cos(angle), math.sin(angle)
     for u, v in ((cosine, sine), (-sine, cosine)):
-        variance = u * u * shape[0, 0] + 2 * u * v * shape[0, 1] + v * v * shape[1, 1]
+        variance = u * u * xx + 2 * u * v * xy + v * v * yy
         excess = max(variance * (1 - relative) - sigma**2, 0.0)
         out[0, 0] += excess * u * u
         out[0, 1] += excess * u * v
         out[1, 1] += excess * v * v
     out[1, 0] = out[0, 1]
+
+
+@compiled()
+def _product(one: Array, other: Array) -> float:
+    total = 0.0
+    for k in range(6):
+        total += one[k] * other[k]
+    return total

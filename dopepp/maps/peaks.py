@@ -1,7 +1,7 @@
-"""Maps to peaks: batched local maxima with sub-cell positions, their covariances and vectors.
+"""Maps to peaks: local maxima with sub-cell positions, their covariances and vectors.
 
-Maxima are found where the maps are. Only they and the cells around them come to the host, in one
-transfer, to be fitted there (:mod:`dopepp.maps.gaussian`).
+Maxima are found and fitted on the host, compiled: an image's maps are a few hundred kilobytes, and
+copying them takes less than the many small operations that would find maxima on a device.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
 
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.maps.encode import Fields, MapGeometry
-from dopepp.maps.gaussian import fit_peaks
+from dopepp.maps.gaussian import fit_peaks, mean_vectors
 
 REACH: Final = 2.5
 """Half-width of the neighbourhood a peak is fitted to, in standard deviations of a perfect peak:
@@ -28,10 +27,8 @@ HALF_WIDTHS: Final = (2, 4)
 """Least and greatest half-width, cells: a fit needs 5×5 cells, and 9×9 determine any."""
 
 TIE_BREAK: Final = 1e-11
-"""Weight of the neighbourhood's sum (at most 25) among equal cells: less than the 2e-9 by which
-float32 beliefs of the lowest useful threshold, 0.02, can differ."""
-
-_SPAN: Final = range(-2, 3)
+"""Weight of the neighbourhood's sum among equal cells: sums that differ by no more than the
+rounding of 25 beliefs leave float64's last digit, and the cells, equal."""
 
 
 @dataclass(frozen=True)
@@ -73,89 +70,107 @@ def find_peaks(
     With a field, which has 16 channels of each object, the belief has nine of each; without it,
     peaks have no vectors.
     """
-    belief = belief.detach().float()
-    height, width = belief.shape[-2:]
-    is_peak = _local_maxima(belief) & (belief > threshold) & torch.isfinite(belief)
-    count = min(max_peaks, height * width)
-    score, index = torch.where(is_peak, belief, -torch.inf).flatten(2).topk(count, dim=-1)
-    half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
-    parts = [index[..., None].float(), score[..., None], _windows(belief, index, half)]
-    if field is not None:
-        disc = math.ceil(geometry.field_radius)
-        parts.append(_field_windows(field.detach().float(), index, disc))
-    # Indices are whole numbers below 2²⁴, which float32 holds.
-    table = torch.cat(parts, -1).cpu().numpy()
-    return _fit(table, width, half, geometry)
-
-
-def _local_maxima(
-    belief: Float[Tensor, "batch channels height width"],
-) -> Bool[Tensor, "batch channels height width"]:
-    """Mark cells that are the highest of their 3×3 neighbourhood, one of every set of equals."""
-    height, width = belief.shape[-2:]
-    # A sum along one axis, then along the other: a fifth of `avg_pool2d`'s time.
-    around = functional.pad(belief, (2,) * 4)
-    around = sum(
-        (around[..., 2 + k : 2 + k + height, :] for k in _SPAN[1:]), around[..., :height, :]
-    )
-    around = sum((around[..., 2 + k : 2 + k + width] for k in _SPAN[1:]), around[..., :width])
-    # Both numbers fit into one float64 key, so that one comparison orders them lexicographically.
-    key = belief.double() + TIE_BREAK * around.double()
-    padded = functional.pad(key, (1, 1, 1, 1), value=-torch.inf)
-    highest = torch.ones_like(belief, dtype=torch.bool)
-    for dy, dx in ((-1, -1), (-1, 0), (-1, 1), (0, -1)):
-        before = padded[..., 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-        after = padded[..., 1 - dy : 1 - dy + height, 1 - dx : 1 - dx + width]
-        highest &= (key > before) & (key >= after)
-    return highest
-
-
-def _windows(
-    maps: Float[Tensor, "*channels height width"], index: Int[Tensor, "*channels peaks"], half: int
-) -> Float[Tensor, "*channels peaks cells"]:
-    """Read the cells around each index, row by row; NaN outside of the map."""
-    width = maps.shape[-1]
-    wide = width + 2 * half
-    padded = functional.pad(maps, (half,) * 4, value=torch.nan).flatten(-2)
-    span = torch.arange(2 * half + 1, device=maps.device)
-    around = (span[:, None] * wide + span).flatten()
-    first = index.div(width, rounding_mode="floor") * wide + index % width
-    cells = first[..., None] + around
-    return padded.gather(-1, cells.flatten(-2)).view(cells.shape)
-
-
-def _field_windows(
-    field: Fields, index: Int[Tensor, "batch channels peaks"], half: int
-) -> Float[Tensor, "batch channels peaks cells"]:
-    """Read the vectors around each peak, all x before all y; zeros for a centroid."""
-    batch, channels, count = index.shape
-    corners = index.view(batch, -1, NUM_KEYPOINTS, 1, count)[:, :, :NUM_CORNERS]
-    vectors = field.reshape(batch, -1, NUM_CORNERS, 2, *field.shape[-2:])
-    read = _windows(vectors, corners.expand(-1, -1, -1, 2, -1), half)
-    read = functional.pad(read.transpose(3, 4).flatten(-2), (0, 0, 0, 0, 0, 1))
-    return read.reshape(batch, channels, count, -1)
-
-
-def _fit(
-    table: Float[np.ndarray, "batch channels peaks columns"],
-    width: int,
-    half: int,
-    geometry: MapGeometry,
-) -> Peaks:
-    """Fit the peaks of every channel; see :func:`find_peaks` for the table's columns."""
-    slots = table.shape[:3]
-    found = table[..., 1] > -np.inf
+    maps = _on_host(belief)
+    height, width = maps.shape[2:]
+    slots = (*maps.shape[:2], min(max_peaks, height * width))
     position, covariance = np.full((*slots, 2), np.nan), np.full((*slots, 2, 2), np.nan)
-    toward = np.zeros((*slots, 2))
-    fit_peaks(
-        table.reshape(-1, *table.shape[2:]), width, half, geometry.sigma, geometry.field_radius,
-        position.reshape(-1, slots[2], 2), covariance.reshape(-1, slots[2], 2, 2),
-        toward.reshape(-1, slots[2], 2),
+    score, toward = np.zeros(slots), np.zeros((*slots, 2))
+    vectors = np.zeros((0, 1, 1), np.float32)
+    if field is not None:
+        vectors = _on_host(field).reshape(-1, height, width)
+    half = min(max(math.ceil(REACH * geometry.sigma), HALF_WIDTHS[0]), HALF_WIDTHS[1])
+    least = float(np.float32(threshold))  # as exact as beliefs are
+    _find(
+        maps.reshape(-1, height, width), vectors, least, half, geometry.sigma,
+        geometry.field_radius, score.reshape(-1, slots[2]), position.reshape(-1, slots[2], 2),
+        covariance.reshape(-1, slots[2], 2, 2), toward.reshape(-1, slots[2], 2),
     )  # fmt: skip
     return Peaks(
         position * geometry.stride + (geometry.stride - 1) / 2,
-        np.where(found, table[..., 1], 0.0).astype(np.float64),
+        score,
         covariance * geometry.stride**2,
         toward,
-        found,
+        score > 0.0,
     )
+
+
+def _on_host(maps: Tensor) -> Float[np.ndarray, "batch channels height width"]:
+    """Return maps as float32 that lies row by row."""
+    return np.ascontiguousarray(maps.detach().float().cpu().numpy())
+
+
+@compiled()
+def _find(
+    belief: Array,
+    field: Array,
+    threshold: float,
+    half: int,
+    sigma: float,
+    radius: float,
+    score: Array,
+    position: Array,
+    covariance: Array,
+    toward: Array,
+) -> None:
+    """Fill the peaks of every channel, cells; there may be no field at all."""
+    cells = np.empty((score.shape[1], 2), np.int64)
+    for channel in range(len(belief)):
+        count = _strongest(belief[channel], threshold, score[channel], cells)
+        if not count:
+            continue
+        own = position[channel, :count]
+        fit_peaks(belief[channel], cells[:count], half, sigma, own, covariance[channel, :count])
+        number, corner = channel // NUM_KEYPOINTS, channel % NUM_KEYPOINTS
+        if len(field) and corner < NUM_CORNERS:
+            first = 2 * (number * NUM_CORNERS + corner)
+            mean_vectors(field[first : first + 2], cells[:count], own, radius, toward[channel])
+
+
+@compiled()
+def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> int:
+    """Write belief and (column, row) of the strongest maxima, strongest first; say how many."""
+    count = 0
+    for y in range(belief.shape[0]):
+        for x in range(belief.shape[1]):
+            value = belief[y, x]
+            if not (value > threshold and value < math.inf and _is_highest(belief, y, x)):
+                continue
+            if count < len(score):
+                count += 1
+            elif not value > score[count - 1]:
+                continue
+            k = count - 1
+            while k > 0 and score[k - 1] < value:
+                score[k], cells[k] = score[k - 1], cells[k - 1]
+                k -= 1
+            score[k], cells[k, 0], cells[k, 1] = value, x, y
+    return count
+
+
+@compiled()
+def _is_highest(belief: Array, y: int, x: int) -> bool:
+    """Tell whether a cell is the highest of its 3×3 neighbourhood, one of every set of equals."""
+    value = belief[y, x]
+    for v in range(max(y - 1, 0), min(y + 2, belief.shape[0])):
+        for u in range(max(x - 1, 0), min(x + 2, belief.shape[1])):
+            other = belief[v, u]
+            if value > other or (v == y and u == x):
+                continue
+            if value != other:  # higher, or no number
+                return False
+            own, its = _tie_break(belief, y, x), _tie_break(belief, v, u)
+            if not (own > its or (own == its and (v > y or (v == y and u > x)))):
+                return False
+    return True
+
+
+@compiled()
+def _tie_break(belief: Array, y: int, x: int) -> float:
+    """Return what orders cells of one belief: it and, in its last digits, the 5×5 cells' sum."""
+    total = np.float32(0.0)
+    for u in range(max(x - 2, 0), min(x + 3, belief.shape[1])):
+        column = np.float32(0.0)
+        for v in range(max(y - 2, 0), min(y + 3, belief.shape[0])):
+            column += belief[v, u]
+        total += column
+    return np.float64(belief[y, x]) + TIE_BREAK * np.float64(total)

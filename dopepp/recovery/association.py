@@ -1,15 +1,15 @@
 """From the peaks of one object's maps to groups of keypoints, one group per instance.
 
 Which corners belong together, an affine camera tells: from far enough away, a corner's image is
-c + A s with the centroid's c, a 2×3 matrix A and the corner's signs s, so any three corners no two
-of which are opposite predict the other five.
+c + A s with the centroid's c, a 2×3 matrix A and the corner's signs s. Opposite corners have
+opposite arms A s, and of the four diagonals' arms, three give the fourth: so any three corners no
+two of which are opposite predict the other five.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.cuboid import CENTROID, CORNER_SIGNS, NUM_CORNERS, NUM_KEYPOINTS
+from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
 
 Evidence = Float[np.ndarray, "instances 8 peaks"]
 CornerPeaks = Float[np.ndarray, "8 peaks 2"]
@@ -42,19 +42,14 @@ PERSPECTIVE: Final = 0.1
 """Deviation of corners from the affine camera, over their distance from the centroid: a part seen
 from five times its size away has corners ±10 % nearer or farther."""
 
-TRIPLES: Final = np.array(
-    [
-        triple
-        for triple in combinations(range(NUM_CORNERS), 3)
-        if abs(np.linalg.det(CORNER_SIGNS[list(triple)])) > 1
-    ]
-)
-"""Corners without an opposite pair, which would leave a direction open; (32, 3)."""
+DIAGONALS: Final = np.array([(0, 6), (1, 7), (2, 4), (3, 5)])
+"""Opposite corners."""
 
-WEIGHTS: Final = np.array(
-    [np.linalg.solve(CORNER_SIGNS[triple].T, CORNER_SIGNS.T).T for triple in TRIPLES]
-)
-"""Every corner as a sum of the triple's, relative to the centroid; (32, 8, 3)."""
+RIVALS: Final = -2
+"""In place of a peak that two instances want."""
+
+ALTERNATING: Final = np.array([1.0, -1.0, 1.0, -1.0])
+"""The sum of the first corners' arms with these signs is zero."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +117,7 @@ def associate(
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:
-        expected, deviation = _predict(peaks, evidence)
+        expected, deviation = _predict(peaks.position, evidence, peaks.centroid, peaks.area_px)
     gain = _gain(evidence, peaks.position, peaks.covariance_px, expected, deviation, peaks.area_px)
     count = len(evidence)
     position = np.full((count, NUM_KEYPOINTS, 2), np.nan)
@@ -131,13 +126,16 @@ def associate(
     position[:, CENTROID] = peaks.centroid
     covariance[:, CENTROID] = peaks.centroid_covariance_px
     score[:, CENTROID] = peaks.centroid_score
-    for k in range(NUM_CORNERS):
+    chosen = _unrivalled(gain)
+    for k in np.flatnonzero((chosen == RIVALS).any(0)):
         instance, peak = linear_sum_assignment(gain[:, k], maximize=True)
-        wanted = gain[instance, k, peak] > 0
-        instance, peak = instance[wanted], peak[wanted]
-        position[instance, k] = peaks.position[k, peak]
-        covariance[instance, k] = peaks.covariance_px[k, peak]
-        score[instance, k] = peaks.score[k, peak]
+        chosen[:, k] = -1
+        chosen[instance, k] = np.where(gain[instance, k, peak] > 0, peak, -1)
+    instance, corner = np.nonzero(chosen >= 0)
+    peak = chosen[instance, corner]
+    position[instance, corner] = peaks.position[corner, peak]
+    covariance[instance, corner] = peaks.covariance_px[corner, peak]
+    score[instance, corner] = peaks.score[corner, peak]
     return [KeypointGroup(*group) for group in zip(position, score, covariance, strict=True)]
 
 
@@ -153,24 +151,28 @@ def _direction_evidence(
 ) -> Array:
     """Return the evidence of every instance, corner and peak."""
     evidence = np.full((len(centroid), *score.shape), -math.inf)
-    for i, k, m in np.ndindex(evidence.shape):
+    beliefs = np.log(centroid_score)
+    for k, m in np.ndindex(score.shape):
         if not score[k, m] > 0.0:
             continue
-        x, y = centroid[i, 0] - position[k, m, 0], centroid[i, 1] - position[k, m, 1]
+        belief = math.log(score[k, m])
         u, v = toward[k, m, 0], toward[k, m, 1]
-        distance = math.hypot(x, y)
-        angle, length = abs(math.atan2(x * v - y * u, x * u + y * v)), math.hypot(u, v)
+        length = math.sqrt(u * u + v * v)
         # A vector that is no number, as of a network that diverged, points nowhere.
-        if not (math.isfinite(angle) and length >= LEAST_LENGTH):
-            angle, length = math.pi, LEAST_LENGTH
-        variance = LEAST_DEVIATION**2 - 2 * math.log(min(length, 1.0))
-        variance += (POSITION_PX / max(distance, POSITION_PX)) ** 2
-        ratio = -(angle**2) / (2 * variance) - min(0.5 * math.log(variance / (2 * math.pi)), 0.0)
-        if distance < coincident_px:
-            ratio = max(ratio, 0.0)
-        elif angle > max_angle:
-            continue
-        evidence[i, k, m] = ratio + math.log(score[k, m]) + math.log(centroid_score[i])
+        directed = LEAST_LENGTH <= length < math.inf
+        spread = LEAST_DEVIATION**2 - 2 * math.log(min(length, 1.0) if directed else LEAST_LENGTH)
+        for i in range(len(centroid)):
+            x, y = centroid[i, 0] - position[k, m, 0], centroid[i, 1] - position[k, m, 1]
+            distance = math.sqrt(x * x + y * y)
+            angle = abs(math.atan2(x * v - y * u, x * u + y * v)) if directed else math.pi
+            if angle > max_angle and not distance < coincident_px:
+                continue
+            variance = spread + (POSITION_PX / max(distance, POSITION_PX)) ** 2
+            ratio = -(angle**2) / (2 * variance)
+            ratio -= min(0.5 * math.log(variance / (2 * math.pi)), 0.0)
+            if distance < coincident_px:
+                ratio = max(ratio, 0.0)
+            evidence[i, k, m] = ratio + belief + beliefs[i]
     return evidence
 
 
@@ -203,80 +205,139 @@ def _gain(
     return gain
 
 
+@compiled()
+def _unrivalled(gain: Array) -> Array:
+    """Return each instance's best peak of each corner, −1 for none.
+
+    For a corner of which two instances want the same peak, all have :data:`RIVALS`.
+    """
+    chosen = np.full(gain.shape[:2], -1, np.int64)
+    for k in range(gain.shape[1]):
+        for i in range(len(gain)):
+            most = 0.0
+            for m in range(gain.shape[2]):
+                if gain[i, k, m] > most:
+                    most, chosen[i, k] = gain[i, k, m], m
+            for j in range(i):
+                if chosen[i, k] >= 0 and chosen[j, k] == chosen[i, k]:
+                    chosen[:, k] = RIVALS
+            if chosen[i, k] == RIVALS:
+                break
+    return chosen
+
+
+@compiled()
 def _predict(
-    peaks: ObjectPeaks, evidence: Evidence
-) -> tuple[Corners, Float[np.ndarray, "instances"]]:
+    position: Array, evidence: Array, centroid: Array, area_px: float
+) -> tuple[Array, Array]:
     """Find for each centroid the corners that the most and likeliest peaks agree on.
 
     A peak that belongs to nobody may lie anywhere on the maps. Returned are the corners' expected
     positions, NaN where no three peaks have a say, and the standard deviation from them, pixels.
     """
-    order = np.argsort(-evidence, axis=-1)[..., :CANDIDATES]
-    likeliest = np.take_along_axis(evidence, order, axis=-1)
-    candidates = np.take_along_axis(peaks.position[None], order[..., None], axis=2)
-    expected = np.full((len(evidence), NUM_CORNERS, 2), np.nan)
-    deviation = np.empty(len(evidence))
-    for i in range(len(evidence)):
-        deviation[i] = _best_triple(
-            candidates[i], likeliest[i], peaks.centroid[i], TRIPLES, WEIGHTS, PREDICTION_PX,
-            peaks.area_px, expected[i],
-        )  # fmt: skip
+    count = len(evidence)
+    expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
+    arms = np.empty((NUM_CORNERS, CANDIDATES, 2))
+    likeliest = np.empty((NUM_CORNERS, CANDIDATES))
+    # What speaks so much against a peak that no agreement makes up for it.
+    hopeless = -math.log(area_px / (2 * math.pi * PREDICTION_PX**2))
+    usable = np.zeros(NUM_CORNERS, np.int64)
+    for i in range(count):
+        for k in range(NUM_CORNERS):
+            usable[k] = 0
+            for m in range(evidence.shape[2]):
+                value = evidence[i, k, m]
+                if not value > hopeless:
+                    continue
+                place = usable[k]
+                while place > 0 and likeliest[k, place - 1] < value:
+                    place -= 1
+                if place == CANDIDATES:
+                    continue
+                usable[k] = min(usable[k] + 1, CANDIDATES)
+                for later in range(usable[k] - 1, place, -1):
+                    likeliest[k, later], arms[k, later] = (
+                        likeliest[k, later - 1],
+                        arms[k, later - 1],
+                    )
+                likeliest[k, place], arms[k, place] = value, position[k, m] - centroid[i]
+        deviation[i] = _best_triple(arms, likeliest, usable, area_px, expected[i])
+        expected[i] += centroid[i]
     return expected, deviation
 
 
 @compiled()
 def _best_triple(
-    candidates: Array,
-    evidence: Array,
-    centroid: Array,
-    triples: Array,
-    weights: Array,
-    deviation_px: float,
-    area_px: float,
-    expected: Array,
+    arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Write the corners that the best three candidates predict; returns their deviation."""
-    best, best_deviation = -math.inf, deviation_px
-    # What speaks so much against a peak that no agreement makes up for it.
-    hopeless = -math.log(area_px / (2 * math.pi * deviation_px**2))
-    count = candidates.shape[1]
-    corners, arms = np.empty((8, 2)), np.empty((3, 2))
-    chosen = np.empty(3, np.int64)
-    usable = np.zeros(8, np.int64)
-    for k in range(8):
-        # Candidates come likeliest first.
-        while usable[k] < count and evidence[k, usable[k]] > hopeless:
-            usable[k] += 1
-    for number in range(len(triples)):
-        a, b, c = usable[triples[number, 0]], usable[triples[number, 1]], usable[triples[number, 2]]
-        for code in range(a * b * c):
-            chosen[0], chosen[1], chosen[2] = code % a, code // a % b, code // (a * b)
-            for i in range(3):
-                arms[i] = candidates[triples[number, i], chosen[i]] - centroid
-            size = 0.0
-            for k in range(8):
+    """Write the arms of the corners that the best three candidates predict.
+
+    Returned is the standard deviation from them. A corner has so many ``usable`` candidates,
+    likeliest first; their arms are seen from the centroid.
+    """
+    best, best_variance = -math.inf, PREDICTION_PX**2
+    diagonals, known = np.empty((4, 2)), np.empty(3, np.int64)
+    corners, chosen = np.empty(3, np.int64), np.empty(3, np.int64)
+    for number in range(4 * 8):
+        missing, sides = number // 8, number % 8
+        for n in range(3):
+            known[n] = (missing + 1 + n) % 4
+            corners[n] = DIAGONALS[known[n], sides >> n & 1]
+        combinations = usable[corners[0]] * usable[corners[1]] * usable[corners[2]]
+        chosen[:] = 0
+        for _ in range(combinations):
+            diagonals[missing] = 0.0
+            for n in range(3):
+                sign = -1.0 if sides >> n & 1 else 1.0
+                weight = -ALTERNATING[missing] * ALTERNATING[known[n]]
                 for axis in range(2):
-                    arm = 0.0
-                    for i in range(3):
-                        arm += weights[number, k, i] * arms[i, axis]
-                    corners[k, axis] = arm
-                size += math.hypot(corners[k, 0], corners[k, 1]) / 8
-            deviation = math.hypot(deviation_px, PERSPECTIVE * size)
-            gain = math.log(area_px / (2 * math.pi * deviation**2))
-            total = 0.0
-            for k in range(8):
-                most = 0.0
-                for m in range(count):
-                    dx = candidates[k, m, 0] - centroid[0] - corners[k, 0]
-                    dy = candidates[k, m, 1] - centroid[1] - corners[k, 1]
-                    miss = (dx * dx + dy * dy) / (2 * deviation**2)
-                    value = evidence[k, m] + gain - miss
-                    # A peak that does not exist has −∞ or NaN.
-                    if value > most:
-                        most = value
-                total += most
+                    arm = sign * arms[corners[n], chosen[n], axis]
+                    diagonals[known[n], axis] = arm
+                    diagonals[missing, axis] += weight * arm
+            total, variance = _agreement(diagonals, arms, evidence, usable, area_px, best)
             if total > best:
-                best, best_deviation = total, deviation
-                for k in range(8):
-                    expected[k] = corners[k] + centroid
-    return best_deviation
+                best, best_variance = total, variance
+                for d in range(4):
+                    for axis in range(2):
+                        expected[DIAGONALS[d, 0], axis] = diagonals[d, axis]
+                        expected[DIAGONALS[d, 1], axis] = -diagonals[d, axis]
+            for n in range(3):  # the next combination, the first corner's candidates fastest
+                chosen[n] += 1
+                if chosen[n] < usable[corners[n]]:
+                    break
+                chosen[n] = 0
+    return math.sqrt(best_variance)
+
+
+@compiled()
+def _agreement(
+    diagonals: Array, arms: Array, evidence: Array, usable: Array, area_px: float, least: float
+) -> tuple[float, float]:
+    """Return the evidence of all candidates near these diagonals' corners, and their variance.
+
+    The sum may be given up, at whatever it is, once it cannot exceed ``least`` any more.
+    """
+    size = 0.0
+    for d in range(4):
+        size += math.sqrt(diagonals[d, 0] ** 2 + diagonals[d, 1] ** 2) / 4
+    variance = PREDICTION_PX**2 + (PERSPECTIVE * size) ** 2
+    gain, precision = math.log(area_px / (2 * math.pi * variance)), 0.5 / variance
+    possible = 0.0
+    for k in range(NUM_CORNERS):
+        if usable[k]:
+            possible += max(evidence[k, 0] + gain, 0.0)
+    for k in range(NUM_CORNERS):
+        if not possible > least:
+            break
+        if not usable[k]:
+            continue
+        most = 0.0
+        d, sign = (k, 1.0) if k < 4 else ((k + 2) % 4, -1.0)
+        for m in range(usable[k]):
+            value = evidence[k, m] + gain
+            if value <= most:
+                break
+            dx, dy = arms[k, m, 0] - sign * diagonals[d, 0], arms[k, m, 1] - sign * diagonals[d, 1]
+            most = max(most, value - (dx * dx + dy * dy) * precision)
+        possible += most - max(evidence[k, 0] + gain, 0.0)
+    return possible, variance

@@ -16,6 +16,7 @@ and give ``RecoveryOptions`` its weight.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
@@ -23,6 +24,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 
+from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
     CameraMatrix,
@@ -298,15 +300,19 @@ def fit_weights(
     return weights
 
 
-def _expected_distance(
-    covariance: Float[np.ndarray, "6 6"], points: Float[np.ndarray, "n 3"]
-) -> float:
+@compiled()
+def _expected_distance(covariance: Array, points: Array) -> float:
     """Return the RMS distance by which points (camera axes, from the origin) are uncertain."""
     total = 0.0
+    moves = np.zeros((3, 6))
+    for row in range(3):
+        moves[row, 3 + row] = 1.0
     for x, y, z in points:
         # A turn ω moves p by ω × p.
-        moves = np.array(
-            [[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1]], np.float64
-        )
-        total += float(np.trace(moves @ covariance @ moves.T))
-    return float(np.sqrt(max(total, 0.0) / len(points)))
+        moves[0, 1], moves[0, 2], moves[1, 2] = z, -y, x
+        moves[1, 0], moves[2, 0], moves[2, 1] = -z, y, -x
+        for row in range(3):
+            for a in range(6):
+                for b in range(6):
+                    total += moves[row, a] * covariance[a, b] * moves[row, b]
+    return math.sqrt(max(total, 0.0) / len(points))

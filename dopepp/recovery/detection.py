@@ -9,8 +9,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
+from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
+from dopepp.geometry.degeneracy import MIN_POINTS, too_few
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
@@ -82,11 +84,13 @@ def peaks_of_object(
     first = number * NUM_KEYPOINTS
     corners, centroid = (image, slice(first, first + NUM_CORNERS)), (image, first + CENTROID)
     strong = peaks.score[centroid] >= threshold
-    extent = np.array(cells) * stride
+    extent = np.array(cells) * float(stride)
     return ObjectPeaks(
         peaks.position[corners],
         peaks.score[corners],
-        _covariance_px(peaks.position[corners], peaks.covariance_px[corners], extent, stride),
+        _covariance_px(
+            peaks.position[corners], peaks.covariance_px[corners], extent, float(stride)
+        ),
         peaks.toward[corners],
         peaks.position[centroid][strong],
         peaks.score[centroid][strong],
@@ -95,16 +99,17 @@ def peaks_of_object(
     )
 
 
-def _covariance_px(
-    position: Float[np.ndarray, "8 peaks 2"],
-    covariance: Float[np.ndarray, "8 peaks 2 2"],
-    extent: Float[np.ndarray, "2"],
-    stride: float,
-) -> Float[np.ndarray, "8 peaks 2 2"]:
+@compiled()
+def _covariance_px(position: Array, covariance: Array, extent: Array, stride: float) -> Array:
     """Add what a peak at the border of the maps does not know; the outermost pixel ends at −½."""
-    inward = np.minimum(position + 0.5, extent - 0.5 - position).min(-1)
-    added = np.where(inward < BORDER * stride, (BORDER_DEVIATION * stride) ** 2, 0.0)
-    return np.asarray(covariance + added[..., None, None] * np.eye(2))
+    widened = covariance.copy()
+    for k, m in np.ndindex(position.shape[:2]):
+        x, y = position[k, m, 0], position[k, m, 1]
+        inward = min(x + 0.5, y + 0.5, extent[0] - 0.5 - x, extent[1] - 0.5 - y)
+        if inward < BORDER * stride:
+            for axis in range(2):
+                widened[k, m, axis, axis] += (BORDER_DEVIATION * stride) ** 2
+    return widened
 
 
 def pose_instances(
@@ -115,6 +120,8 @@ def pose_instances(
     coincident_px: float,
 ) -> list[tuple[KeypointGroup, PnPResult]]:
     """Group keypoints and solve poses by turns, until the poses change no group any more."""
+    if not len(peaks.centroid):
+        return []
     evidence = direction_evidence(peaks, math.radians(max_angle_deg), coincident_px)
     groups = associate(peaks, evidence)
     results = [solve_group(group, cuboid, K) for group in groups]
@@ -127,7 +134,7 @@ def pose_instances(
                 corners[:] = project_keypoints(cuboid, result.T_cam_obj, K)[:NUM_CORNERS]
         before, groups = groups, associate(peaks, evidence, expected)
         same = [
-            np.array_equal(old.position, new.position, equal_nan=True)
+            old.position.tobytes() == new.position.tobytes()
             for old, new in zip(before, groups, strict=True)
         ]
         if all(same):
@@ -149,23 +156,21 @@ def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPRes
     A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
     agree on a pose, the deviations are widened and the pose solved again.
     """
+    found = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
+    if found < MIN_POINTS:  # as of most centroids that noise makes
+        return PnPResult(None, math.inf, np.zeros(NUM_KEYPOINTS, bool), too_few(found))
     covariance = _averaged(group.covariance_px)
-    found = int(np.isfinite(group.position[:, 0]).sum())
-    best = None
-    for widening in WIDENINGS:
-        result = solve_pnp(cuboid, group.position, K, covariance_px=covariance * widening**2)
-        if best is None or result.inliers.sum() > best.inliers.sum():
-            best = result
-        if 3 * best.inliers.sum() >= 2 * found:
-            break
-    assert best is not None
-    return best
+    return solve_pnp(cuboid, group.position, K, covariance_px=covariance, widenings=WIDENINGS)
 
 
-def _averaged(covariance: Float[np.ndarray, "9 2 2"]) -> Float[np.ndarray, "9 2 2"]:
+@compiled()
+def _averaged(covariance: Array) -> Array:
     """Return circular covariances of the same mean variance, and the floor; NaN stays NaN."""
-    variance = covariance.trace(axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2
-    return np.asarray(variance[:, None, None] * np.eye(2))
+    averaged = np.zeros(covariance.shape)
+    for k in range(len(covariance)):
+        variance = (covariance[k, 0, 0] + covariance[k, 1, 1]) / 2 + SIGMA_FLOOR_PX**2
+        averaged[k, 0, 0] = averaged[k, 1, 1] = variance
+    return averaged
 
 
 def make_detection(

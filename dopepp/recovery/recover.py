@@ -64,7 +64,6 @@ def recover_batch(
     images or names as objects. A :class:`UserError`: an option is out of range.
     """
     chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
-    left_out: list[Reason] = [] if reasons is None else reasons
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
     _check_shapes(belief, field, len(cuboids), K)
     labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
@@ -81,7 +80,7 @@ def recover_batch(
         detections: list[Detection] = []
         for c, (cuboid, name) in enumerate(zip(cuboids, labels, strict=True)):
             own = peaks_of_object(peaks, image, c, chosen.centroid_threshold, cells, stride)
-            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, left_out)
+            detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, reasons)
             if reasons is not None and not len(own.centroid):
                 beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
                 reasons.append(no_centroid(beliefs, name, chosen))
@@ -113,21 +112,24 @@ def _recover_object(
     options: RecoveryOptions,
     stride: int,
     size: str,
-    reasons: list[Reason],
+    reasons: list[Reason] | None,
 ) -> Iterator[Detection]:
-    """Yield all instances of one object, and add a reason for each that is none."""
+    """Yield all instances of one object; ``reasons`` takes one for each that is none."""
     for group, result in pose_instances(peaks, cuboid, K, options.max_angle_deg, float(stride)):
         detection = make_detection(group, result, cuboid, K, name)
+        if detection is not None:
+            detection = calibrated(detection, cuboid, K, options)
+            if detection.score >= options.min_score:
+                yield detection
+                continue
+        if reasons is None:
+            continue
         x, y = group.position[CENTROID]
         where = f"at pixel ({x:.0f}, {y:.0f}) of {size}"
         if detection is None:
             reasons.append(no_pose(group, result.reason, name, where, stride))
-            continue
-        detection = calibrated(detection, cuboid, K, options)
-        if detection.score < options.min_score:
-            reasons.append(low_score(detection, options.min_score, where, stride))
         else:
-            yield detection
+            reasons.append(low_score(detection, options.min_score, where, stride))
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:

@@ -186,6 +186,32 @@ def test_beats_opencv_on_anisotropic_noise_and_wild_corners(name):
     assert our_rate >= 0.9
 
 
+@pytest.mark.parametrize("name", ["box", "plate"])
+def test_widenings_are_solved_in_turn_until_two_thirds_agree(name):
+    cuboid, rng = CUBOIDS[name], np.random.default_rng(7)
+    widened = set()
+    for _ in range(40):
+        pixels = project_keypoints(cuboid, look_at(cuboid, rng), K)
+        pixels += rng.uniform(0, 6) * rng.normal(size=(9, 2))
+        pixels[rng.random(9) < 0.2] = np.nan
+        least = 2 * np.isfinite(pixels[:, 0]).sum() / 3
+        best = None
+        for factor in (1.0, 2.0, 4.0):
+            one = solve_pnp(cuboid, pixels, K, factor)
+            if best is None or one.inliers.sum() > best.inliers.sum():
+                best, chosen = one, factor
+            if best.inliers.sum() >= least:
+                break
+        widened.add(chosen)
+        found = solve_pnp(cuboid, pixels, K, widenings=(1.0, 2.0, 4.0))
+        assert found.reason == best.reason
+        assert_array_equal(found.inliers, best.inliers)
+        if best.T_cam_obj is not None:
+            assert_allclose(found.T_cam_obj, best.T_cam_obj, atol=1e-9)
+            assert_allclose(found.covariance, best.covariance, rtol=1e-6, atol=1e-12)
+    assert len(widened) == 3
+
+
 DEGENERATE = {
     "three points": (CUBOIDS["box"][:3], [[0, 0], [100, 0], [0, 100]], "only 3 usable points"),
     "no points": (np.zeros((0, 3)), np.zeros((0, 2)), "only 0 usable points"),

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
@@ -183,6 +184,17 @@ def test_tiny_maps(size):
     )
     assert peaks.found.any(-1).all()
     assert np.isfinite(peaks.position[peaks.found]).all()
+
+
+@pytest.mark.parametrize("size", [(16, 16), (7, 31), (1, 9)])
+def test_peaks_are_the_highest_cells_of_their_neighbourhoods(size):
+    """As scipy finds them."""
+    belief = torch.rand(2, 9, *size, generator=torch.Generator().manual_seed(1))
+    score = find_peaks(belief, GEOMETRY, threshold=0.3, max_peaks=6).score
+    for found, image in zip(score.reshape(18, 6), belief.reshape(18, *size).numpy(), strict=True):
+        around = maximum_filter(image, 3, mode="constant", cval=-1)
+        highest = np.sort(image[(image == around) & (image > 0.3)])[::-1]
+        assert_array_equal(found[found > 0], highest[:6].astype(np.float64))
 
 
 def test_random_maps_never_give_a_position_that_is_none():

@@ -40,6 +40,28 @@ def test_every_combination_gives_stages_of_the_right_shape(
         assert torch.equal(one, same)
 
 
+@pytest.mark.parametrize(
+    ("backbone", "head"), [("Pyramid", "SharedTrunk"), ("DSC", "MultiScale"), ("VGG19", "Cascade")]
+)
+def test_the_copy_for_inference_answers_the_same_without_batch_norm(make_spec, backbone, head):
+    options = {"backbone_width": 0.125, "head_width": 0.125}
+    options |= {} if head == "SharedTrunk" else {"head_batch_norm": True}
+    network = build_network(make_spec(backbone, "CBAM", head, **options)).double()
+    images = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
+    for norm in (one for one in network.modules() if isinstance(one, nn.BatchNorm2d)):
+        for values, least in ((norm.running_var, 0.2), (norm.weight, 0.5), (norm.bias, -0.5)):
+            nn.init.uniform_(values, least, least + 1)
+        nn.init.normal_(norm.running_mean)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    folded = network.for_inference()
+    assert network.training
+    assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+    assert not any(isinstance(one, nn.BatchNorm2d) for one in folded.modules())
+    with torch.inference_mode():
+        for same, expected in zip(folded(images)[-1], network.eval()(images)[-1], strict=True):
+            torch.testing.assert_close(same, expected)
+
+
 @pytest.mark.parametrize("stages", [1, 2])
 def test_every_scale_of_a_multi_scale_stage_answers_maps_of_its_own(make_spec, stages):
     head = {"head_width": 0.125, "head_stages": stages, "head_batch_norm": True}

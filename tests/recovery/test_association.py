@@ -1,12 +1,21 @@
 import math
+from itertools import combinations, product
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.geometry.camera import project_keypoints, transform
 from dopepp.geometry.cuboid import CORNER_SIGNS
-from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
+from dopepp.recovery.association import (
+    PERSPECTIVE,
+    PREDICTION_PX,
+    KeypointGroup,
+    ObjectPeaks,
+    _predict,
+    associate,
+    direction_evidence,
+)
 from dopepp.recovery.detection import solve_group
 
 WIDE = math.radians(45)
@@ -90,6 +99,37 @@ def test_corners_in_one_direction_are_told_apart_by_the_others():
             right += (one.position[:8] == corners[:, n]).all(1).sum()
             total += 8
     assert right >= 0.97 * total
+
+
+def test_the_triple_with_the_most_evidence_predicts_the_corners():
+    """Against all triples without an opposite pair, each corner as the triple's weighted sum."""
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        corners, centroids = crowd(rng, 3)
+        corners = corners + rng.normal(0, 3, corners.shape)
+        toward = 0.05 * rng.normal(size=corners.shape)  # so short that all may belong together
+        found = peaks(corners, toward, centroids)
+        evidence = direction_evidence(found, math.pi, 8.0)
+        expected, deviation = _predict(found.position, evidence, centroids, found.area_px)
+        for i, centroid in enumerate(centroids):
+            best = -np.inf
+            for triple in combinations(range(8), 3):
+                signs = CORNER_SIGNS[list(triple)]
+                if abs(np.linalg.det(signs)) < 1:
+                    continue
+                weights = np.linalg.solve(signs.T, CORNER_SIGNS.T).T
+                for chosen in product(range(corners.shape[1]), repeat=3):
+                    arms = corners[list(triple), list(chosen)] - centroid
+                    predicted = weights @ arms
+                    size = np.linalg.norm(predicted, axis=1).mean()
+                    variance = PREDICTION_PX**2 + (PERSPECTIVE * size) ** 2
+                    squared = ((corners - centroid - predicted[:, None]) ** 2).sum(-1)
+                    gain = np.log(found.area_px / (2 * np.pi * variance)) - squared / 2 / variance
+                    total = np.maximum(evidence[i] + gain, 0).max(1).sum()
+                    if total > best + 1e-9:
+                        best, answer = total, (predicted + centroid, np.sqrt(variance))
+            assert_allclose(expected[i], answer[0], atol=1e-9)
+            assert_allclose(deviation[i], answer[1])
 
 
 def test_a_pose_found_before_decides():

@@ -27,6 +27,7 @@ from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import network_cost
+from dopepp.models.spec import build_network
 from dopepp.parts.part import Parts
 from dopepp.recovery.silence import Reason, furthest
 
@@ -113,8 +114,9 @@ class EstimatorMethod:
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
-        size = self.estimator.checkpoint.input_size
-        parameters, gmacs = network_cost(self.estimator.network, size)
+        checkpoint = self.estimator.checkpoint
+        network = build_network(checkpoint.spec)  # as it was trained: the estimator's is folded
+        parameters, gmacs = network_cost(network, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 

@@ -1,0 +1,144 @@
+"""One scene in many pictures: what is done to a picture and to its K leaves the metric pose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from dopepp import PoseEstimator
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, project_keypoints
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory, render
+
+SIZE = (1920, 1080)
+MOST_MM, MOST_DEG = 1.0, 0.3
+AROUND_PX = 40
+LENS = np.array([-0.18, 0.06, 0.0015, -0.001, 0.01])
+"""Up to 40 pixels off at the corners of the whole picture."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is done to the picture, in this order.
+
+    Attributes:
+        cut: Shares of width and height that go left, above, right and below, as far as the part
+            and some pixels around it stay.
+        scale: Pixels per pixel; the picture is resized to whole pixels, so that fx and fy differ.
+        turns: Quarter turns, anticlockwise.
+        lens: Whether a lens distorts it.
+        flipped: Whether its channels lie in memory the other way round, as in ``bgr[..., ::-1]``.
+    """
+
+    cut: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    scale: float = 1.0
+    turns: int = 0
+    lens: bool = False
+    flipped: bool = False
+
+
+VGA = View(cut=(1 / 8, 0.0, 1 / 8, 0.0), scale=4 / 9)
+PORTRAIT = View(cut=(0.35, 0.0, 0.35, 0.0))
+VIEWS = st.builds(
+    View,
+    cut=st.tuples(*[st.floats(0.0, 0.5)] * 4),
+    scale=st.floats(0.35, 1.0),
+    turns=st.integers(0, 3),
+    lens=st.booleans(),
+    flipped=st.booleans(),
+)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Factory([pivconnector()], PRESETS["wide"].reframed(*SIZE), seed=4).scene(0, 0)
+
+
+@pytest.fixture(scope="module")
+def picture(scene):
+    return render(scene).image
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return PoseEstimator.load("pretrained/pivconnector_wide", refine="region")
+
+
+@pytest.fixture(scope="module")
+def whole(estimator, scene, picture):
+    """The pose on the whole picture."""
+    (found,) = estimator.predict(picture, scene.K)
+    assert not found.kept
+    return found.T_cam_obj
+
+
+@settings(max_examples=8, deadline=None, derandomize=True, database=None)
+@given(VIEWS)
+@example(VGA)
+@example(PORTRAIT)
+@example(View(turns=1))
+@example(View(lens=True))
+@example(View(scale=1 / 3, lens=True, flipped=True))
+def test_the_metric_pose_stays(estimator, scene, picture, whole, view):
+    keypoints = project_keypoints(pivconnector().cuboid, whole, scene.K)
+    seen, K = made(view, picture, scene.K, keypoints)
+    assert view is not VGA or seen.shape == (480, 640, 3)
+    found = estimator.predict(seen, K, LENS if view.lens else None, cropped=True)
+    assert found, "nothing found"
+    back = np.eye(4)
+    back[:3, :3] = quarter_turn(-view.turns)
+    T = back @ found[0].T_cam_obj
+    assert 1000 * np.linalg.norm(T[:3, 3] - whole[:3, 3]) < MOST_MM
+    assert math.degrees(rotation_angle(T[:3, :3] @ whole[:3, :3].T)) < MOST_DEG
+
+
+def made(
+    view: View, picture: Picture, K: CameraMatrix, keypoints: np.ndarray
+) -> tuple[Picture, CameraMatrix]:
+    """Return the picture of a view and its K, by formulas of this file's own."""
+    limit = np.array(picture.shape[1::-1])
+    lower, upper = keypoints.min(0) - AROUND_PX, keypoints.max(0) + AROUND_PX
+    left, top = np.clip(np.minimum(view.cut[:2] * limit, lower), 0, limit).astype(int)
+    right, bottom = np.clip(limit - np.minimum(view.cut[2:] * limit, limit - upper), 0, limit)
+    right, bottom = math.ceil(right), math.ceil(bottom)
+    picture = picture[top:bottom, left:right]
+    (width, height), K = (right - left, bottom - top), K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+    columns, rows = round(view.scale * width), round(view.scale * height)
+    picture = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    # Pixel corners, at halves, stay corners.
+    corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    K = np.linalg.inv(corner) @ np.diag([columns / width, rows / height, 1]) @ corner @ K
+    for _ in range(view.turns):
+        # Anticlockwise, (u, v) goes to (v, columns − 1 − u).
+        columns = picture.shape[1]
+        turned = np.array([[0, 1, 0], [-1, 0, columns - 1], [0, 0, 1.0]])
+        K = turned @ K @ quarter_turn(-1)
+        picture = np.rot90(picture)
+    if view.lens:
+        picture = distorted(picture, K)
+    if view.flipped:
+        picture = np.ascontiguousarray(picture[..., ::-1])[..., ::-1]
+    return picture, K
+
+
+def quarter_turn(turns: int) -> np.ndarray:
+    """Return what turns the camera's axes as the picture is turned, anticlockwise."""
+    once = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    return np.linalg.matrix_power(once, turns % 4)
+
+
+def distorted(picture: Picture, K: CameraMatrix) -> Picture:
+    """Return a picture as the lens shows it: each of its pixels is read where the ray ends."""
+    rows, columns = picture.shape[:2]
+    pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels.astype(np.float64), K, LENS, P=K)
+    at = straight.reshape(rows, columns, 2).astype(np.float32)
+    return cv2.remap(np.ascontiguousarray(picture), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
