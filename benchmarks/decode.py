@@ -54,7 +54,7 @@ def scene(count: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Ten
     return belief[0], field[0]
 
 
-def noisy(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def disturbed(rng: np.random.Generator, wrong: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """Maps of one instance with noise, of right keypoints or of wrong ones."""
     t = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.8, 1.2)])
     T = make_transform(Rotation.random(random_state=rng).as_matrix(), t)
@@ -103,7 +103,7 @@ def main() -> None:
     for name, wrong in (("noisy maps", False), ("wrong keypoints", True)):
         spent = [
             milliseconds(partial(recover, *maps, CRACKER_BOX[None], K, STRIDE), repeats=3)
-            for maps in (noisy(rng, wrong) for _ in range(NOISY))
+            for maps in (disturbed(rng, wrong) for _ in range(NOISY))
         ]
         print(f"{name:>16}{np.median(spent):10.2f}{np.quantile(spent, 0.9):10.2f}")
     print("\nTest images: on the network's own maps, and on true ones with the noise of job=cost")

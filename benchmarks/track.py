@@ -1,6 +1,6 @@
 """Tracking on rendered sequences: how near, how steady, how soon again, how fast.
 
-    python benchmarks/track.py [--checkpoint pretrained/NAME] [--seeds 3] [--pictures FOLDER]
+    python benchmarks/track.py [--checkpoint NAME] [--seeds 3] [--first 0] [--pictures FOLDER]
 
 The part rests, is turned (up to 8° a frame) and shifted (up to 5 % of its distance a frame), passes
 behind a hand-sized occluder, is covered completely for 15 frames, and rests again, while the light
@@ -168,6 +168,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="pretrained/pivconnector_wide")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="the first of the seeds")
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--pictures", type=Path)
     arguments = parser.parse_args()
@@ -178,7 +179,7 @@ def main() -> None:
     estimator = estimator.refining("region", [part])
     titles = "seed | within 5 mm and 2° | at rest mm | at rest ° | frames to recover | frames/s"
     print(f"| {titles} | ms p50 | p95 |\n" + "| --- " * 8 + "|")
-    for seed in range(arguments.seeds):
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
         row = measure(estimator, part, seed, arguments.frames, arguments.pictures)
         print("| " + " | ".join(row) + " |", flush=True)
 

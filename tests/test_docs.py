@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -11,15 +11,16 @@ from typing import Final
 import pytest
 import typer.main
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
 
 from dopepp.cli import app
-from dopepp.experiment.command_line import SHORT_NAMES
-from dopepp.experiment.reports import protocols
+from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, SHORT_NAMES
 from dopepp.virtual.presets.preset import PRESETS
 
 ROOT: Final = Path(__file__).parents[1]
 CONF: Final = ROOT / "conf"
-DOCUMENTS: Final = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+DOCUMENTS: Final = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 FENCE: Final = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SPAN: Final = re.compile(r"`([^`\n]+)`")
@@ -27,20 +28,49 @@ LINK: Final = re.compile(r"\]\(([^)\s]+)\)")
 OTHER_TOOLS: Final = {"--cfg"}
 """Options of Hydra's own that documents name alone."""
 
-COMMANDS: Final = typer.main.get_command(app).commands
+USAGE_ERROR: Final = typer.BadParameter.__mro__[1]
+"""Of the click that Typer brings along or imports."""
+APP: Final = typer.main.get_command(app)
+APP_OPTIONS: Final = {text for parameter in APP.params for text in parameter.opts}
+COMMANDS: Final = APP.commands
 OPTIONS: Final = {
-    name: {text for parameter in command.params for text in parameter.opts} | {"--help"}
+    name: {
+        text
+        for one in (command, *getattr(command, "commands", {}).values())  # of `dopepp calibrate …`
+        for parameter in one.params
+        for text in parameter.opts
+    }
+    | {"--help"}
     for name, command in COMMANDS.items()
 }
 
 
+ENTRIES: Final = {
+    ("python", "train.py"): SHORT_NAMES,
+    ("dopepp", "train"): SHORT_NAMES,
+    ("python", "evaluate.py"): EVALUATION_SHORT_NAMES,
+    ("dopepp", "evaluate"): EVALUATION_SHORT_NAMES,
+}
+"""What takes Hydra's overrides, and its short names."""
+
+
+def fenced(text: str, language: str) -> list[str]:
+    return [content for name, content in FENCE.findall(text) if name == language]
+
+
+def typed_commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of every shell command in a document's fenced blocks."""
+    for content in fenced(text, "bash"):
+        yield from words_of(content.replace("\\\n", " ").splitlines())
+
+
 def commands(text: str) -> Iterator[list[str]]:
     """Yield the words of every shell command in a document, of fenced blocks and of code spans."""
-    lines: list[str] = []
-    for language, content in FENCE.findall(text):
-        if language == "bash":
-            lines += content.replace("\\\n", " ").splitlines()
-    lines += SPAN.findall(FENCE.sub("", text))
+    yield from typed_commands(text)
+    yield from words_of(SPAN.findall(FENCE.sub("", text)))
+
+
+def words_of(lines: Sequence[str]) -> Iterator[list[str]]:
     for line in lines:
         for command in line.split("&&"):
             try:
@@ -118,7 +148,9 @@ def test_links_lead_somewhere(path):
 def test_console_commands_and_their_options_exist(path):
     bad = []
     for words in commands(path.read_text()):
-        if words[0] == "dopepp" and len(words) > 1:
+        if words[0] == "dopepp" and tuple(words[:2]) not in ENTRIES and len(words) > 1:
+            if words[1] in APP_OPTIONS:
+                continue
             if words[1] not in COMMANDS:
                 bad.append(" ".join(words))
                 continue
@@ -147,7 +179,7 @@ def test_options_of_training_and_evaluation_exist(path):
     groups = {key.split(".")[0] for key in KEYS if "." in key}
     text, bad = path.read_text(), []
     for words in commands(text):
-        entry = " ".join(words[:2]) in ("python train.py", "python evaluate.py")
+        entry = tuple(words[:2]) in ENTRIES
         # A span on its own: data/test=photoreal, virtual.backgrounds=DIR, data.cache_dir.
         alone = re.match(r"(\w+)(/\w+)*=|(\w+)\.[\w.]+(=|$)", words[0])
         if entry:
@@ -156,7 +188,7 @@ def test_options_of_training_and_evaluation_exist(path):
             overrides = [word for word in words if re.match(r"[\w./]+(=|$)", word)]
         else:
             continue
-        short = SHORT_NAMES | (protocols.SHORT_NAMES if words[1:2] == ["evaluate.py"] else {})
+        short = ENTRIES.get(tuple(words[:2]), SHORT_NAMES)
         overrides = [re.sub(r"^\w+", lambda key, short=short: short.get(key[0], key[0]), one)
                      for one in overrides]  # fmt: skip
         problems = [problem for one in overrides if (problem := option_problem(one))]
@@ -165,12 +197,47 @@ def test_options_of_training_and_evaluation_exist(path):
     assert not bad
 
 
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def test_fenced_commands_are_ones_that_their_programs_read(path):
+    told = {" ".join(words): parse_problem(words) for words in typed_commands(path.read_text())}
+    assert not {command: problem for command, problem in told.items() if problem}
+
+
+def parse_problem(words: list[str]) -> str | None:
+    """Hand a command to its parser, which runs nothing; return what it objects to."""
+    program, arguments = tuple(words[:2]), words[2:]
+    try:
+        if program in ENTRIES:
+            plain = [re.sub("…|<.*?>", "x", word) for word in arguments]
+            overrides = [word for word in plain if "=" in word and not word.startswith("-")]
+            OverridesParser.create().parse_overrides(overrides)
+        elif words[0] == "dopepp" and program[1] in COMMANDS:
+            command = COMMANDS[program[1]]
+            if hasattr(command, "commands"):
+                name, *arguments = arguments
+                command = command.commands[name]
+            command.make_context(program[1], arguments)
+    except (OverrideParseException, USAGE_ERROR) as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def test_python_of_the_pages_compiles(path):
+    for number, code in enumerate(fenced(path.read_text(), "python")):
+        lines = f"{{{code}}}" if re.match(r'"\w', code) else code  # lines to put into a dictionary
+        compile(lines, f"{path.name}, block {number}", "exec")
+
+
 def test_it_finds_what_does_not_exist():
     """The checks above would find nothing in an empty list, too."""
     assert option_problem("data=cbp") == "no conf/data/cbp.yaml"
     assert option_problem("data.preset=paper") == "no option data.preset"
     assert option_problem("virtual.scene.lighting.lamps=3") is not None
     assert option_problem("virtual.scene.table.tilt_deg=[0,5]") is None
+    assert parse_problem(["dopepp", "train", "model=[a"]) is not None
+    assert parse_problem(["dopepp", "predict", "a.ckpt", "a.png", "--K", "1", "2", "x", "4"])
+    assert parse_problem(["dopepp", "predict"]) is not None
     starts = [words[:2] for words in commands((ROOT / "README.md").read_text())]
     assert ["dopepp", "render"] in starts
     assert ["python", "train.py"] in starts

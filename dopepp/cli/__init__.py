@@ -6,16 +6,35 @@ To add a command, write a function in a module of its name and one line in :data
 from __future__ import annotations
 
 import logging
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
 
-from dopepp.cli import check, compare, download, predict, release, render, symmetries
+from dopepp import __version__
+from dopepp.cli import (
+    benchmark,
+    calibrate,
+    check,
+    compare,
+    download,
+    entries,
+    export,
+    predict,
+    release,
+    render,
+    serve,
+    symmetries,
+)
 from dopepp.cli.errors import USERS_MISTAKE
 
 COMMANDS: Final = (
+    entries.train,
+    entries.evaluate,
     predict.predict,
+    serve.serve,
+    export.export,
+    benchmark.benchmark,
     render.render,
     check.check,
     download.download,
@@ -44,16 +63,33 @@ class _OneLine(TyperGroup):
 app = typer.Typer(
     cls=_OneLine,
     no_args_is_help=True,
-    add_completion=False,
     help="The console command ``dopepp``; each subcommand imports what it needs when it is called.",
 )
 
 
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"dopepp {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def _configure() -> None:
-    """Poses of weakly textured parts: render, check, predict and compare."""
+def _configure(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="print it")
+    ] = False,
+) -> None:
+    """Poses of weakly textured parts: train, measure, predict, render, check and compare."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
 
 for _command in COMMANDS:
-    app.command(cls=render.RenderCommand if _command is render.render else None)(_command)
+    app.command(
+        cls=render.RenderCommand if _command is render.render else None,
+        context_settings=entries.HANDED_ON
+        if _command in (entries.train, entries.evaluate)
+        else None,
+        add_help_option=_command not in (entries.train, entries.evaluate),
+    )(_command)
+
+app.add_typer(calibrate.app, name="calibrate")

@@ -11,16 +11,18 @@ import typer
 from dopepp.core.errors import RunError, UserError
 
 USERS_MISTAKE: Final = 2
+FAILED: Final = 1
 
 
 @contextmanager
 def report_errors() -> Iterator[None]:
-    """End the command with one line for a user's mistake."""
+    """End the command with one line for a user's mistake, or for work that cannot go on."""
     try:
         yield
-    except UserError as error:
+    except (UserError, RunError) as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(USERS_MISTAKE) from error
+        code = USERS_MISTAKE if isinstance(error, UserError) else FAILED
+        raise typer.Exit(code) from error
 
 
 @contextmanager

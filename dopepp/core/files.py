@@ -14,8 +14,10 @@ import hashlib
 import io
 import os
 import re
+import shutil
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -85,6 +87,24 @@ def write_whole(path: Path | str, content: bytes) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def draft(path: Path) -> Iterator[Path]:
+    """Yield a place for a file or a folder, which then takes the place of what was at a path.
+
+    Where the block fails, what was there stays and nothing else is left.
+    """
+    folder = partial_path(path)
+    folder.mkdir(parents=True)
+    try:
+        place = folder / path.name
+        yield place
+        if path.is_dir():
+            shutil.rmtree(path)
+        place.replace(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 PARTIAL_SUFFIX: Final = ".partial"

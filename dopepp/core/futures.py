@@ -37,6 +37,17 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def physical_cores() -> int:
+    """Return how many cores this process may use, two that share one's arithmetic as one."""
+    if not hasattr(os, "sched_getaffinity"):
+        return os.cpu_count() or 1
+    siblings = set()
+    for core in os.sched_getaffinity(0):
+        path = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list")
+        siblings.add(path.read_text() if path.is_file() else str(core))
+    return len(siblings)
+
+
 def cpu_fact(*names: str) -> str:
     """Return what Linux states of the first processor under one of these names; else nothing."""
     path = Path("/proc/cpuinfo")

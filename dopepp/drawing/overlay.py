@@ -193,7 +193,7 @@ def draw_tags(image: Picture, tags: Sequence[tuple[str, tuple[float, float], Col
 @lru_cache(maxsize=256)
 def text_coverage(text: str, size_px: int) -> Float[np.ndarray, "size_px width"]:
     """Rasterise one line: how much of each pixel the glyphs cover, in [0, 1]; do not change it."""
-    # Its import takes a second, and only text needs it.
+    # Imported where text is drawn: a command that prints poses alone starts without it.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

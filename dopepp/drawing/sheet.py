@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from dopepp.drawing.overlay import Colour, draw_line, draw_text, text_coverage
 from dopepp.drawing.pictures import DepthMap, Mask, Picture
+from dopepp.geometry.cuboid import CENTROID
 
 _CAPTION_PX: Final = 18
 _MIN_CAPTION_PX: Final = 9
@@ -105,6 +106,38 @@ def message_picture(width: int, height: int, text: str) -> Picture:
             break
         draw_text(picture, line, (size, top), size, (255, 255, 255))
     return picture
+
+
+def belief_tiles(
+    image: Picture, beliefs: Float[np.ndarray, "9 map_height map_width"], stride: int, name: str
+) -> list[Tile]:
+    """Show an image twice with the maxima: under its corners' and under its centroid's beliefs.
+
+    See :func:`heat_picture`; the captions begin with ``name``.
+    """
+    maps = {"corners": beliefs[:CENTROID].max(axis=0), "centroid": beliefs[CENTROID]}
+    return [
+        Tile(heat_picture(image, one, stride), f"{name} {which}, max {one.max():.2f}")
+        for which, one in maps.items()
+    ]
+
+
+def heat_picture(
+    image: Picture, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
+) -> Picture:
+    """Blend one map into the dimmed image, the more opaque the stronger the belief.
+
+    The image is at the scale of the network's input, ``stride`` pixels per cell of the map that
+    covers it, whose values are clipped to [0, 1].
+    """
+    # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
+    large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)
+    share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)
+    heat = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_JET)
+    weight = (0.8 * share)[..., None]
+    # The picture is dimmed, so that a faint belief is not lost in a bright background.
+    blended = (1 - weight) * 0.6 * image + weight * heat[..., ::-1]
+    return np.asarray(np.rint(blended), np.uint8)
 
 
 def mask_panel(image: Picture, masks: Sequence[Mask | None]) -> Picture:

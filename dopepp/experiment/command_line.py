@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import difflib
 import errno
-import inspect
 import logging
 import os
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,22 +21,25 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import dopepp
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
 from dopepp.experiment.launch import remote
-from dopepp.experiment.reports.report import Report
-from dopepp.experiment.runs import display, record
-from dopepp.experiment.runs.resume import read_overrides, remember_overrides
-from dopepp.experiment.runs.sweep import compare_jobs
-from dopepp.training.callbacks.trial import PrunedError
+from dopepp.experiment.runs import program
+
+# The modules that load PyTorch are imported inside functions: a typo is told before.
 
 _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
+
+_PACKAGE: Final = Path(dopepp.__file__).parent
+_SHIPPED: Final = _PACKAGE / "conf"
+CONF: Final = _SHIPPED if _SHIPPED.is_dir() else _PACKAGE.parent / "conf"
+"""Inside the package that a wheel has installed; of a checkout, beside it."""
 
 SHORT_NAMES: Final = {
     "camera": "virtual.camera",
@@ -44,6 +47,9 @@ SHORT_NAMES: Final = {
     "max_tilt_deg": "virtual.scene.turning.tilt_deg",
 }
 """What options of how a part is seen are called on the command line, and where they stand."""
+EVALUATION_SHORT_NAMES: Final = {**SHORT_NAMES, "scale": "scale_factors"}
+"""``evaluate.py``'s; ``scale`` alone, without being short for something, would be a file of
+``conf/scale``, which chooses a training's sizes."""
 
 FAILED: Final = 1
 USERS_MISTAKE: Final = 2
@@ -58,22 +64,31 @@ def run_job(config: DictConfig, job: Job) -> float | None:
     In a multirun a failing job leaves ``failed.json``, one that a search has stopped
     ``pruned.json``, and the others run. Returned is the objective of a multirun's training, for
     Hydra's sweepers; None where there is none.
+
+    A run that is refused because of what its user asked for leaves no folder.
     """
     hydra = HydraConfig.get()
     run_dir = Path(hydra.runtime.output_dir)
     if hydra.mode != RunMode.MULTIRUN:
+        if remote.is_first_process():
+            program.say(f"begins in {program.shown(run_dir)}")
         try:
             # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
-            if not any(text.startswith("resume=") for text in hydra.overrides.task):
+            resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
+            if not resumed:
+                from dopepp.experiment.runs.resume import remember_overrides
+
                 remember_overrides(run_dir)
                 remote.remember_run(sys.argv[1:], run_dir)
             job(_plain(config), run_dir)
-        except UserError as error:  # here, because Hydra would print a stack before handing it on
-            _exit(error, USERS_MISTAKE)
+        # Here, because Hydra would print a stack before handing it on.
+        except (UserError, OmegaConfBaseException) as error:
+            if not resumed and remote.is_first_process():
+                _remove_unused(run_dir)
+            told = error if isinstance(error, UserError) else _explain(error, None)
+            _exit(told, USERS_MISTAKE)
         except RunError as error:
             _exit(error, FAILED)
-        except OmegaConfBaseException as error:
-            _exit(_explain(error, None), USERS_MISTAKE)
         except OSError as error:
             if error.errno not in _REFUSALS:
                 raise
@@ -87,8 +102,24 @@ def run_job(config: DictConfig, job: Job) -> float | None:
         return _run_one_of_many(config, job, run_dir)
 
 
+def _remove_unused(run_dir: Path) -> None:
+    """Remove the folder of a refused run, unless it holds more than how it was started."""
+    from dopepp.experiment.runs import record
+
+    names = {path.name for path in run_dir.iterdir()}
+    if all(one in record.OF_THE_START or one.startswith(record.DIFFERENCE) for one in names):
+        shutil.rmtree(run_dir)
+        if not any(run_dir.parent.iterdir()):
+            run_dir.parent.rmdir()
+
+
 def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
     """Run a job of a multirun, whose end stands in its folder."""
+    from dopepp.experiment.reports.report import Report
+    from dopepp.experiment.runs import display, record
+    from dopepp.experiment.runs.sweep import compare_jobs
+    from dopepp.training.callbacks.trial import PrunedError
+
     for name in (record.FAILURE_FILE, record.PRUNED_FILE):  # of an attempt before this one
         (run_dir / name).unlink(missing_ok=True)
     try:
@@ -125,34 +156,36 @@ def entry(
     main: Callable[[], object],
     open_nodes: Sequence[str] = (),
     short_names: Mapping[str, str] | None = None,
+    num_words: int = 1,
 ) -> None:
     """Run an entry point and exit with its code; a user's mistake is printed as one line.
 
-    ``main`` is the function under ``@hydra.main``. Keys of the open nodes are not in ``conf/`` but
-    checked later, so that they can be set without Hydra's ``+``: ``virtual.scene`` takes any field
-    of a preset. ``short_names`` is what options may be called instead of their names.
+    ``main`` hands ``sys.argv`` to Hydra, but for the ``num_words`` of the program. Keys of the open
+    nodes are not in ``conf/`` but checked later, so that they can be set without Hydra's ``+``:
+    ``virtual.scene`` takes any field of a preset. ``short_names`` is what options may be called
+    instead of their names.
     """
     # Hydra would print its own pages of text and exit with 1; so it hands its errors on instead.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     remote.configure_logging()
     try:
-        arguments = [_spelled_out(text, short_names or {}, open_nodes) for text in sys.argv[1:]]
-        begun = remote.begun_run(arguments)
+        words, given = sys.argv[:num_words], sys.argv[num_words:]
+        arguments = [_spelled_out(text, short_names or {}, open_nodes) for text in given]
+        begun = remote.begun_run([*words[1:], *arguments])
         if begun is not None:
             arguments.append(f"resume={begun}")
         _refuse_used_folder(arguments)
-        sys.argv = [sys.argv[0], *_resumed(arguments)]
+        sys.argv = [*words, *_resumed(arguments)]
         with interruptible("start the command again"):
             main()
     except Interruption as interruption:
         line = str(interruption)
-        first = not getattr(rank_zero_only, "rank", 0)
+        first = remote.is_first_process()
         if interruption.number == signal.SIGTERM and remote.job_id() is not None and first:
             line = f"{line}; {remote.requeue()}"
         _exit(line, interruption.exit_code)
     except (HydraException, OmegaConfBaseException) as error:  # one of Hydra's is an OSError, too
-        config_dir = Path(inspect.getfile(inspect.unwrap(main))).parent / "conf"
-        _exit(_explain(error, config_dir), USERS_MISTAKE)
+        _exit(_explain(error, CONF), USERS_MISTAKE)
     except OSError as error:  # the jobs' own are dealt with: what is left is Hydra's
         if error.errno not in _REFUSALS:
             raise
@@ -164,7 +197,7 @@ def entry(
 
 
 def _exit(line: object, code: int) -> None:
-    display.console.file.flush()
+    sys.stdout.flush()
     sys.stderr.write(f"{line}\n")
     raise SystemExit(code)
 
@@ -186,7 +219,9 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
     folder = words.get("hydra.run.dir", "")
     if not folder or words.get("resume", "null") not in ("", "null"):
         return
-    if Path(folder, record.VERSIONS_FILE).is_file() and not getattr(rank_zero_only, "rank", 0):
+    from dopepp.experiment.runs import record
+
+    if Path(folder, record.VERSIONS_FILE).is_file() and remote.is_first_process():
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",
             "a folder without one",
@@ -199,6 +234,8 @@ def _resumed(arguments: list[str]) -> list[str]:
     runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
     if not runs or runs[-1] in ("", "null"):
         return arguments
+    from dopepp.experiment.runs.resume import read_overrides
+
     run = Path(runs[-1])
     overrides = read_overrides(run)
     if overrides is None:

@@ -37,7 +37,7 @@ from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.network import PoseNetwork, network_cost
+from dopepp.models.network import network_cost
 from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
@@ -172,9 +172,7 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
         network_ms=1000 * float(np.median(frames.network_seconds)),
         recovery_ms=1000 * float(np.median(frames.recovery_seconds)),
         batch_size=config.cost.batch_size,
-        frames_per_s=_frames_per_s(
-            estimator.network, config.cost.batch_size, description.input_size
-        ),
+        frames_per_s=_frames_per_s(estimator, config.cost.batch_size, description.input_size),
     )
     record.write_config(run_dir, config.plain)
     record.write_json(run_dir / COST_FILE, asdict(cost))
@@ -265,16 +263,16 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
 
 
 @torch.inference_mode()
-def _frames_per_s(network: PoseNetwork, batch_size: int, size: tuple[int, int]) -> float:
+def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
     """Return what the network alone reaches in the fastest of some passes over random images."""
-    device = next(network.parameters()).device
+    device = estimator.device
     shape = (batch_size, 3, size[1], size[0])
     images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
     images = images.contiguous(memory_format=torch.channels_last)
     times = []
     for _ in range(WARM_UP + _BATCHES):
         start = time.perf_counter()
-        network.maps(images)
+        estimator.network.maps(images)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - start)

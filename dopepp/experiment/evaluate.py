@@ -35,6 +35,8 @@ from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.experiment.tuning import FalsePositiveTarget, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refine
+from dopepp.inference.runtimes import is_export
+from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery.silence import summary
 
@@ -238,10 +240,11 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if asked.ckpt_path is None and asked.results is None:
         allowed = "ckpt_path=… or results=… on the command line"
         raise UserError("no ckpt_path", allowed, "add what is to be measured")
+    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
     device = asked.device
     if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
+        exported = any(is_export(Path(path)) for path in paths)
+        device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
     loaded = [PoseEstimator.load(path, device) for path in paths]
     own = loaded[-1].checkpoint if loaded else None
     measured = str(asked.results if own is None else paths[-1])
@@ -294,6 +297,9 @@ def _tune_only(
     if asked.ckpt_path is None or len(loaded) > 1:
         allowed = "one ckpt_path, and no baseline"
         raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+    if not isinstance(loaded[0].network, PoseNetwork):
+        fix = "tune the checkpoint, then export the tuned one"
+        raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)
     estimator = refining(loaded[0], asked.refine, parts)
     tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
     display.show_files(run_dir)

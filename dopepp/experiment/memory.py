@@ -9,12 +9,13 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable, Hashable
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 from dopepp.data.sample import Sample, Source
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.models.heads import Stage
-from dopepp.models.network import Images, PoseNetwork
+from dopepp.models.network import Images
 
 MOST_BYTES: Final = 2**30
 """Of all that is kept: 1,400 pictures of 400×400 pixels, with the maps of one part."""
@@ -46,7 +47,7 @@ class Memory:
     def behind(self, estimator: PoseEstimator) -> PoseEstimator:
         """Return a copy of an estimator that runs its network once on each picture."""
         remembering = copy.copy(estimator)
-        remembering.network = cast(PoseNetwork, _RememberedNetwork(estimator.network, self))
+        remembering.network = _RememberedNetwork(estimator.network, self)
         return remembering
 
 
@@ -65,7 +66,7 @@ class _RememberedSource:
 
 
 class _RememberedNetwork:
-    def __init__(self, network: PoseNetwork, memory: Memory) -> None:
+    def __init__(self, network: Runtime, memory: Memory) -> None:
         self.stride, self.size_multiple = network.stride, network.size_multiple
         self._network, self._memory = network, memory
 

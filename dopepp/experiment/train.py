@@ -37,7 +37,7 @@ from dopepp.experiment.lr_finder import find_learning_rate
 from dopepp.experiment.reports.conditions import check_masks
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report, full_size_cost
-from dopepp.experiment.runs import display, readme, record
+from dopepp.experiment.runs import display, program, readme, record
 from dopepp.experiment.runs.images import describe_images
 from dopepp.experiment.runs.resume import ConfigDifference, check_resume, remember_overrides
 from dopepp.experiment.runs.tracking import log_report, tracked
@@ -55,7 +55,7 @@ from dopepp.training.system import PoseSystem
 _log = logging.getLogger(__name__)
 
 PAPER_INPUT_SIZE: Final = (416, 416)
-QUICKSTART: Final = "python train.py experiment=quickstart"
+QUICKSTART: Final = "experiment=quickstart"
 
 
 def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
@@ -210,7 +210,8 @@ def _announce_duration(
     seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
     hours = seconds / 3600
     duration = f"{hours:,.1f} hours" if hours >= 1 else f"{max(1, round(seconds / 60))} min"
-    advice = f"; for a first result in minutes: {QUICKSTART}" if hours >= 1 else ""
+    quick = f"; for a first result in minutes: {program.typed('train')} {QUICKSTART}"
+    advice = quick if hours >= 1 else ""
     display.console.print(f"no accelerator: about {duration} to finish{advice}")
 
 

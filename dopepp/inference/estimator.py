@@ -27,12 +27,12 @@ from dopepp.geometry.camera import (
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
-from dopepp.inference.refinement.refiner import Refine, Refiner, make_refiner
+from dopepp.inference import runtimes
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.inference.scales import Distances, letterboxes, merged
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
-from dopepp.models.network import PoseNetwork
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import rescored
 from dopepp.recovery.detection import Detection
@@ -41,6 +41,7 @@ from dopepp.recovery.silence import Reason, rejected_refined
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
+    from dopepp.inference.refinement.refiner import Refine, Refiner
     from dopepp.inference.results import PoseResult
     from dopepp.inference.sources import SourceLike
     from dopepp.inference.stream import StreamOptions
@@ -63,7 +64,7 @@ class PoseEstimator:
     """Finds the 6D poses of the trained parts on RGB images of any size.
 
     Args:
-        network: The trained network.
+        network: The trained network, of PyTorch's or out of an exported file.
         checkpoint: What the network was trained for.
         device: Where to run it, e.g. ``cpu`` or ``cuda``.
         refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
@@ -80,7 +81,7 @@ class PoseEstimator:
 
     def __init__(
         self,
-        network: PoseNetwork,
+        network: Runtime,
         checkpoint: Checkpoint,
         device: str | torch.device = "cpu",
         refine: Refine | None = None,
@@ -88,14 +89,18 @@ class PoseEstimator:
         max_ms: float | None = None,
     ) -> None:
         self.checkpoint = checkpoint
-        self.refiner = None if refine is None else make_refiner(refine, parts or checkpoint.parts)
+        self.refine, self.refiner = refine, None
+        if refine is not None:  # its solvers take as long to import as all else but torch
+            from dopepp.inference.refinement.refiner import make_refiner
+
+            self.refiner = make_refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
         self.solid_parts = tuple(parts or checkpoint.parts)
         """Its parts, with the meshes that it was given."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
         """Milliseconds since it was made, by step of :data:`STEPS`."""
-        self.network = network.for_inference().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
         self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
@@ -109,12 +114,13 @@ class PoseEstimator:
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
     ) -> PoseEstimator:
-        """Load a checkpoint written by training; see the class for the options.
+        """Load a checkpoint, or what ``dopepp export`` made of one; see the class for the options.
 
-        A :class:`UserError`: the file is missing, not a checkpoint, or not safe to load, or the
-        refinement is not possible.
+        A :class:`UserError`: the file is missing, is neither of these or not safe to load, its
+        extra is missing, or the refinement is not possible.
         """
-        return cls(*load_network(Path(path)), device, refine, parts, max_ms)
+        chosen = checked_device(device)
+        return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
 
     def refining(self, refine: Refine, parts: Sequence[Part] | None = None) -> PoseEstimator:
         """Return an estimator with the same network that also refines; see the class."""
@@ -124,6 +130,26 @@ class PoseEstimator:
     def parts(self) -> Sequence[Part]:
         """The objects this estimator knows, in the network's order."""
         return self.checkpoint.parts
+
+    def __repr__(self) -> str:
+        """Say what it finds at which distances, with which network and thresholds."""
+        known, limits = self.checkpoint, self.recovery
+        runtime = type(self.network).__name__
+        width, height = known.input_size
+        name = known.data.get("name", "network")
+        lines = [f"PoseEstimator({name} as {runtime}, {width}×{height} pixels, "
+                 f"{self.device}, refine={self.refine})"]  # fmt: skip
+        for part in self.parts:
+            size = " × ".join(f"{1000 * one:.0f}" for one in np.ptp(part.cuboid, axis=0))
+            seen = known.seen.get(part.name)
+            where = f", learned at {seen.nearest:.2g} – {seen.farthest:.2g} m" if seen else ""
+            lines.append(f"{part.name}: {size} mm{where}")
+        lines.append(
+            f"thresholds: peak {limits.peak_threshold:.3g}, "
+            f"centroid {limits.centroid_threshold:.3g}, score {limits.min_score:.3g}, "
+            f"refined score {limits.refined_min_score:.3g}"
+        )
+        return "\n  ".join(lines)
 
     def predict(
         self,

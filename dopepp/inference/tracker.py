@@ -19,33 +19,10 @@ from scipy.optimize import linear_sum_assignment
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import (
-    CameraMatrix,
-    Step,
-    Transform,
-    moved,
-    project_keypoints,
-    step_between,
-    transform,
-)
+from dopepp.geometry.camera import CameraMatrix, Step, project_keypoints, transform
 from dopepp.inference.estimator import PoseEstimator, checked_picture
+from dopepp.inference.motion import Motion, at_rest
 from dopepp.recovery.detection import Detection
-
-STILL: Final = (math.radians(0.15), 5e-4)
-"""Standard deviations of what a part at rest seems to move by a frame: radians along each axis, and
-metres per metre of its distance. The smaller, the less a resting pose trembles."""
-
-SUDDEN: Final = (math.radians(4.0), 0.025)
-"""The same of a part that a hand takes up or turns round: half of 8° and of 5 % a frame."""
-
-SWERVE: Final = 0.5
-"""Share of its last step by which a moving part may do otherwise in the next one."""
-
-SMOOTHING: Final = 0.6
-"""Weight of the last step in the velocity: a step is known to a few pixels' worth only."""
-
-PERSISTENCE: Final = 0.9
-"""Share of the velocity that is left after a frame."""
 
 NEAR: Final = 0.5
 """Diameters between the centres of a track and a detection that may be the same part."""
@@ -103,6 +80,7 @@ class _State:
     """
 
     track: Track
+    motion: Motion
     usual: float
     unseen: int = 0
     doubts: int = 0
@@ -116,6 +94,7 @@ class _State:
     def move_to(self, one: Detection) -> None:
         """Go on from where the network has found the part."""
         self.track = Track(self.track.identity, one, np.zeros(6), detected=True)
+        self.motion = at_rest(one.T_cam_obj, one.covariance)
         self.unseen = self.doubts = self.disagreements = 0
 
 
@@ -172,23 +151,21 @@ class PoseTracker:
     def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
         """Look for a part where its motion takes it."""
         old = state.track.detection
-        velocity = PERSISTENCE * state.track.velocity
-        expected = moved(old.T_cam_obj, velocity)
+        forecast = state.motion.ahead()
         doubtful = None
-        if not state.unseen and expected[2, 3] > 0:
-            for spread in (_spread(expected, velocity), _at(expected, SUDDEN)):
+        if not state.unseen and forecast.T_cam_obj[2, 3] > 0:
+            for expected in (forecast, state.motion.ahead(sudden=True)):
                 given = replace(
-                    old, T_cam_obj=expected, covariance=old.covariance + np.diag(spread**2)
+                    old, T_cam_obj=expected.T_cam_obj, covariance=expected.pose_covariance
                 )
                 found = self._estimator.refined([given], image, K)[0]
                 if found.kept:
                     continue
                 agreement = _agreement(found)
                 if agreement >= max(DOUBTFUL * state.usual, min(TRUSTED, state.usual)):
-                    step = step_between(old.T_cam_obj, found.T_cam_obj)
-                    velocity = SMOOTHING * step + (1 - SMOOTHING) * velocity
+                    state.motion = expected.seen(found.T_cam_obj, found.covariance)
                     state.track = replace(
-                        state.track, detection=found, velocity=velocity, detected=False
+                        state.track, detection=found, velocity=state.motion.velocity, detected=False
                     )
                     state.usual += USUAL * (agreement - state.usual)
                     state.doubts = 0
@@ -197,9 +174,12 @@ class PoseTracker:
         if doubtful is None or state.doubts == PATIENCE:
             state.unseen += 1
             return
-        keypoints = project_keypoints(self._cuboid_of[old.object], expected, K)
+        keypoints = project_keypoints(self._cuboid_of[old.object], forecast.T_cam_obj, K)
         doubtful = replace(doubtful, keypoints=keypoints)
-        state.track = replace(state.track, detection=doubtful, velocity=velocity, detected=False)
+        state.motion = forecast
+        state.track = replace(
+            state.track, detection=doubtful, velocity=forecast.velocity, detected=False
+        )
         state.doubts += 1
 
     def _look(self, image: Picture, K: CameraMatrix) -> None:
@@ -209,7 +189,8 @@ class PoseTracker:
         for state, one in self._matched(found):
             if state is None:
                 track = Track(self._identities, one, np.zeros(6), detected=True)
-                self._states.append(_State(track, _agreement(one)))
+                motion = at_rest(one.T_cam_obj, one.covariance)
+                self._states.append(_State(track, motion, _agreement(one)))
                 self._identities += 1
             elif _agreement(one) < min(TRUSTED, state.usual):
                 continue
@@ -254,19 +235,6 @@ class PoseTracker:
 
 def _agreement(one: Detection) -> float:
     return 0.0 if one.agreement is None else one.agreement
-
-
-def _spread(expected: Transform, velocity: Step) -> Step:
-    """Return by how much a part may be elsewhere than its motion takes it, standard deviations."""
-    speeds = (np.linalg.norm(velocity[:3]), np.linalg.norm(velocity[3:]))
-    swerve = np.repeat([SWERVE / math.sqrt(3) * float(speed) for speed in speeds], 3)
-    return np.asarray(np.maximum(_at(expected, STILL), swerve))
-
-
-def _at(expected: Transform, deviations: tuple[float, float]) -> Step:
-    """Return deviations of turn and shift at a part's distance, axis by axis."""
-    turn, shift = deviations
-    return np.array([turn] * 3 + [shift * float(expected[2, 3])] * 3)
 
 
 def _distance(one: Detection, other: Detection) -> float:

@@ -90,8 +90,8 @@ def fit_peaks(
         _own_cells(i, windows, cells, position, scores, sigma, FIRST_MARGIN, own[i])
     for i in range(count):
         _fit_logarithm(windows[i], logarithms[i], own[i], sigma, 0.0, work, room, theta[i])
-        x, y, _ = _mode(windows[i], theta[i])
-        position[i, 0], position[i, 1] = cells[i, 0] + x, cells[i, 1] + y
+        u, v, _ = _mode(windows[i], theta[i])
+        position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
     for i in range(count):
         _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
         squared, used, _ = _step(
@@ -109,10 +109,10 @@ def fit_peaks(
             )
             if move < ARRIVED:
                 break
-        x, y, sound = _mode(windows[i], theta[i])
-        position[i, 0], position[i, 1] = cells[i, 0] + x, cells[i, 1] + y
+        u, v, sound = _mode(windows[i], theta[i])
+        position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
         if sound:
-            _covariance(theta[i], x, y, hessian[i], relative, sigma, room, covariance[i])
+            _covariance(theta[i], u, v, hessian[i], relative, sigma, room, covariance[i])
         else:
             covariance[i] = 0.0
             covariance[i, 0, 0] = covariance[i, 1, 1] = UNCERTAIN

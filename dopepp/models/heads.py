@@ -95,7 +95,8 @@ class Head(nn.Module):
             (self.field_branches, 0.0),
         ):
             for output in (one for branch in branches for one in cast(Branch, branch).outputs):
-                nn.init.normal_(output.weight, std=_OUTPUT_STD)
+                if not output.weight.is_meta:  # see layers.initialise
+                    nn.init.normal_(output.weight, std=_OUTPUT_STD)
                 nn.init.constant_(cast(Tensor, output.bias), bias)
 
     def forward(self, features: Features) -> list[Stage]:

@@ -103,9 +103,11 @@ def initialise(module: nn.Module) -> None:
 
     The variance 2 / fan_in (He et al. 2015, Eq. 10) keeps the activations' scale through a network
     without batch norm as deep as the DOPE cascade.
+
+    Weights on ``meta`` hold nothing; to draw them, PyTorch would import its whole compiler.
     """
     for layer in module.modules():
-        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+        if isinstance(layer, (nn.Conv2d, nn.Linear)) and not layer.weight.is_meta:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)

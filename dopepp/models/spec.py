@@ -14,7 +14,7 @@ from typing import Any
 from dopepp.core.errors import UserError
 from dopepp.models import attention, backbones, heads, losses
 from dopepp.models.network import PoseNetwork
-from dopepp.models.registry import Registry
+from dopepp.models.registry import TARGET, Registry
 
 BACKBONES = Registry.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
 ATTENTIONS = Registry.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
@@ -29,10 +29,7 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
 
     A :class:`UserError`: a key is missing or unknown, a target is not allowed, or an argument is.
     """
-    if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
-        got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
-        keys = f"exactly {', '.join(SPEC_KEYS)}"
-        raise UserError(f"a model spec with {got}", keys, "add or remove keys")
+    _check_keys(spec)
     activation, num_objects = spec["activation"], spec["num_objects"]
     backbone = BACKBONES.build(spec["backbone"])
     channels = backbone.out_channels
@@ -45,6 +42,27 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
         activation,
         num_objects,
     )
+
+
+def check_spec(spec: Mapping[str, Any]) -> None:
+    """Check that a spec names nothing but allowed targets, without building any of them.
+
+    A :class:`UserError`: a key is missing or unknown, or a target is not allowed.
+    """
+    _check_keys(spec)
+    registries: dict[str, Registry[Any]] = {
+        "backbone": BACKBONES, "attention": ATTENTIONS, "head": HEADS,
+    }  # fmt: skip
+    for key, registry in registries.items():
+        node = spec[key]
+        registry.resolve(node.get(TARGET) if isinstance(node, Mapping) else node)
+
+
+def _check_keys(spec: object) -> None:
+    if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
+        got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
+        keys = f"exactly {', '.join(SPEC_KEYS)}"
+        raise UserError(f"a model spec with {got!s:.200}", keys, "add or remove keys")
 
 
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:

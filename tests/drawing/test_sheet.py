@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dopepp.drawing import curves, sheet
 from dopepp.drawing.curves import figure_image
 from dopepp.drawing.overlay import text_coverage
-from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.drawing.sheet import Tile, contact_sheet, heat_picture
 
 IMAGE = np.full((30, 40, 3), 100, np.uint8)
 RED, GREY = (200, 10, 10), (90, 90, 90)
@@ -192,3 +192,20 @@ def test_text_fits_its_line_and_is_as_wide_as_its_letters():
     assert letters.max() > 0.9
     assert letters[0].max() < 0.1  # nothing is cut off above or below
     assert letters[-1].max() < 0.1
+
+
+def test_a_belief_lies_over_the_pixels_its_cell_covers():
+    image = np.full((90, 150, 3), 90, np.uint8)  # the maps cover its padding, too
+    belief = np.zeros((12, 20), np.float32)
+    belief[4, 11] = 1
+    picture = heat_picture(image, belief).astype(int)
+    assert picture.shape == image.shape
+    hot = np.argwhere(np.abs(picture - 54).max(axis=2) > 100)  # 54 = the dimmed grey
+    np.testing.assert_allclose(hot.mean(axis=0), [8 * 4 + 3.5, 8 * 11 + 3.5], atol=0.6)
+    assert (picture[:24] == 54).all()
+
+
+def test_beliefs_beyond_their_range_are_clipped():
+    image = np.full((96, 160, 3), 90, np.uint8)
+    one, seven = (heat_picture(image, np.full((12, 20), value, np.float32)) for value in (1, 7))
+    np.testing.assert_array_equal(one, seven)

@@ -101,6 +101,15 @@ def test_loads_what_was_saved(estimator, parts):
     assert estimator.recovery.sigma == 1.5
 
 
+def test_it_says_what_it_knows():
+    text = repr(PoseEstimator.load("pretrained/pivconnector", refine="region"))
+    assert "128×128 pixels, cpu, refine=region)" in text
+    assert (
+        "pivconnector: 105 × 52 × 7 mm, learned at 0.085 – 0.16 m" in text
+    )  # the paper's 10.5×5.2×0.7 cm
+    assert "thresholds: " in text
+
+
 @pytest.mark.parametrize("size", [(416, 416), (640, 480), (97, 301), (33, 32), (1, 1), (900, 20)])
 def test_any_image_size(estimator, size):
     longest = max(size)
@@ -297,7 +306,7 @@ def test_refines_on_the_picture(parts_path):
     alone = estimator.predict(np.full_like(rendered.image, 90), K_VGA)[0]
     assert alone.kept
     assert alone.agreement is None
-    assert_array_equal(alone.T_cam_obj, found.T_cam_obj)
+    assert_allclose(alone.T_cam_obj, TRUE, atol=1e-5)  # the network's
 
 
 def test_refines_no_longer_than_it_may(parts_path):

@@ -143,7 +143,8 @@ def test_values_that_explode(field, value, saved, rejected):
 
 def test_a_payload_nested_very_deep(tmp_path, rejected):
     deep = b"]" * 100_000 + b"a" * 99_999
-    pickled = b"\x80\x02}X\x06\x00\x00\x00dopepp}X\x04\x00\x00\x00data" + deep + b"ss."
+    pickled = b"\x80\x02}X\x06\x00\x00\x00dopepp}X\x04\x00\x00\x00data" + deep
+    pickled += b"ssX\x0a\x00\x00\x00state_dict}s."
     torch.save({}, tmp_path / "empty.ckpt")
     content = [
         (name, pickled if name.endswith(".pkl") else data)

@@ -26,10 +26,12 @@ from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
+from dopepp.drawing.pictures import Size
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
-from dopepp.experiment.config.data import Cache, DataConfig
+from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
 from dopepp.geometry.camera import Letterbox
-from dopepp.parts.catalogue import load_part
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.parts.catalogue import load_part, with_meshes
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Part, Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
@@ -285,6 +287,21 @@ def held_out_renders(
     factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
     name = "virtual" if renderer == "raster" else renderer
     return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
+
+
+def validation_renders(
+    checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
+) -> DescribedSource:
+    """Render a checkpoint's parts, by the meshes in it, as its validation images are rendered.
+
+    The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of their
+    own; those of a camera that the checkpoint was trained for keep theirs.
+    """
+    data = replace(chosen_data({}, {}, trained_on(checkpoint.data), str(path)), num_val=count)
+    if size is not None and data.virtual.view is None:
+        scene = {**(data.virtual.scene or {}), "width": size[0], "height": size[1]}
+        data = replace(data, virtual=replace(data.virtual, scene=scene))
+    return held_out_renders(data, with_meshes(checkpoint.parts), "val")
 
 
 def kept(

@@ -15,6 +15,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,23 +24,36 @@ from typing import Any, Final
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from dopepp.core.files import write_whole
-from dopepp.core.yaml import read_yaml
-from dopepp.experiment.runs import display, record
-from dopepp.experiment.runs.resume import config_differences
+from dopepp.experiment.runs import program
 
 _log = logging.getLogger(__name__)
 
 LOG_FILE: Final = "job.log"
 _OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 _STANDARD_OUT_AND_ERROR: Final = (1, 2)
+_RANKS: Final = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
+"""Environment variables that number a run's processes, as torchrun, Lightning, SLURM and LSF do."""
 
 
 def configure_logging() -> None:
-    """Send messages to the terminal; Lightning's, which only repeat ours, from warnings up."""
+    """Send messages to the terminal."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+
+
+def quiet_lightning() -> None:
+    """Leave out Lightning's messages that only repeat ours; for once it is imported.
+
+    One warning goes as well: Lightning 2.6 makes a ``LeafSpec`` of every batch, which PyTorch calls
+    deprecated since 2.9, and nobody but Lightning can change that.
+    """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+
+
+def is_first_process() -> bool:
+    """Tell whether this is the run's only process, or the first of several."""
+    return all(os.environ.get(name, "0") in ("", "0") for name in _RANKS)
 
 
 def is_remote(launcher: str) -> bool:
@@ -74,6 +88,10 @@ def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
 
     So does a SLURM job that was queued again, and a search that was started again.
     """
+    from dopepp.core.yaml import read_yaml
+    from dopepp.experiment.runs import record
+    from dopepp.experiment.runs.resume import config_differences
+
     stored = run_dir / record.CONFIG_FILE
     if config.get("resume") is not None or not stored.is_file():
         return False
@@ -108,6 +126,8 @@ def requeue() -> str:
 
 def remember_run(command: Sequence[str], run_dir: Path) -> None:
     """Write down which folder this job's command has begun; nothing outside SLURM."""
+    from dopepp.core.files import write_whole
+
     note = _note(command)
     if note is not None:
         write_whole(note, f"{run_dir.absolute()}\n".encode())
@@ -135,9 +155,11 @@ def _note(command: Sequence[str]) -> Path | None:
 
 
 class AnnounceJobs(Callback):
-    """Hydra's hook at the start of a multirun: says where to look while other processes work."""
+    """Hydra's hook at the start of a multirun: says where to look."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Name the file that each job prints to."""
+        """Name the folder, and the file that each job of another process prints to."""
+        folder = config.hydra.sweep.dir
+        program.say(f"begins in {folder}")
         if is_remote(str(config.hydra.launcher._target_)):
-            display.console.print(f"each job prints to {config.hydra.sweep.dir}/JOB/{LOG_FILE}")
+            program.say(f"each job prints to {folder}/JOB/{LOG_FILE}")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
@@ -25,6 +26,7 @@ from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
@@ -114,9 +116,13 @@ class EstimatorMethod:
 
     def cost(self, seconds: Sequence[float]) -> Cost:
         """Count parameters and operations, and take the median of the timed frames."""
-        checkpoint = self.estimator.checkpoint
-        network = build_network(checkpoint.spec)  # as it was trained: the estimator's is folded
-        parameters, gmacs = network_cost(network, checkpoint.input_size)
+        checkpoint, network = self.estimator.checkpoint, self.estimator.network
+        if isinstance(network, ExportedNetwork):  # without the network's own modules
+            parameters, gmacs = network.export.parameters, network.export.gmacs
+        else:
+            with torch.device("meta"):  # as it was trained, where the estimator's is folded
+                trained = build_network(checkpoint.spec)
+            parameters, gmacs = network_cost(trained, checkpoint.input_size)
         return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 

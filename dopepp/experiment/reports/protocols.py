@@ -34,10 +34,6 @@ from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
 
-SHORT_NAMES: Final = {"scale": "scale_factors"}
-"""What evaluate.py calls an option on the command line, and the option: ``scale`` alone, without
-being short for something, would be a file of ``conf/scale``, which chooses a training's sizes."""
-
 _MAX_SCALE: Final = 20.0
 """Twenty times as near or as far."""
 

@@ -18,7 +18,8 @@ from dopepp.core.files import write_whole
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.reports.tables import markdown_text
-from dopepp.experiment.runs import record
+from dopepp.experiment.runs import program, record
+from dopepp.experiment.runs.program import shown
 from dopepp.metrics.row import shown_columns
 from dopepp.training.callbacks.pictures import best_effort
 
@@ -110,12 +111,13 @@ class RunReadme:
         if not self._config.keep_checkpoints:
             trial = "A trial of the program itself (`keep_checkpoints=false`)"
             return f"{trial}: nothing to go on with."
-        lines = [] if state == FINISHED else [f"python train.py resume={run}  # go on"]
+        train, evaluate = program.typed("train"), program.typed("evaluate")
+        lines = [] if state == FINISHED else [f"{train} resume={run}  # go on"]
         if state == FINISHED:
             epochs = 2 * self._config.trainer.max_epochs
             lines += [
-                f"python evaluate.py ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
-                f"python train.py resume={run} trainer.max_epochs={epochs}  # train for longer",
+                f"{evaluate} ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
+                f"{train} resume={run} trainer.max_epochs={epochs}  # train for longer",
             ]
         lines += [
             f"dopepp predict {best} PICTURE.png --K FX FY CX CY",
@@ -144,19 +146,12 @@ def write_sweep_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, 
     }
     sections = [
         f"# Multirun: {state}",
-        f"```bash\npython {shlex.join(command)}\n```",
+        f"```bash\n{program.line(command)}\n```",
         *(text for name, text in links.items() if (folder / name).is_file()),
         "Every job that has begun to train has a README in its folder.",
         markdown_text(rows, ["job", "state"]) if rows else "",
     ]
     _write(folder, sections)
-
-
-def shown(path: Path) -> str:
-    """Return a path as a person would type it here: relative where it is below this folder."""
-    path = path.absolute()
-    below = path.is_relative_to(Path.cwd())
-    return str(path.relative_to(Path.cwd()) if below else path)
 
 
 def _write(folder: Path, sections: Sequence[str]) -> None:
@@ -174,7 +169,7 @@ def _commands(folder: Path) -> str:
         for one in (*(earlier if isinstance(earlier, list) else []), present)
         if isinstance(one, Mapping) and isinstance(one.get("command"), list)
     ]
-    lines = [f"python {shlex.join(map(str, call))}" for call in calls]
+    lines = [program.line([str(word) for word in call]) for call in calls if call]
     return "```bash\n" + "\n".join(lines) + "\n```"
 
 

@@ -7,7 +7,6 @@ import json
 import os
 import platform
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import distributions
@@ -22,6 +21,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.futures import cpu_fact
 from dopepp.core.json import read_json as read_strict_json
+from dopepp.experiment.runs import program
 from dopepp.training.checkpointing.files import BEST, FOLDER, LAST
 from dopepp.virtual.factory import code_hash
 
@@ -33,6 +33,10 @@ PRUNED_FILE: Final = "pruned.json"
 OBJECTIVE: Final = "objective"
 """Key of ``metrics.json``: the validation value that the best checkpoint was chosen by."""
 OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
+"""What a run folder holds before anything is done, but for the working tree's difference."""
+DIFFERENCE: Final = "working_tree_"
+"""How the name of that file begins."""
 BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
 LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
 
@@ -86,7 +90,7 @@ def write_environment(
         digest = hashlib.sha256(diff).hexdigest()
         present["git"]["diff_sha256"] = digest
         if len(diff) <= _MAX_DIFF_BYTES:
-            present["git"]["diff"] = f"working_tree_{digest[:8]}.diff"
+            present["git"]["diff"] = f"{DIFFERENCE}{digest[:8]}.diff"
             write_whole(run_dir / present["git"]["diff"], diff)
     write_json(path, {**present, "changes": list(changes), "earlier": earlier})
 
@@ -105,7 +109,7 @@ def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
         },
         "git": _git_state(),
         "hardware": _hardware(),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "command": program.command(),
         "seed": seed,
         "data_fingerprint": data_fingerprint,
         "rendering_code": code_hash(),

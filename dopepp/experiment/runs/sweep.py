@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from dopepp.experiment.cost import COST_FILE
-from dopepp.experiment.reports.compare import compare_runs
-from dopepp.experiment.reports.entries import read_run
-from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
-from dopepp.experiment.runs import display, record
-from dopepp.experiment.runs.readme import write_sweep_readme
-from dopepp.experiment.runs.tracking import log_comparison
+from dopepp.experiment.runs import program
+
+# Hydra makes its hooks before any job, of a single run, too: what they need is imported late.
 
 
 class CompareJobs(Callback):
@@ -27,7 +22,9 @@ class CompareJobs(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Say in the sweep's folder what runs there."""
-        write_sweep_readme(Path(str(config.hydra.sweep.dir)), _command(), {})
+        from dopepp.experiment.runs.readme import write_sweep_readme
+
+        write_sweep_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Compare all jobs of the sweep folder; exit with code 1 if one failed."""
@@ -37,6 +34,13 @@ class CompareJobs(Callback):
 
 def compare_jobs(folder: Path, config: DictConfig) -> bool:
     """Compare the jobs that a sweep's folder holds; return whether none has failed."""
+    from dopepp.experiment.reports.compare import compare_runs
+    from dopepp.experiment.reports.entries import read_run
+    from dopepp.experiment.reports.paper_table import PaperTable, write_paper_table
+    from dopepp.experiment.runs import display
+    from dopepp.experiment.runs.readme import write_sweep_readme
+    from dopepp.experiment.runs.tracking import log_comparison
+
     table = _node(config, "table")
     jobs = sorted((p for p in folder.iterdir() if p.name.isdigit()), key=lambda p: int(p.name))
     if not jobs:
@@ -45,7 +49,7 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
     if table is not None:
         write_paper_table(PaperTable.of(table), entries, folder)
     log_comparison(_node(config, "logger"), folder)
-    write_sweep_readme(folder, _command(), {job.name: _state(job) for job in jobs})
+    write_sweep_readme(folder, program.command(), {job.name: _state(job) for job in jobs})
     display.console.print(f"comparison in {folder}")
     return not any(entry.failure and not entry.pruned for entry in entries)
 
@@ -56,12 +60,11 @@ def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
     return node if isinstance(node, dict) else None
 
 
-def _command() -> list[str]:
-    return [Path(sys.argv[0]).name, *sys.argv[1:]]
-
-
 def _state(job: Path) -> str:
     """Say how a job stands, by what is in its folder."""
+    from dopepp.experiment.cost import COST_FILE
+    from dopepp.experiment.runs import record
+
     ends = {record.FAILURE_FILE: "failed", record.PRUNED_FILE: "stopped by the search"}
     for name, word in ends.items():
         if (job / name).is_file():

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -24,12 +24,6 @@ from dopepp.geometry.refine import solve_damped
 from dopepp.inference.refinement.contour import Contour
 from dopepp.inference.refinement.fit import Terms
 from dopepp.inference.refinement.solver import DAMPING
-
-CONFIDENCE: Final = 0.5
-"""Exponent of the likelihood of neighbouring pixels, whose colours are not independent."""
-
-EDGE: Final = 1.0
-"""Exponent of a place's likelihood of an edge: one, plus the square of its change over the mean."""
 
 LEAST_CHANGE: Final = 3.0
 """Grey levels that are noise: a picture that changes less has no edges."""
@@ -58,6 +52,28 @@ OFFSET_PX: Final = 1.5
 """Standard deviation of an offset that all points have in common: blur, a halo, a CAD's error."""
 
 
+class Weights(NamedTuple):
+    """How much colours and edges tell.
+
+    Attributes:
+        colour: Exponent of the likelihood of neighbouring pixels, whose colours are not
+            independent.
+        edge: Exponent of a place's likelihood of an edge: one, plus the square of its change over
+            the mean.
+    """
+
+    colour: float
+    edge: float
+
+
+FOUND: Final = Weights(colour=0.5, edge=1.0)
+"""For a start that may be far off: many edges are near, and colours tell which is the part's."""
+
+FOLLOWED: Final = Weights(colour=0.12, edge=4.0)
+"""For one that is near: the nearest edge is the part's, and blur leaves its middle where it was,
+whatever the colours. From far starts on real pictures 9 % of poses get worse by it, not 7 %."""
+
+
 @dataclass(frozen=True, eq=False)
 class Shifts:
     """How far the picture's outline is from a pose's, along each normal.
@@ -77,6 +93,7 @@ def find_shifts(
     contour: Contour,
     reach: float,
     step: float,
+    weights: Weights,
 ) -> Shifts:
     """Read the picture along the normals.
 
@@ -86,12 +103,13 @@ def find_shifts(
         contour: The outline.
         reach: Pixels to each side.
         step: Pixels between what is read.
+        weights: Of what is read.
     """
     count = max(2, round(reach / step))
     changes = np.empty((len(contour), 2 * count + 2))
     strength = _changes(colours, contour.pixels, contour.normals, step, count, changes)
     found = np.empty((len(contour), 2))
-    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, found)
+    _shifts(odds, contour.pixels, contour.normals, changes, strength, step, count, *weights, found)
     return Shifts(found[:, 0], found[:, 1])
 
 
@@ -255,6 +273,8 @@ def _shifts(
     strength: float,
     step: float,
     count: int,
+    colour: float,
+    edge: float,
     found: Array,
 ) -> None:
     """Write mean and information of every normal's shift."""
@@ -265,10 +285,10 @@ def _shifts(
     for i in range(len(pixels)):
         before, most = 0.0, -math.inf
         for k in range(len(sums)):
-            sums[k] = before + EDGE * math.log(1.0 + (changes[i, k] / strength) ** 2)
+            sums[k] = before + edge * math.log(1.0 + (changes[i, k] / strength) ** 2)
             most = max(most, sums[k])
             along = (k - count) * step
-            before += CONFIDENCE * _sampled(
+            before += colour * _sampled(
                 odds, pixels[i, 0] + along * normals[i, 0], pixels[i, 1] + along * normals[i, 1]
             )
         total = first = second = 0.0

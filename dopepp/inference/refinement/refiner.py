@@ -47,11 +47,11 @@ def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
     cuboids = {part.name: part.cuboid for part in parts}
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
-        # One that was refined before comes from a tracker, which knows how far it may have moved.
-        network = one.agreement is None
-        elsewhere = partial(poses_of_four, cuboids[one.object], one.peaks, K) if network else None
+        followed = one.agreement is not None  # which only refinement gives
+        # A tracker knows how far a part may have moved; a network may be wrong about that.
+        starts = None if followed else partial(poses_of_four, cuboids[one.object], one.peaks, K)
         return refiners[one.object].refine(
-            image, K, one.T_cam_obj, one.covariance, depth, elsewhere
+            image, K, one.T_cam_obj, one.covariance, depth, followed, starts
         )
 
     return refined
@@ -90,6 +90,7 @@ class PartRefiner:
         T_cam_obj: Transform,
         covariance: PoseMatrix | None = None,
         depth: Depth | None = None,
+        followed: bool = False,
         starts: Starts | None = None,
     ) -> Refinement:
         """Refine one pose.
@@ -101,6 +102,7 @@ class PartRefiner:
             covariance: Of the given pose: rotation vector about the object's origin and shift, both
                 in camera axes, radians and metres. Without it, a broad one is taken.
             depth: Metres along z, aligned to the image, 0 where unknown.
+            followed: Whether the pose follows from one that was refined on the frame before.
             starts: As :meth:`RegionRefiner.refine` takes it.
 
         Returns:
@@ -111,7 +113,7 @@ class PartRefiner:
             return Refinement(given, reason="the pose is not finite")
         alone = None
         if self._region is not None:
-            alone = self._region.refine(image, K, given, covariance, starts)
+            alone = self._region.refine(image, K, given, covariance, followed, starts)
         if alone is not None and (depth is None or not self._by_depth):
             return alone
         try:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.crop import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import Prior, make_prior
-from dopepp.inference.refinement.lines import outline_rows
+from dopepp.inference.refinement.lines import FOLLOWED, FOUND, Weights, outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
 from dopepp.inference.refinement.rounds import Agreement, Round, Stage
 from dopepp.inference.refinement.silhouette import posed
@@ -37,9 +38,9 @@ from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, U
 from dopepp.inference.refinement.starts import drawn_poses
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
-COARSE: Final = Stage(longest_px=120, reach=1.0, steps=3, points=100, tiles=1)
-MIDDLE: Final = Stage(longest_px=200, reach=0.5, steps=2, points=120, tiles=2)
-FINE: Final = Stage(longest_px=300, reach=0.25, steps=3, points=160, tiles=3)
+COARSE: Final = Stage(120, reach=1.0, steps=3, points=100, tiles=1, weights=FOUND)
+MIDDLE: Final = Stage(200, reach=0.5, steps=2, points=120, tiles=2, weights=FOUND)
+FINE: Final = Stage(300, reach=0.25, steps=3, points=160, tiles=3, weights=FOUND)
 """The coarse round is every start's, the others only the best one's."""
 
 WIDENED: Final = 2.0
@@ -100,6 +101,7 @@ class RegionRefiner:
         K: CameraMatrix,
         T_cam_obj: Transform,
         covariance: Float[np.ndarray, "6 6"] | None = None,
+        followed: bool = False,
         starts: Starts | None = None,
     ) -> Refinement:
         """Refine one pose.
@@ -110,6 +112,7 @@ class RegionRefiner:
             T_cam_obj: The pose to start from, metres.
             covariance: Of the given pose: rotation vector about the object's origin and shift, both
                 in camera axes, radians and metres. Without it, a broad one is taken.
+            followed: Whether the pose follows from one that was refined on the frame before.
             starts: Asked for further poses, where the picture does not agree with what is near the
                 given one: then those, and some that are drawn, are started from too. None: the
                 covariance is believed.
@@ -122,8 +125,9 @@ class RegionRefiner:
             return Refinement(given, reason="the pose is not finite")
         try:
             prior = _prior(given, self._diameter, covariance)
-            loose = _loosened(prior, self._diameter)
-            return refinement(*_search(self._rounds(image, K, given), prior, loose, starts))
+            loose, weights = _loosened(prior, self._diameter), FOLLOWED if followed else FOUND
+            rounds = self._rounds(image, K, given, weights)
+            return refinement(*_search(rounds, prior, loose, starts))
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
 
@@ -149,7 +153,7 @@ class RegionRefiner:
             UndecidedError: The picture does not decide.
         """
         depth.look(start.T_cam_obj)
-        rounds = self._rounds(image, K, start.T_cam_obj, [depth.evidence()])
+        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.evidence()])
         reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
         end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
         known = depth.information(end.T_cam_obj)
@@ -160,6 +164,7 @@ class RegionRefiner:
         image: UInt8[np.ndarray, "height width 3"],
         K: CameraMatrix,
         pose: Transform,
+        weights: Weights = FOUND,
         more: Sequence[Evidence] = (),
     ) -> list[Round]:
         """Return the rounds around a pose; an :class:`UndecidedError` where it is not in view."""
@@ -173,7 +178,7 @@ class RegionRefiner:
             crop = crop_around(image, K, corners, stage.longest_px)
             if isinstance(crop, str):
                 raise UndecidedError(crop)
-            rounds.append(Round(self._mesh, crop, stage, more))
+            rounds.append(Round(self._mesh, crop, replace(stage, weights=weights), more))
         return rounds
 
 
@@ -223,7 +228,7 @@ def _near(rounds: Sequence[Round], prior: Prior) -> Found:
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
     rounds = _needed(rounds, reach)
-    if rounds[0].stage is FINE:
+    if rounds[0] is rounds[-1]:  # the last one alone
         return _refined(rounds, given, prior, reach)
     return _from_afar(rounds, given, prior, reach)
 

@@ -17,10 +17,11 @@ from dopepp.inference.refinement.contour import Contour, find_contour
 from dopepp.inference.refinement.crop import EDGE_PX, Crop
 from dopepp.inference.refinement.fit import Prior, Terms
 from dopepp.inference.refinement.lines import (
-    CONFIDENCE,
+    FOLLOWED,
     INDEPENDENT_PX,
     LEAST_INFORMATION,
     Shifts,
+    Weights,
     find_shifts,
     outline_rows,
     region_terms,
@@ -46,6 +47,9 @@ FEWEST_POINTS: Final = 24
 LEAST_GAIN: Final = 2.0
 """Of the logarithm of the covariance's volume, below which the picture says nothing."""
 
+FIRM: Final = (math.radians(1.0), 5e-3)
+"""Standard deviations of a pose that was known well: radians, and metres per metre of distance."""
+
 AGREE_PX: Final = 2.0
 LEAST_AGREEING: Final = 0.3
 """Share of a refined outline, by information, that the picture's is so near to."""
@@ -67,6 +71,7 @@ class Stage:
         steps: Gauss–Newton steps.
         points: About so many on the outline.
         tiles: Along each side of the part, with colours of their own.
+        weights: Of colours and edges.
     """
 
     longest_px: int
@@ -74,6 +79,7 @@ class Stage:
     steps: int
     points: int
     tiles: int
+    weights: Weights
 
 
 @dataclass(frozen=True)
@@ -165,21 +171,14 @@ class Round:
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return -math.inf
-        inside = float(self._odds.ravel() @ silhouette.mask.ravel()) * CONFIDENCE / INDEPENDENT_PX
+        inside = float(self._odds.ravel() @ silhouette.mask.ravel())
+        inside *= self.stage.weights.colour / INDEPENDENT_PX
         offset = prior.offset(pose)
         return inside - 0.5 * float(offset @ prior.information @ offset)
 
     def agreement(self, pose: Transform, reach: float) -> Agreement:
         """Return how well an outline agrees with the picture, in the colours learned last."""
-        contour = self.contour(pose)
-        if contour is None:
-            raise UndecidedError("the part's outline left the picture")
-        shifts = self._shifts(contour, reach)
-        weights = shifts.information
-        away = np.abs(shifts.mean - np.average(shifts.mean, weights=weights + LEAST_INFORMATION))
-        agrees = away <= AGREE_PX
-        share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
-        return Agreement(share, float((agrees & (weights > TOLD)).mean()))
+        return self._agreement(self._outline(pose), reach)
 
     def believed(
         self, end: Solution, prior: Prior, reach: float, known: Float[np.ndarray, "6 6"]
@@ -191,9 +190,9 @@ class Round:
         Raises:
             UndecidedError: The picture does not decide for this pose.
         """
-        agreement = self.agreement(end.T_cam_obj, reach)
-        gain = np.linalg.slogdet(end.information)[1] - np.linalg.slogdet(known)[1]
-        if gain < LEAST_GAIN:
+        contour = self._outline(end.T_cam_obj)
+        agreement = self._agreement(contour, reach)
+        if self._gain(end, known) < LEAST_GAIN:
             raise UndecidedError("colours inside and around the part are too alike")
         if agreement.share < LEAST_AGREEING:
             raise UndecidedError(
@@ -205,10 +204,44 @@ class Round:
             raise UndecidedError(
                 f"{distance:.1f} standard deviations from the given pose, more than {FARTHEST:g}"
             )
-        after = self.log_likelihood(end.T_cam_obj, prior)
-        if after <= self.log_likelihood(prior.T_cam_obj, prior):
-            raise UndecidedError("the picture fits the given pose no worse")
+        rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
+        near = self._followed and np.mean((rows @ offset) ** 2) < 1.0
+        if not near:  # of a followed part within a pixel, single pixels would decide
+            after = self.log_likelihood(end.T_cam_obj, prior)
+            if after <= self.log_likelihood(prior.T_cam_obj, prior):
+                raise UndecidedError("the picture fits the given pose no worse")
         return agreement
+
+    def _outline(self, pose: Transform) -> Contour:
+        contour = self.contour(pose)
+        if contour is None:
+            raise UndecidedError("the part's outline left the picture")
+        return contour
+
+    def _agreement(self, contour: Contour, reach: float) -> Agreement:
+        shifts = self._shifts(contour, reach)
+        weights = shifts.information
+        away = np.abs(shifts.mean - np.average(shifts.mean, weights=weights + LEAST_INFORMATION))
+        agrees = away <= AGREE_PX
+        share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
+        return Agreement(share, float((agrees & (weights > TOLD)).mean()))
+
+    def _gain(self, end: Solution, known: Float[np.ndarray, "6 6"]) -> float:
+        """Return by how much the outline makes the covariance's volume smaller, its logarithm.
+
+        What it says of a followed part, whose pose was known well, is measured against one that
+        was known less.
+        """
+        said = end.information - known
+        if self._followed:
+            turn, shift = FIRM
+            firm = np.repeat([turn, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
+            known = np.linalg.inv(np.linalg.inv(known) + np.diag(firm))
+        return float(np.linalg.slogdet(known + said)[1] - np.linalg.slogdet(known)[1])
+
+    @property
+    def _followed(self) -> bool:
+        return self.stage.weights == FOLLOWED
 
     def reach(self, reach: float) -> float:
         """Return the stage's share of a reach, in pixels of its crop."""
@@ -220,7 +253,9 @@ class Round:
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
         reach = self.reach(reach)
-        return find_shifts(self._soft, self.crop.colours, contour, reach, _step(reach))
+        return find_shifts(
+            self._soft, self.crop.colours, contour, reach, _step(reach), self.stage.weights
+        )
 
     def _silhouette(self, pose: Transform) -> _Silhouette | None:
         """Return that of a pose, kept while the same pose is asked for."""

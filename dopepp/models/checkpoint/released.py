@@ -73,7 +73,7 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
     if KEY not in metadata:
         raise UserError(
             f"{path} without a description under {KEY!r}",
-            "a checkpoint written by `dopepp release`", "get the file again",
+            "a file written by `dopepp release` or `dopepp export`", "get the file again",
         )  # fmt: skip
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
     weights = {
@@ -84,15 +84,21 @@ def read_content(path: Path) -> tuple[dict[str, Any], int]:
     return {"state_dict": weights, KEY: payload}, size
 
 
-def write_content(content: Mapping[str, Any], path: Path) -> None:
-    """Write weights in half precision and the payload without local paths.
+def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
+    """Write weights, in half precision or as they are, and the payload without local paths.
 
     The content is as :meth:`~dopepp.models.checkpoint.schema.Checkpoint.to_file` returns it. A
     weight that does not fit into half precision is a :class:`UserError`.
     """
-    weights = {name: _half(name, value) for name, value in content["state_dict"].items()}
-    payload = json.dumps(_portable(content[KEY]), allow_nan=False)
-    write_safetensors(path, weights, {KEY: payload})
+    weights = content["state_dict"]
+    if half:
+        weights = {name: _half(name, value) for name, value in weights.items()}
+    write_safetensors(path, weights, {KEY: packed(content[KEY])})
+
+
+def packed(payload: Mapping[str, Any]) -> str:
+    """Return a payload as one line of JSON, without folders of this machine."""
+    return json.dumps(_portable(payload), allow_nan=False)
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

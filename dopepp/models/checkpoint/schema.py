@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -25,7 +25,7 @@ from dopepp.models.spec import architecture, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.seen import Seen
 
-__all__ = ["Checkpoint", "load_network", "read", "write_atomic"]
+__all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 
 KEY: Final = released.KEY
 STATE_PREFIX: Final = "network."
@@ -139,7 +139,15 @@ def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
 
 
 def _parse(content: Mapping[str, Any]) -> Checkpoint:
-    payload = content[KEY]
+    weights = _parse_weights(content.get("state_dict"))
+    return replace(parse_description(content[KEY]), state_dict=weights)
+
+
+def parse_description(payload: object) -> Checkpoint:
+    """Read what :meth:`Checkpoint.to_payload` returns back, as a checkpoint without weights.
+
+    A :class:`UserError` says which field of it is not as it should be. Nothing is built.
+    """
     if not isinstance(payload, dict):
         raise UserError(f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train again")
     _check_plain(payload)
@@ -157,7 +165,7 @@ def _parse(content: Mapping[str, Any]) -> Checkpoint:
         raise UserError(f"sigma {sigma}", "a positive number of cells", "train again")
     return Checkpoint(
         spec=architecture(_take(payload, "spec", dict)),
-        state_dict=_parse_weights(content.get("state_dict")),
+        state_dict={},
         parts=[Part.from_record(record) for record in _take(payload, "parts", list)],
         input_size=(input_size[0], input_size[1]),
         stride=_take(payload, "stride", int),

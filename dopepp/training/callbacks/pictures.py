@@ -14,10 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
-import numpy as np
 import torch
-from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from dopepp.core.files import write_png
@@ -25,8 +22,8 @@ from dopepp.data.batch import Batch
 from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
+from dopepp.drawing.sheet import Tile, belief_tiles, contact_sheet
+from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.training.callbacks.pose_metrics import PoseMetricsCallback
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.system import PoseSystem, ValidationOutput
@@ -128,31 +125,10 @@ class BeliefMaps(ValidationSheet):
         images = batch.images.permute(0, 2, 3, 1).cpu().numpy()
         shape = (len(images), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
         beliefs = outputs.belief.reshape(shape).amax(dim=1).cpu().numpy()
-        tiles = []
+        tiles: list[Tile] = []
         for image, belief, key in zip(images, beliefs, batch.keys, strict=True):
-            maps = {"corners": belief[:CENTROID].max(axis=0), "centroid": belief[CENTROID]}
-            for name, one in maps.items():
-                picture = heat_picture(image, one, system.geometry.stride)
-                tiles.append(Tile(picture, f"{key} {name}, max {one.max():.2f}"))
+            tiles += belief_tiles(image, belief, system.geometry.stride, key)
         return tiles
-
-
-def heat_picture(
-    image: Picture, channel: Float[np.ndarray, "map_height map_width"], stride: int = 8
-) -> Picture:
-    """Blend one map into the dimmed image, the more opaque the stronger the belief.
-
-    The image is at the scale of the network's input, ``stride`` pixels per cell of the map that
-    covers it, whose values are clipped to [0, 1].
-    """
-    # cv2's resize keeps pixel centres: cell i lands on pixel stride·i + (stride − 1)/2.
-    large = cv2.resize(channel, None, fx=stride, fy=stride, interpolation=cv2.INTER_LINEAR)
-    share = np.clip(large[: image.shape[0], : image.shape[1]], 0.0, 1.0)
-    heat = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_JET)
-    weight = (0.8 * share)[..., None]
-    # The picture is dimmed, so that a faint belief is not lost in a bright background.
-    blended = (1 - weight) * 0.6 * image + weight * heat[..., ::-1]
-    return np.asarray(np.rint(blended), np.uint8)
 
 
 def log_picture(trainer: Trainer, name: str, image: Picture) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.command_line import entry
-from dopepp.experiment.reports.protocols import SHORT_NAMES, Protocols
+from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, entry
+from dopepp.experiment.reports.protocols import Protocols
 
 OPTIONS: dict[str, Any] = {"shading": None, "by": None, "num_bins": 5, "scale_factors": None}
 SHARES = r"shading=.*; allowed: shares .* 0 to 1"
@@ -48,7 +48,7 @@ def test_scale_is_short_for_an_option(composed, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "scale=[0.5,1,2]", "data.num_test=3"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     seen: list[str] = []
-    entry(lambda: seen.extend(sys.argv[1:]), ["data"], SHORT_NAMES)
+    entry(lambda: seen.extend(sys.argv[1:]), ["data"], EVALUATION_SHORT_NAMES)
     assert seen == ["scale_factors=[0.5,1,2]", "++data.num_test=3"]
     config = composed(seen[0], config="evaluate")
     assert Protocols.of(config) == Protocols(scales=(0.5, 2.0))

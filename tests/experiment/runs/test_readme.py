@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from dopepp.experiment.runs import readme, record
+from dopepp.experiment.runs import program, readme, record
 
 CONFIG: Any = SimpleNamespace(
     model=SimpleNamespace(name="dopepp"),
@@ -24,7 +24,8 @@ def run(tmp_path):
     return folder
 
 
-def test_every_state_is_told_with_what_to_do(run):
+def test_every_state_is_told_with_what_to_do(run, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/somewhere/train.py", "seed=1"])
     page = readme.RunReadme(CONFIG, run)
     page.end(readme.FAILED, "too early")
     assert not (run / readme.README_FILE).exists()  # it was never begun
@@ -45,12 +46,15 @@ def test_every_state_is_told_with_what_to_do(run):
     assert "trainer.max_epochs=6" in text
     assert "](overlay.png)" in text
     assert "](auc.png)" not in text
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/dopepp", "train", "seed=1"])
+    page.end(readme.FINISHED)
+    assert "\ndopepp train resume=" in (run / readme.README_FILE).read_text()
 
 
 def test_paths_are_typed_as_from_here(run, monkeypatch):
-    assert readme.shown(run) == str(run)
+    assert program.shown(run) == str(run)
     monkeypatch.chdir(run.parent)
-    assert readme.shown(run / "x") == "a run/x"
+    assert program.shown(run / "x") == "a run/x"
 
 
 def test_a_readme_that_cannot_be_written_ends_no_run(run, caplog):

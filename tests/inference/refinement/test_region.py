@@ -27,7 +27,7 @@ from dopepp.inference.refinement.lines import (
     region_terms,
 )
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.region import FINE, SURE, RegionRefiner
+from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
 from dopepp.inference.refinement.rounds import Round
 from dopepp.inference.refinement.silhouette import filled_mask, posed
 from dopepp.inference.refinement.solver import descend
@@ -205,10 +205,10 @@ def test_shifts_of_a_straight_edge() -> None:
     for edge in (30.3, 33.0, 35.6):
         odds = np.clip(2 * (edge - columns), -1, 1) * 3
         image = np.broadcast_to(odds, (64, 64)).astype(np.float32)
-        shifts = find_shifts(image, FLAT, contour, 8.0, 1.0)
+        shifts = find_shifts(image, FLAT, contour, 8.0, 1.0, FOUND)
         assert_allclose(shifts.mean[right], edge - 31.5, atol=0.15)
         assert shifts.information[right].min() > 0.5
-    nothing = find_shifts(np.zeros((64, 64), np.float32), FLAT, contour, 8.0, 1.0)
+    nothing = find_shifts(np.zeros((64, 64), np.float32), FLAT, contour, 8.0, 1.0, FOUND)
     assert_allclose(nothing.information, 0.0, atol=1e-12)
 
 
@@ -218,13 +218,28 @@ def test_an_edge_is_found_where_colours_tell_nothing() -> None:
         columns = np.arange(64.0)
         grey = 100 + 60 * np.clip(columns - edge + 0.5, 0, 1)
         colours = np.broadcast_to(grey[:, None], (64, 64, 3)).astype(np.uint8)
-        shifts = find_shifts(np.zeros((64, 64), np.float32), colours, contour, 6.0, 1.0)
+        shifts = find_shifts(np.zeros((64, 64), np.float32), colours, contour, 6.0, 1.0, FOUND)
         weights = shifts.information[right]
         assert weights.min() > 0.05
         assert abs(np.average(shifts.mean[right], weights=weights) - (edge - 31.5)) < 0.8
     noise = np.random.default_rng(0).normal(128, 2, (64, 64, 3)).astype(np.uint8)
-    nothing = find_shifts(np.zeros((64, 64), np.float32), noise, contour, 6.0, 1.0)
+    nothing = find_shifts(np.zeros((64, 64), np.float32), noise, contour, 6.0, 1.0, FOUND)
     assert nothing.information.mean() < 0.003
+
+
+def test_of_a_followed_part_a_blurred_edge_outweighs_its_colours() -> None:
+    contour, right = straight_edge()
+    columns = np.arange(64.0)
+    grey = cv2.GaussianBlur(np.where(columns < 31.5, 60.0, 160.0)[None], (0, 0), 3.0)[0]
+    colours = np.broadcast_to(grey[:, None], (64, 64, 3)).astype(np.uint8)
+    # The mixed colours beyond the edge were learned as the part's.
+    odds = np.broadcast_to(np.where(columns < 34.5, 3.0, -3.0), (64, 64)).astype(np.float32)
+    found, followed = (
+        find_shifts(odds, colours, contour, 8.0, 1.0, weights).mean[right]
+        for weights in (FOUND, FOLLOWED)
+    )
+    assert_allclose(followed, 0.0, atol=0.7)
+    assert found.min() > 1.5
 
 
 @pytest.mark.parametrize("extent", [40.0, 150.0, 900.0])
@@ -355,6 +370,20 @@ def test_tight_prior_needs_the_last_round_only(refiner: RegionRefiner) -> None:
     assert learned == [FINE.longest_px]
     assert not refined.reason
     assert max(off(refined.T_cam_obj)) < 0.3 < max(off(start))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pose_that_was_known_well_is_not_given_up(refiner: RegionRefiner, seed: int) -> None:
+    # A picture adds little to it, and moves it by a fraction of a pixel either way.
+    deviations = np.repeat([math.radians(0.05), 0.00005], 3)
+    start = moved(TRUE, np.random.default_rng(seed).normal(size=6) * deviations)
+    found = refiner.refine(picture(pivconnector()), K, start, np.diag(deviations**2), followed=True)
+    assert not found.reason
+    assert max(off(found.T_cam_obj)) < 0.15
+    grey = refiner.refine(
+        picture(pivconnector(), around=PART_COLOUR, noise=0), K, start, np.diag(deviations**2)
+    )
+    assert "too alike" in grey.reason
 
 
 def test_large_pictures_are_read_smaller(refiner: RegionRefiner) -> None:

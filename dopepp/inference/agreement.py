@@ -1,0 +1,114 @@
+"""How far an exported network's maps and poses are from the original's on the same pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.scales import letterboxes
+from dopepp.recovery.detection import Detection
+
+MAX_MAPS: Final = 1e-4
+MAX_MM: Final = 0.1
+MAX_DEG: Final = 0.05
+"""What float32 of another runtime may change: maps, positions and rotations."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The largest differences, and how many poses they are of.
+
+    Attributes:
+        maps: Of a value of a map, as a share of the largest one's size where that is over 1.
+        position_mm: Of a position, millimetres.
+        rotation_deg: Of a rotation, degrees.
+        num_poses: Poses that both found.
+        num_single: Poses that only one of them found.
+        num_pictures: Pictures they looked at.
+    """
+
+    maps: float
+    position_mm: float
+    rotation_deg: float
+    num_poses: int
+    num_single: int
+    num_pictures: int
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing differs by more than float32's rounding may bring about."""
+        close = self.maps <= MAX_MAPS and self.position_mm <= MAX_MM
+        return close and self.rotation_deg <= MAX_DEG and not self.num_single
+
+    def __str__(self) -> str:
+        words = f"maps within {self.maps:.1e}"
+        if self.num_poses:
+            words += (
+                f", {self.num_poses} poses within {self.position_mm:.3g} mm "
+                f"and {self.rotation_deg:.3g}°"
+            )
+        else:
+            words += ", no pose found by both"
+        single = f", {self.num_single} found by one alone" if self.num_single else ""
+        return f"{words}{single}, on {self.num_pictures} pictures"
+
+
+def compare(
+    exported: PoseEstimator,
+    original: PoseEstimator,
+    pictures: Sequence[tuple[Picture, CameraMatrix]],
+) -> Agreement:
+    """Compare maps and poses on pictures with their camera matrices."""
+    maps, apart, num_single = [0.0], [(0.0, 0.0)], 0
+    for picture, K in pictures:
+        for box in letterboxes(original.checkpoint, K, picture):
+            pixels = letterboxed(picture, box, original.network.size_multiple)
+            for one, other in zip(exported.maps(pixels), original.maps(pixels), strict=True):
+                maps.append(_difference(one, other))
+        found = [each.predict(picture, K, cropped=True) for each in (original, exported)]
+        pairs = _pairs(*found)
+        apart += [_apart(*pair) for pair in pairs]
+        num_single += sum(map(len, found)) - 2 * len(pairs)
+    positions, rotations = zip(*apart, strict=True)
+    return Agreement(
+        max(maps), max(positions), max(rotations), len(apart) - 1, num_single, len(pictures)
+    )
+
+
+def _difference(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Return the largest difference of two maps; infinite where one is not finite."""
+    largest = float((one - other).abs().max() / other.abs().max().clamp(min=1.0))
+    return largest if math.isfinite(largest) else math.inf
+
+
+def _pairs(
+    ours: Sequence[Detection], theirs: Sequence[Detection]
+) -> list[tuple[Detection, Detection]]:
+    """Return detections of the same object, the nearest ones first, each in one pair."""
+    distances = [
+        (_apart(one, other)[0], i, k)
+        for i, one in enumerate(ours)
+        for k, other in enumerate(theirs)
+        if one.object == other.object
+    ]
+    pairs: dict[int, int] = {}
+    for _, i, k in sorted(distances):
+        if i not in pairs and k not in pairs.values():
+            pairs[i] = k
+    return [(ours[i], theirs[k]) for i, k in pairs.items()]
+
+
+def _apart(one: Detection, other: Detection) -> tuple[float, float]:
+    """Return how far two poses are apart, millimetres and degrees."""
+    T, U = one.T_cam_obj, other.T_cam_obj
+    angle = rotation_angle(T[:3, :3].T @ U[:3, :3])
+    return 1000 * float(np.linalg.norm(T[:3, 3] - U[:3, 3])), math.degrees(float(angle))

@@ -1,0 +1,253 @@
+"""Exporting a network: normalisation, network and activation as one graph in a file.
+
+Pixels (batch, 3, height, width), uint8 RGB, go in; belief maps and the vector field come out.
+Batch, height and width are free, the sides multiples of the network's. To add a format, write an
+:data:`Exporter` and a line in :data:`EXPORTERS`.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+
+from dopepp.core.errors import UserError, require
+from dopepp.core.files import write_whole
+from dopepp.inference.runtimes.description import Export, described, pack
+from dopepp.inference.runtimes.openvino import NAME, load_openvino
+from dopepp.inference.runtimes.runtime import INPUT, OUTPUTS, Pixels
+from dopepp.models.checkpoint.released import KEY, SUFFIX, write_content
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.network import PoseNetwork
+
+PRECISIONS: Final = ("fp32", "fp16", "int8")
+
+Save = Callable[[Path, Checkpoint, Export], None]
+"""Writes a graph with its description into a file, or a folder, that is not there yet."""
+
+Exporter = Callable[[PoseNetwork, str, Sequence[Pixels]], Save]
+"""Makes a graph of a network in a precision; int8 is measured on images of the network's input.
+
+A UserError: an extra is missing, or the network has what the format or the precision has not."""
+
+_CHATTY: Final = ("torch.onnx", "onnxscript", "onnx_ir")
+"""Loggers that tell every step of a translation."""
+
+_SMALL: Final = 1024
+"""Numbers of a constant that half precision does not make worthwhile; shapes have fewer."""
+
+_FLOAT16_MAX: Final = 65504.0
+
+
+class _Maps(nn.Module):
+    """What is exported of a network: from pixels to maps in float32."""
+
+    def __init__(self, network: PoseNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        belief, field = self.network.maps(pixels)
+        return belief.float(), field.float()
+
+
+def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
+    """Make an ONNX model; see :data:`Exporter`."""
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        require(package, "--format onnx", "onnx")
+    program = _traced(network)
+    with _translating(network, "ONNX"):
+        made: Any = torch.onnx.export(
+            program, input_names=[INPUT], output_names=list(OUTPUTS), dynamo=True,
+            external_data=False, verbose=False,
+        )  # fmt: skip
+        model = made.model_proto
+    _strip(model.graph)
+    if precision == "fp16":
+        _halve(model.graph)
+    if precision == "int8":
+        batches = [{INPUT: one} for one in images]
+        model = _quantised(model, batches, _last_convolutions(model.graph))
+
+    def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
+        del model.metadata_props[:]
+        model.metadata_props.add(key=KEY, value=pack(checkpoint, export))
+        write_whole(path, model.SerializeToString())
+
+    return save
+
+
+def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
+    """Make an OpenVINO model; see :data:`Exporter`."""
+    openvino = load_openvino("--format openvino")
+    program = _traced(network)
+    with _translating(network, "OpenVINO"):
+        model = openvino.convert_model(program)
+    model.reshape({model.inputs[0]: [-1, 3, -1, -1]})
+    model.inputs[0].set_names({INPUT})
+    for output, name in zip(model.outputs, OUTPUTS, strict=True):
+        output.set_names({name})
+    if precision == "int8":
+        model = _quantised(model, list(images), _last_openvino_convolutions(model))
+
+    def save(folder: Path, checkpoint: Checkpoint, export: Export) -> None:
+        model.set_rt_info(pack(checkpoint, export), [KEY])
+        folder.mkdir(exist_ok=True)
+        try:
+            openvino.save_model(model, folder / NAME, compress_to_fp16=precision == "fp16")
+        except RuntimeError as error:  # does not say what the system has refused
+            raise OSError(errno.EIO, "OpenVINO could not write it, is the disk full?") from error
+
+    return save
+
+
+def to_safetensors(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
+    """Keep the weights as they are, or in half precision, for PyTorch; see :data:`Exporter`."""
+    if precision == "int8":
+        allowed, fix = "fp32 or fp16", "choose --format onnx or openvino for int8"
+        raise UserError("--format safetensors --precision int8", allowed, fix)
+    weights = network.state_dict()
+
+    def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
+        whole = Checkpoint(**{**vars(checkpoint), "state_dict": weights})
+        write_content(described(whole, export), path, half=precision == "fp16")
+
+    return save
+
+
+EXPORTERS: Final[dict[str, tuple[Exporter, str]]] = {
+    "onnx": (to_onnx, ".onnx"),
+    "openvino": (to_openvino, "_openvino"),
+    "safetensors": (to_safetensors, SUFFIX),
+}
+"""Of every format what makes it, and how a file's or folder's name ends."""
+
+
+def _traced(network: PoseNetwork) -> ExportedProgram:
+    """Return the operations of a network for any batch, height and width."""
+    multiple = network.size_multiple
+    example = torch.zeros(2, 3, 3 * multiple, 4 * multiple, dtype=torch.uint8)
+    free = {0: Dim("batch"), 2: multiple * Dim("rows"), 3: multiple * Dim("columns")}
+    maps = _Maps(network.cpu()).eval()
+    with _translating(network, "torch.export"):
+        return torch.export.export(maps, (example,), dynamic_shapes=(free,))
+
+
+@contextmanager
+def _translating(network: PoseNetwork, language: str) -> Iterator[None]:
+    """Tell an operator that a language does not have in one line, and nothing else."""
+    loggers = {one: one.level for one in map(logging.getLogger, _CHATTY)}
+    for one in loggers:
+        one.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except UserError:
+        raise
+    except Exception as error:  # each library's own, whatever the network leads to
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        parts = ", ".join(type(one).__name__ for one in network.children())
+        raise UserError(
+            f"a network of {parts}, which {language} has no words for "
+            f"({lines[0] if lines else type(error).__name__:.300})",
+            f"operators that {language} knows, for images of any size",
+            "use another operator in your module, or export it as safetensors",
+        ) from error
+    finally:
+        for one, level in loggers.items():
+            one.setLevel(level)
+
+
+def _strip(graph: Any) -> None:
+    """Leave out where in our sources a node comes from, and give the free sides names."""
+    for one in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del one.metadata_props[:]
+        one.doc_string = ""
+    del graph.value_info[:]
+    names = ("batch", None, "height", "width"), *2 * (("batch", None, "rows", "columns"),)
+    for one, sides in zip((*graph.input, *graph.output), names, strict=True):
+        for side, name in zip(one.type.tensor_type.shape.dim, sides, strict=True):
+            if name is not None:
+                side.dim_param = name
+
+
+def _halve(graph: Any) -> None:
+    """Keep weights in half precision, each behind a conversion that a runtime does once."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    conversions = []
+    for one in graph.initializer:
+        values = numpy_helper.to_array(one)
+        if values.dtype != np.float32 or values.size <= _SMALL:
+            continue
+        if not np.abs(values).max() <= _FLOAT16_MAX:
+            allowed = f"weights of at most {_FLOAT16_MAX:g}"
+            raise UserError(f"--precision fp16 of {one.name}", allowed, "choose fp32")
+        name, half = one.name, f"{one.name}.half"
+        one.CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
+        conversions.append(helper.make_node("Cast", [half], [name], name, to=TensorProto.FLOAT))
+    nodes = [*conversions, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def _last_convolutions(graph: Any) -> list[str]:
+    """Return the names of the convolutions that answer an ONNX graph's maps."""
+    made_by = {name: node for node in graph.node for name in node.output}
+    ends = []
+    for output in graph.output:
+        node = made_by.get(output.name)
+        while node is not None and node.op_type != "Conv":
+            node = next((made_by[one] for one in node.input if one in made_by), None)
+        ends += [] if node is None else [node.name]
+    return ends
+
+
+def _last_openvino_convolutions(model: Any) -> list[str]:
+    """Return the names of the convolutions that answer an OpenVINO graph's maps."""
+    ends = []
+    for output in model.outputs:
+        node = output.get_node()
+        while node is not None and node.get_type_name() != "Convolution":
+            inputs = (one.get_node() for one in node.input_values())
+            node = next((one for one in inputs if one.get_type_name() != "Constant"), None)
+        ends += [] if node is None else [node.get_friendly_name()]
+    return ends
+
+
+def _quantised(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
+    """Return a graph that computes in 8 bits, but for what answers the maps.
+
+    Weights take 7 bits of them: where the processor has no VNNI, sums of two products of 8 bits
+    overflow.
+    """
+    load_openvino("--precision int8")
+    require("nncf", "--precision int8", "openvino")
+    logging.getLogger("nncf").setLevel(logging.ERROR)
+    with redirect_stdout(StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import nncf
+        from nncf.quantization.advanced_parameters import (
+            AdvancedQuantizationParameters,
+            OverflowFix,
+        )
+
+        return nncf.quantize(
+            model,
+            nncf.Dataset(images),
+            preset=nncf.QuantizationPreset.MIXED,
+            subset_size=len(images),
+            ignored_scope=nncf.IgnoredScope(names=list(ends)),
+            advanced_parameters=AdvancedQuantizationParameters(overflow_fix=OverflowFix.ENABLE),
+        )

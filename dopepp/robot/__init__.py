@@ -1,0 +1,1 @@
+"""The robot's side: what ties a camera to an arm."""

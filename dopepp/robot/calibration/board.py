@@ -1,0 +1,209 @@
+"""Calibration boards: printed at true scale, found on pictures.
+
+A board's frame has its origin at the first point, x along the columns, y along the rows and z
+into the board. To add a kind, write its points, its picture and its finder below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import check_target, write_whole
+from dopepp.drawing.pictures import Picture
+
+PX_PER_MM: Final = 10
+"""Of a printed board: 254 dots per inch, so that sizes in tenths of millimetres are exact."""
+
+MARGIN_MM: Final = 10
+
+LONGEST_MM: Final = 1200
+
+MIN_POINTS: Final = 8
+"""Fewer do not tell a board's turn from its distance."""
+
+SPELLING: Final = (
+    "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], chess:COLUMNSxROWS:SQUARE (inner corners), "
+    "circles:COLUMNSxROWS:SPACING (asymmetric); lengths in mm"
+)
+
+DICTIONARY: Final = "5X5_100"
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A board on a picture.
+
+    Attributes:
+        name: Of the picture.
+        points: Of the board that were found, in its frame, metres.
+        pixels: Where they are.
+    """
+
+    name: str
+    points: Float[np.ndarray, "n 3"]
+    pixels: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat target.
+
+    Attributes:
+        kind: ``charuco``, ``chess`` or ``circles``.
+        columns: Squares across (ChArUco), inner corners (chess board), circles in a row.
+        rows: The same, downwards.
+        spacing: Side of a square; of circles, twice the step from row to row; metres.
+        marker: Side of a ChArUco marker, metres.
+        dictionary: Of the ChArUco markers, without OpenCV's ``DICT_``.
+    """
+
+    kind: str
+    columns: int
+    rows: int
+    spacing: float
+    marker: float = 0.0
+    dictionary: str = DICTIONARY
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """All points in the board's frame, metres."""
+        if self.kind == "charuco":
+            return np.asarray(self._charuco.getChessboardCorners(), np.float64)
+        column, row = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        x, y = column * self.spacing, row * self.spacing
+        if self.kind == "circles":
+            x, y = x + (row % 2) * self.spacing / 2, y / 2
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+    def find(self, picture: Picture, name: str) -> Sighting | None:
+        """Find the board on an RGB picture; None where fewer than 8 points are seen."""
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        chosen, pixels = getattr(self, f"_find_{self.kind}")(grey)
+        if len(chosen) < MIN_POINTS:
+            return None
+        return Sighting(name, self.points[chosen], np.asarray(pixels, np.float64).reshape(-1, 2))
+
+    @property
+    def first_px(self) -> float:
+        """Where the frame's origin is from the drawing's upper and left border, pixels."""
+        squares = {"charuco": 0.0, "chess": 1.0, "circles": 0.5}[self.kind]
+        return PX_PER_MM * (MARGIN_MM + 1000 * squares * self.spacing)
+
+    def drawing(self) -> UInt8[np.ndarray, "height width"]:
+        """Return the board as it is printed, :data:`PX_PER_MM` pixels a millimetre."""
+        step, margin = round(self.spacing * 1000 * PX_PER_MM), MARGIN_MM * PX_PER_MM
+        if self.kind == "charuco":
+            size = (self.columns * step + 2 * margin, self.rows * step + 2 * margin)
+            return np.asarray(self._charuco.generateImage(size, marginSize=margin, borderBits=1))
+        if self.kind == "chess":
+            row, column = np.indices((self.rows + 1, self.columns + 1))
+            squares = np.where((row + column) % 2, 255, 0).astype(np.uint8)
+            inner = np.kron(squares, np.ones((step, step), np.uint8))
+            return np.pad(inner, margin, constant_values=255)
+        at = np.rint(self.points[:, :2] * 1000 * PX_PER_MM + self.first_px).astype(int)
+        height, width = at[:, 1].max() + margin + step // 2, at[:, 0].max() + margin + step // 2
+        page = np.full((height, width), 255, np.uint8)
+        for x, y in at.tolist():
+            middle = (2 * x - 1, 2 * y - 1)  # half pixels: (0, 0) is a pixel's centre
+            cv2.circle(page, middle, step // 2, 0, -1, cv2.LINE_AA, shift=1)
+        return page
+
+    def write(self, path: Path) -> str:
+        """Write the board for printing, PDF or PNG; return its size in words."""
+        import io
+
+        check_target(path, (".pdf", ".png"))
+        page, content = self.drawing(), io.BytesIO()
+        dots = PX_PER_MM * 25.4
+        if path.suffix.lower() == ".pdf":
+            Image.fromarray(page).save(content, "PDF", resolution=dots)
+        else:
+            Image.fromarray(page).save(content, "PNG", dpi=(dots, dots))
+        write_whole(path, content.getvalue())
+        height, width = (one / PX_PER_MM for one in page.shape)
+        return f"{width:g} × {height:g} mm; print at 100 %, not fitted to the page, and measure it"
+
+    @cached_property
+    def _charuco(self) -> Any:
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.spacing, self.marker, markers)
+
+    @cached_property
+    def _detector(self) -> Any:
+        return cv2.aruco.CharucoDetector(self._charuco)
+
+    def _find_charuco(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[Any, Any]:
+        pixels, numbers, _, _ = self._detector.detectBoard(grey)
+        return ([], []) if numbers is None else (np.ravel(numbers), pixels)
+
+    def _find_chess(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[Any, Any]:
+        found, pixels = cv2.findChessboardCornersSB(grey, (self.columns, self.rows), None)
+        if not found:
+            return [], []
+        pixels = pixels.reshape(-1, 2)
+        # The finder may begin at either end: the square behind the first corner is black.
+        grid = pixels.reshape(self.rows, self.columns, 2)
+        first, second = (self._shade(grey, grid[:2, k : k + 2]) for k in (0, 1))
+        return np.arange(len(pixels)), pixels if first < second else pixels[::-1]
+
+    def _shade(self, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "2 2 2"]) -> float:
+        """Return the brightness in the middle of a square."""
+        x, y = corners.mean(axis=(0, 1))
+        return float(cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean())
+
+    def _find_circles(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[Any, Any]:
+        layout = cv2.CALIB_CB_ASYMMETRIC_GRID
+        found, pixels = cv2.findCirclesGrid(grey, (self.columns, self.rows), None, layout)
+        return (np.arange(len(pixels)), pixels) if found else ([], [])
+
+
+def parse_board(text: str) -> Board:
+    """Read a board's description (:data:`SPELLING`); what is none is a :class:`UserError`."""
+    kind, _, rest = text.partition(":")
+    fields = rest.split(":")
+    try:
+        columns, rows = (int(one) for one in fields[0].lower().split("x"))
+        spacing, *marker = (float(one) / 1000 for one in fields[1:3])
+    except ValueError as error:
+        raise _refused(text, SPELLING) from error
+    fewest, most = {"charuco": (3, 4), "chess": (2, 2), "circles": (2, 2)}.get(kind, (0, 0))
+    if not fewest <= len(fields) <= most:
+        raise _refused(text, SPELLING)
+    dictionary = (*fields[3:], DICTIONARY)[0]
+    board = Board(kind, columns, rows, spacing, sum(marker), dictionary)
+    _check(board, text)
+    return board
+
+
+def _check(board: Board, text: str) -> None:
+    longest = max(board.columns, board.rows) * board.spacing * 1000
+    if min(board.columns, board.rows) < 3 or not board.spacing >= 0.001:
+        raise _refused(text, "at least 3×3, squares of at least 1 mm")
+    if longest > LONGEST_MM:
+        raise _refused(text, f"a board of at most {LONGEST_MM} mm")
+    if board.kind == "charuco":
+        names = [one[5:] for one in dir(cv2.aruco) if one.startswith("DICT_")]
+        if board.dictionary not in names:
+            raise _refused(text, "a dictionary of " + ", ".join(names))
+        if not 0 < board.marker < board.spacing:
+            raise _refused(text, "markers smaller than their squares")
+        markers = cv2.aruco.getPredefinedDictionary(
+            getattr(cv2.aruco, f"DICT_{board.dictionary}")
+        ).bytesList
+        if board.columns * board.rows // 2 > len(markers):
+            raise _refused(text, f"at most {len(markers)} markers, as {board.dictionary} has")
+    if board.kind == "chess" and (board.columns + board.rows) % 2 == 0:
+        raise _refused(text, "one even and one odd number of corners: others look the same turned")
+
+
+def _refused(text: str, allowed: str) -> UserError:
+    return UserError(f"board {text!r:.100}", allowed, "e.g. charuco:8x11:20:15")

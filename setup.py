@@ -1,0 +1,10 @@
+"""What pyproject.toml cannot say: ``conf/`` of the repository is ``dopepp/conf`` of the wheel."""
+
+from setuptools import find_namespace_packages, setup
+
+setup(
+    packages=[*find_namespace_packages(include=["dopepp*", "hydra_plugins*"]), "dopepp.conf"],
+    package_dir={"dopepp.conf": "conf"},
+    include_package_data=False,  # only what stands here, whatever version control knows
+    package_data={"dopepp": ["py.typed", "pretrained/*"], "dopepp.conf": ["**/*.yaml"]},
+)

@@ -1,0 +1,158 @@
+"""The commands as they are typed, on drawn pictures."""
+
+import csv
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.core.files import write_png
+from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
+from dopepp.geometry.camera_file import Camera, read_camera
+from dopepp.robot.calibration.board import parse_board
+from dopepp.robot.calibration.drawn import draw_view
+from dopepp.robot.calibration.files import read_transform
+from dopepp.robot.calibration.lens import write_camera
+
+BOARD = "charuco:8x6:25:19"
+
+
+def call(*words):
+    done = CliRunner().invoke(app, ["calibrate", *map(str, words)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    """A folder with ten pictures, poses.csv and camera.yaml, and where the camera truly is."""
+    folder, rng = tmp_path_factory.mktemp("cell"), np.random.default_rng(0)
+    camera = Camera((640, 480), camera_matrix(560, 560, 322, 236), (0.05, -0.1, 0, 0, 0), "true")
+    board, X = (
+        parse_board(BOARD),
+        make_transform(Rotation.random(rng=rng).as_matrix(), [0.03, -0.05, 0.08]),
+    )
+    Y = make_transform(Rotation.random(rng=rng).as_matrix(), [0.5, 0.1, 0.02])
+    write_camera(folder / "camera.yaml", camera)
+    rows = []
+    for number in range(10):
+        tilt = Rotation.from_euler("xyz", rng.uniform(-0.5, 0.5, 3)).as_matrix()
+        middle = tilt @ board.points.mean(axis=0)
+        near = np.append(rng.uniform(-0.08, 0.08, 2), rng.uniform(0.24, 0.32))
+        T_cam_board = make_transform(tilt, near - middle)
+        write_png(folder / f"{number}.png", draw_view(board, T_cam_board, camera, rng))
+        M = Y @ invert_transform(T_cam_board) @ invert_transform(X)
+        quaternion = Rotation.from_matrix(M[:3, :3]).as_quat(scalar_first=True)
+        rows.append([f"{number}.png", *(M[:3, 3] + 2e-4 * rng.normal(size=3)), *quaternion])
+    with (folder / "poses.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["name", "x", "y", "z", "qw", "qx", "qy", "qz"], *rows])
+    return folder, X, camera
+
+
+def test_a_camera_is_calibrated_from_pictures(cell, tmp_path):
+    folder, _, camera = cell
+    done = call("camera", folder, "--board", BOARD, "--out", tmp_path / "camera.yaml", "--force")
+    assert done.exit_code == 0, done.output
+    assert "reprojection error 0." in done.output
+    K = read_camera(tmp_path / "camera.yaml").K
+    assert np.allclose(K, camera.K, atol=2.5)
+
+
+def test_the_hand_eye_is_found_and_its_file_says_what_it_is(cell, tmp_path):
+    folder, X, _ = cell
+    out = tmp_path / "hand_eye.yaml"
+    words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--mount", "hand", "--out", out)
+    done = call("handeye", folder, folder / "poses.csv", *words)
+    assert done.exit_code == 0, done.output
+    assert "expected error at the board's distance" in done.output
+    T = read_transform(out, "T_flange_cam")
+    assert np.linalg.norm(T[:3, 3] - X[:3, 3]) < 0.0015
+    assert np.degrees(Rotation.from_matrix(T[:3, :3].T @ X[:3, :3]).magnitude()) < 0.2
+    content = yaml.safe_load(out.read_text())
+    assert content["trusted"] is True
+    assert content["poses_used"] == 10
+
+
+def test_a_calibration_that_is_not_trusted_is_written_by_force_alone(cell, tmp_path):
+    folder, _, _ = cell
+    with (folder / "poses.csv").open() as file:
+        few = file.readlines()[:5]
+    (tmp_path / "few.csv").write_text("".join(few))
+    out = tmp_path / "hand_eye.yaml"
+    words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--mount", "hand", "--out", out)
+    done = call("handeye", folder, tmp_path / "few.csv", *words)
+    assert done.exit_code == 2
+    assert "only 4 poses" in done.output
+    assert not out.exists()
+    assert call("handeye", folder, tmp_path / "few.csv", *words, "--force").exit_code == 0
+    content = yaml.safe_load(out.read_text())
+    assert content["trusted"] is False
+    assert "only 4 poses" in content["doubts"][0]
+
+
+def test_poses_in_millimetres_are_told(cell, tmp_path):
+    folder, _, _ = cell
+    words = (
+        "--board",
+        BOARD,
+        "--camera",
+        folder / "camera.yaml",
+        "--mount",
+        "hand",
+        "--unit",
+        "mm",
+    )
+    done = call("handeye", folder, folder / "poses.csv", *words, "--out", tmp_path / "x.yaml")
+    assert done.exit_code == 2
+    assert "--unit m" in done.output
+
+
+def test_a_tip_and_a_bench_are_written(tmp_path):
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (6, 3)))
+    at = np.array([0.4, 0, 0.1]) - turns.apply([0, 0.01, 0.12])
+    rows = np.hstack([1000 * at, turns.as_rotvec(degrees=True)])
+    np.savetxt(tmp_path / "p.csv", rows, delimiter=",", header="x,y,z,rx,ry,rz", comments="")
+    words = ("--unit", "mm", "--angles", "deg", "--out", tmp_path / "tool.yaml")
+    assert call("tcp", tmp_path / "p.csv", *words).exit_code == 0
+    tip = yaml.safe_load((tmp_path / "tool.yaml").read_text())["tip"]
+    assert np.allclose(tip, [0, 0.01, 0.12], atol=1e-6)
+    points = np.array([[0, 0, 0], [300, 0, 1], [0, 300, 0], [300, 300, 1.0]])
+    np.savetxt(tmp_path / "b.csv", points, delimiter=",", header="x,y,z", comments="")
+    assert (
+        call(
+            "bench", tmp_path / "b.csv", "--unit", "mm", "--out", tmp_path / "bench.yaml"
+        ).exit_code
+        == 0
+    )
+    assert read_transform(tmp_path / "bench.yaml", "T_base_bench")[2, 2] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("board", "chess:8x6:20", "--out", "b.pdf"), "one even and one odd"),
+        (("board", "chess:8x5:20", "--out", "b.txt"), ".pdf"),
+        (("camera", ".", "--board", BOARD, "--out", "c.yaml"), "without pictures"),
+        (("camera", ".", "--board", BOARD, "--out", "c.json"), ".yaml"),
+        (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
+        (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
+        (("bench", "none.csv", "--out", "t.yaml"), "none.csv"),
+        (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
+    ],
+)
+def test_bad_words_are_told_in_one_line(tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    done = call(*words)
+    assert done.exit_code == 2
+    assert said in done.output
+    assert len(done.output.strip().splitlines()) == 1
+
+
+def test_pictures_without_the_board_are_told(cell, tmp_path):
+    done = call("camera", cell[0], "--board", "chess:9x6:20", "--out", tmp_path / "c.yaml")
+    assert done.exit_code == 2
+    assert "on none of 10 pictures" in done.output

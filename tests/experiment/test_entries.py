@@ -1,0 +1,73 @@
+"""``dopepp train`` and ``dopepp evaluate``: what is told before PyTorch is there, what is left."""
+
+import re
+
+import pytest
+
+from dopepp.experiment.completion import complete
+
+CONSOLE = """
+import sys
+from dopepp.cli import app
+sys.argv = ["dopepp", *sys.argv[1:]]
+try:
+    app()
+finally:
+    print({"torch", "lightning", "cv2"} & set(sys.modules))
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("train", "sed=1"), 2, "got override 'sed', which names no option; .* nearest seed; "),
+        (("evaluate", "model=dope"), 2, "got override 'model', which names no option; "),
+        (("train", "model=dopp"), 2, "got model=dopp; allowed: dope dopepp dopepp_fast; "),
+        (("train", "--cfg", "job", "model=dope", "--package", "optimizer"), 0, "lr: "),
+        (("evaluate", "--help"), 0, "ckpt_path: null"),
+        (("--version",), 0, r"dopepp \d+\.\d+"),
+    ],
+)
+def test_the_console_answers_before_it_imports_pytorch(command, arguments, code, said):
+    done = command("-c", CONSOLE, *arguments, code=code)
+    assert re.search(said, done.out + done.err)
+    assert done.out.endswith("set()\n")
+
+
+def test_a_network_is_read_without_pytorchs_compiler(command):
+    code = """
+import sys
+from dopepp import PoseEstimator
+PoseEstimator.load("pretrained/pivconnector")
+print({"torch._dynamo", "sympy", "lightning", "matplotlib"} & set(sys.modules))
+"""
+    assert command("-c", code, code=0).out == "set()\n"
+
+
+def test_a_refused_run_leaves_no_folder(call, tiny_options, tmp_path):
+    output = f"output_dir={tmp_path}"
+    call("train.py", *tiny_options, "data.parts=[none.stl]", output, code=2)
+    call("train.py", *tiny_options, "trainer.max_epochs=many", output, code=2)
+    call("evaluate.py", "ckpt_path=none.ckpt", output, code=2)
+    call("evaluate.py", "ckpt_path=pretrained/servoholder", "data.num_test=0", output, code=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refused_run_leaves_what_was_there(call, tiny_options, tmp_path):
+    (tmp_path / "mine.txt").touch()
+    call("train.py", *tiny_options, "data.parts=[none.stl]", f"hydra.run.dir={tmp_path}", code=2)
+    assert (tmp_path / "mine.txt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        ([], "model=dopepp_", ["model=dopepp_fast"]),
+        (["model", "="], "dopepp_", ["dopepp_fast"]),  # as bash splits it
+        ([], "recip", ["recipe=ours", "recipe=paper"]),
+        (["recipe=paper"], "trainer.max_ep", ["trainer.max_epochs=60"]),
+        ([], "no_such", []),
+    ],
+)
+def test_the_shell_completes_overrides(words, incomplete, expected):
+    assert complete("train", words, incomplete) == expected

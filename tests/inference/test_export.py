@@ -1,0 +1,185 @@
+"""Networks out of files: the same maps and poses as PyTorch's, whatever they are called."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from torch import nn
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import camera_matrix
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.export import EXPORTERS
+from dopepp.inference.runtimes.description import Export
+from dopepp.inference.runtimes.runtime import num_threads
+from dopepp.models import spec as specs
+from dopepp.models.backbones import Backbone
+from dopepp.models.checkpoint.schema import Checkpoint, load_network, write_atomic
+from dopepp.parts.catalogue import pivconnector
+
+K = camera_matrix(130, 130, 63.5, 47.5)
+
+
+CASCADE = {"_target_": "dopepp.models.heads.Cascade", "width": 0.0625, "stages": 1}
+SCALES = {"_target_": "dopepp.models.heads.MultiScale", "width": 0.0625}
+PYRAMID = {"_target_": "dopepp.models.backbones.Pyramid", "width": 0.0625}
+
+
+@pytest.fixture(scope="module", params=["small", pytest.param("large", marks=pytest.mark.slow)])
+def original(request, tiny_spec, tmp_path_factory):
+    """A network of random weights whose maps are far from flat, with attention and batch norm."""
+    attention = {"_target_": "dopepp.models.attention.CBAM", "reduction": 4}
+    head = {**(CASCADE if request.param == "small" else SCALES), "batch_norm": True}
+    spec = {**tiny_spec, "attention": attention, "head": head}
+    if request.param == "large":
+        spec["backbone"] = PYRAMID
+    torch.manual_seed(0)
+    network = specs.build_network(spec)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            nn.init.normal_(module.running_mean)
+            nn.init.uniform_(module.running_var, 0.5, 2)
+    for branch in (*network.head.belief_branches, *network.head.field_branches):
+        nn.init.normal_(branch.outputs[-1].weight, std=0.5)  # untrained ones answer a constant
+    checkpoint = Checkpoint(
+        spec, network.state_dict(), [pivconnector()], (128, 96), 8, 1.5, {"peak_threshold": 1e-3}
+    )
+    path = tmp_path_factory.mktemp("checkpoint") / "best.ckpt"
+    write_atomic(checkpoint.to_file(), path)
+    return path
+
+
+def written(original, layout, folder, precision="fp32", images=()):
+    network, checkpoint = load_network(original)
+    save = EXPORTERS[layout][0](network, precision, images)
+    path = folder / f"any name{EXPORTERS[layout][1]}"
+    save(path, checkpoint, Export(layout, precision, network.size_multiple, 7, 0.5))
+    return path
+
+
+@pytest.fixture(scope="module", params=EXPORTERS)
+def exported(request, original, tmp_path_factory):
+    for package in {"onnx": ("onnx", "onnxruntime", "onnxscript"), "openvino": ("openvino",)}.get(
+        request.param, ()
+    ):
+        pytest.importorskip(package)
+    return written(original, request.param, tmp_path_factory.mktemp("exported"))
+
+
+def pictures(*shape: int) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, shape, np.uint8))
+
+
+def test_the_same_maps_for_any_batch_height_and_width(exported, original):
+    theirs, ours = PoseEstimator.load(exported), PoseEstimator.load(original)
+    assert theirs.network.size_multiple == ours.network.size_multiple
+    for shape in ((1, 3, 96, 128), (1, 3, 32, 32), (3, 3, 160, 64)):
+        images = pictures(*shape)
+        with torch.inference_mode():
+            pairs = zip(theirs.network.maps(images), ours.network.maps(images), strict=True)
+        for one, other in pairs:
+            assert other.std() > 0.01
+            torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+
+
+def test_a_renamed_file_is_the_same_estimator(exported, original, tmp_path):
+    ending = "".join(exported.suffixes)
+    moved = tmp_path / f"renamed{ending}"
+    (shutil.copytree if exported.is_dir() else shutil.copy)(exported, moved)
+    theirs, ours = (PoseEstimator.load(one, refine="region") for one in (moved, original))
+    assert replace(theirs.checkpoint, state_dict={}).to_payload() == ours.checkpoint.to_payload()
+    assert theirs.recovery == ours.recovery
+    picture = pictures(96, 128, 3).numpy()
+    found, expected = (one.predict(picture, K) for one in (theirs, ours))
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert_allclose(one.T_cam_obj, other.T_cam_obj, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_weights_in_half_precision_take_half_the_place(original, tmp_path):
+    pytest.importorskip("onnxscript")
+    whole, half = (written(original, "onnx", tmp_path / one, one) for one in ("fp32", "fp16"))
+    described = len(half.read_bytes()) - 2 * len(whole.read_bytes())
+    assert described < 0
+    images = pictures(1, 3, 96, 128)
+    belief, _ = PoseEstimator.load(half).network.maps(images)
+    with torch.inference_mode():
+        expected, _ = PoseEstimator.load(original).network.maps(images)
+    assert 0 < (belief - expected).abs().max() < 0.01
+
+
+def test_no_export_names_a_file_of_ours(exported):
+    for path in [exported, *exported.glob("*")]:
+        if path.is_file():
+            content = path.read_bytes()
+            assert str(__file__).encode() not in content
+            assert b"network.py" not in content
+
+
+def test_an_export_runs_on_the_cpu_alone(original, tmp_path, monkeypatch):
+    path = tmp_path / "a.onnx"
+    monkeypatch.setattr("dopepp.inference.estimator.checked_device", torch.device)
+    with pytest.raises(UserError, match=r"device cuda for .*a\.onnx; allowed: cpu"):
+        PoseEstimator.load(path, "cuda")
+
+
+@pytest.mark.parametrize(
+    ("layout", "package"), [("onnx", "onnxscript"), ("openvino", "openvino"), ("onnx", "onnx")]
+)
+def test_a_missing_extra_is_named(layout, package, original, tmp_path, monkeypatch):
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None if name == package else 1)
+    with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{layout}\]"):
+        written(original, layout, tmp_path)
+    if package != "onnxscript":
+        path = tmp_path / "a.onnx" if layout == "onnx" else tmp_path
+        (tmp_path / "model.xml").touch()
+        with pytest.raises(UserError, match=rf"without the package {package}.*dopepp\[{layout}\]"):
+            PoseEstimator.load(path)
+
+
+class Cubed(Backbone):
+    """Has an operator that only this process knows."""
+
+    out_channels, stride, cell_multiple = 8, 8, 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Conv2d(3, 8, 8, stride=8)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.ops.dopepp_test.cubed(self.layer(images))
+
+
+@pytest.mark.parametrize("layout", ["onnx", pytest.param("openvino", marks=pytest.mark.slow)])
+def test_an_operator_that_a_format_does_not_have(layout, original, tmp_path, monkeypatch):
+    pytest.importorskip("onnxscript" if layout == "onnx" else "openvino")
+    if not hasattr(torch.ops.dopepp_test, "cubed"):
+        operator = torch.library.custom_op("dopepp_test::cubed", mutates_args=())(_cubed)
+        operator.register_fake(torch.empty_like)
+    network, _ = load_network(original)
+    network.backbone = Cubed()
+    network.attention = nn.Identity()
+    wired = {"in_channels": 8, "num_objects": 1, "activation": "exp"}
+    network.head = specs.HEADS.build(CASCADE, **wired)
+    with pytest.raises(UserError, match=r"Cubed, Identity, .* has no words for") as e:
+        EXPORTERS[layout][0](network.eval(), "fp32", ())
+    assert "\n" not in str(e.value)
+
+
+def _cubed(values: torch.Tensor) -> torch.Tensor:
+    return values**3
+
+
+def test_threads(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert num_threads() == 3
+    for text in ("", "many", "0"):
+        monkeypatch.setenv("OMP_NUM_THREADS", text)
+        assert 1 <= num_threads() <= len(os.sched_getaffinity(0))

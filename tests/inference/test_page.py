@@ -1,0 +1,145 @@
+"""The page of ``dopepp serve`` in a browser, as somebody without a command line uses it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dopepp import PoseEstimator
+from dopepp.cli import app
+from dopepp.core.errors import UserError
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+FIND = "Find poses"
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on the PATH")
+pytest.importorskip("gradio", reason="without the extra web")
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    """A picture with the part, one without, files that are no picture, and the camera's numbers."""
+    folder = tmp_path_factory.mktemp("files")
+    rendered = Factory([pivconnector()], PRESETS["quickstart"].reframed(640, 480), 2).render(0, 9)
+    cv2.imwrite(str(folder / "part.png"), rendered.image[..., ::-1])
+    cv2.imwrite(str(folder / "empty.png"), np.full((480, 640, 3), 90, np.uint8))
+    (folder / "words.png").write_text("no picture")
+    np.savetxt(folder / "K.txt", rendered.scene.K)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def opened() -> Iterator[tuple[object, list[str]]]:
+    """The open page, and the addresses elsewhere that it has asked for."""
+    from dopepp.inference.page import served
+
+    elsewhere: list[str] = []
+    estimator = PoseEstimator.load("pretrained/pivconnector")
+    with served(estimator) as address, sync_api.sync_playwright() as browsers:
+        browser = browsers.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page()
+        page.set_default_timeout(120_000)  # beside other work
+        inside = (address, "data:", "blob:")
+        page.on("request", lambda one: one.url.startswith(inside) or elsewhere.append(one.url))
+        page.goto(address)
+        page.get_by_role("button", name=FIND).wait_for()
+        yield page, elsewhere
+        browser.close()
+
+
+@pytest.fixture
+def page(opened):
+    shown, elsewhere = opened
+    yield shown
+    assert not elsewhere
+
+
+def upload(page, place, path):
+    """Put a file into one of the two places for one."""
+    area = page.locator(place)
+    if area.get_by_label("Clear").count():
+        area.get_by_label("Clear").click()
+    area.locator("input[type=file]").set_input_files(path)
+    area.get_by_text(path.name.split(".")[0]).first.wait_for()
+
+
+def said(page):
+    """Find poses; return what the page says then."""
+    line = page.locator(".said")
+    before = line.inner_text()
+    page.get_by_role("button", name=FIND).click()
+    sync_api.expect(line).not_to_have_text(before, timeout=60_000)
+    return line.inner_text()
+
+
+def test_a_picture_becomes_an_overlay_and_a_file_as_predict_prints_it(page, files, tmp_path):
+    upload(page, "#picture", files / "part.png")
+    page.get_by_label("camera file", exact=True).check()
+    upload(page, "#camera", files / "K.txt")
+    assert said(page) == "1 pose found"
+    shown = page.locator("#poses img")
+    shown.wait_for()
+    source = shown.get_attribute("src")
+    pixels = np.frombuffer(page.request.get(source).body(), np.uint8)
+    drawn, given = cv2.imdecode(pixels, 1), cv2.imread(str(files / "part.png"))
+    changed = np.abs(drawn.astype(int) - given).max(axis=2) > 100
+    assert 0.002 < changed.mean() < 0.2
+    page.get_by_role("gridcell", name="pivconnector").wait_for(timeout=9000)
+    with page.expect_download() as download:
+        page.get_by_text("Download JSON").click()
+    download.value.save_as(tmp_path / "poses.json")
+    assert download.value.suggested_filename == "part.json"
+    options = ["--camera", str(files / "K.txt")]
+    done = CliRunner().invoke(
+        app, ["predict", "pretrained/pivconnector", str(files / "part.png"), *options]
+    )
+    predicted = [json.loads(line) | {"image": "part.png"} for line in done.stdout.splitlines()]
+    assert len(predicted) == 1
+    assert json.loads((tmp_path / "poses.json").read_text()) == predicted
+
+
+@pytest.mark.parametrize(
+    ("picture", "view", "line"),
+    [
+        ("words.png", "60", "got image words.png: cannot identify the format"),
+        ("part.png", "179", "got field of view=179; allowed: a number from 5 to 150 (degrees)"),
+        ("empty.png", "60", "Nothing found: pivconnector: its maps are empty"),
+    ],
+)
+def test_what_is_wrong_is_told_in_a_sentence(page, files, picture, view, line):
+    upload(page, "#picture", files / picture)
+    page.get_by_label("field of view", exact=True).check()
+    page.get_by_label("Degrees across").fill(view)
+    assert said(page).startswith(line)
+    assert page.locator("#poses img").count() == (picture == "empty.png")
+
+
+def test_numbers_of_another_size_are_told(page, files):
+    upload(page, "#picture", files / "part.png")
+    page.get_by_label("K", exact=True).check()
+    for name in ("fx", "fy", "cx", "cy"):
+        page.get_by_label(name, exact=True).fill("100")
+    assert "likely of 201×201 (--K-size)" in said(page)
+
+
+def test_a_port_that_is_taken_is_told(page):
+    from dopepp.inference.page import served
+
+    port = int(page.url.rstrip("/").rsplit(":", 1)[1])
+    estimator = PoseEstimator.load("pretrained/pivconnector")
+    with pytest.raises(UserError, match=f"--port {port}, which is taken"), served(estimator, port):
+        raise AssertionError

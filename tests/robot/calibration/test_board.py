@@ -1,0 +1,80 @@
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera import camera_matrix, invert_transform, project, transform
+from dopepp.geometry.camera_file import Camera
+from dopepp.robot.calibration.board import parse_board
+from dopepp.robot.calibration.drawn import draw_view
+
+BOARDS = ["charuco:8x6:20:15", "charuco:7x5:24.5:18:4X4_50", "chess:8x5:20", "circles:4x9:30"]
+
+
+@pytest.mark.parametrize("what", BOARDS)
+@pytest.mark.parametrize("roll", [0.3, 2.0, -2.6])
+def test_points_are_found_where_the_camera_has_them(what, roll, looking_at):
+    board, rng = parse_board(what), np.random.default_rng(0)
+    camera = Camera((800, 600), camera_matrix(700, 700, 395, 310), (), "a camera")
+    middle = board.points.mean(axis=0)
+    T = invert_transform(looking_at(middle + np.array([0.08, -0.05, -0.3]), middle, roll))
+    seen = board.find(draw_view(board, T, camera, rng), "picture")
+    assert seen is not None
+    assert len(seen.points) > 0.8 * len(board.points)
+    errors = np.linalg.norm(project(transform(T, seen.points), camera.K) - seen.pixels, axis=1)
+    assert errors.max() < 0.4
+    assert np.sqrt((errors**2).mean()) < 0.15
+
+
+def test_an_empty_picture_shows_no_board():
+    empty = np.full((240, 320, 3), 128, np.uint8)
+    assert all(parse_board(what).find(empty, "empty") is None for what in BOARDS)
+
+
+@pytest.mark.parametrize("what", BOARDS)
+def test_a_printed_board_has_its_true_size(what, tmp_path):
+    board = parse_board(what)
+    said = board.write(tmp_path / "board.pdf")
+    board.write(tmp_path / "board.png")
+    width, height = (float(one) for one in re.match(r"([\d.]+) × ([\d.]+) mm", said).groups())
+    box = re.search(rb"/MediaBox \[([^\]]*)\]", (tmp_path / "board.pdf").read_bytes())[1].split()
+    assert np.allclose(
+        [float(one) for one in box], [0, 0, width / 25.4 * 72, height / 25.4 * 72], atol=0.05
+    )
+    with Image.open(tmp_path / "board.png") as image:
+        assert np.allclose(
+            np.array(image.size) / image.info["dpi"] * 25.4, [width, height], rtol=1e-3
+        )
+
+
+def test_squares_of_a_printed_charuco_board_are_as_long_as_said():
+    board = parse_board("charuco:8x6:20:15")
+    page = board.drawing()
+    assert page.shape == (6 * 200 + 200, 8 * 200 + 200)
+    assert set(np.unique(page[:100])) == {255}
+    dark = page[100:300, 100] < 128  # the first square, at the board's corner, is black
+    assert dark.all()
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("", "charuco:COLUMNS"),
+        ("charuco:8x6:20", "charuco:COLUMNS"),
+        ("charuco:8x6:20:15:5X5_100:more", "charuco:COLUMNS"),
+        ("charuco:8x6:20:25", "smaller than their squares"),
+        ("charuco:8x6:20:15:NO_SUCH", "a dictionary of"),
+        ("charuco:30x30:20:15:4X4_50", "at most 50 markers"),
+        ("chess:8x6:20", "one even and one odd"),
+        ("chess:8xsix:20", "charuco:COLUMNS"),
+        ("chess:800x5:20", "at most 1200 mm"),
+        ("chess:8x5:nan", "at least 1 mm"),
+        ("circles:2x9:30", "at least 3×3"),
+        ("rings:8x5:20", "charuco:COLUMNS"),
+    ],
+)
+def test_a_board_that_is_none_is_refused(what, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        parse_board(what)

@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.geometry.camera_file import read_camera
+from dopepp.robot.calibration.board import Sighting, parse_board
+from dopepp.robot.calibration.lens import calibrate_lens, write_camera
+
+
+@pytest.fixture(scope="module")
+def views(cell):
+    """Views with the board near and far, out to the picture's corners."""
+    found = cell(3, num=4)
+    camera, rng = found.camera, np.random.default_rng(1)
+    board = parse_board("charuco:9x7:25:18")
+    sightings = []
+    for number in range(16):
+        turn = rng.uniform(-0.6, 0.6, 3)
+        shift = np.array([-0.11 + rng.uniform(-0.12, 0.12), -0.09 + rng.uniform(-0.1, 0.1), 0.33])
+        pixels = cv2.projectPoints(board.points, turn, shift, camera.K, camera.coefficients)[0]
+        pixels = pixels[:, 0] + 0.1 * rng.normal(size=(len(board.points), 2))
+        inside = ((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=1)
+        sightings.append(Sighting(f"{number}.png", board.points[inside], pixels[inside]))
+    return camera, sightings
+
+
+def test_the_lens_is_found_within_its_deviations(views):
+    camera, sightings = views
+    found = calibrate_lens(sightings, camera.size)
+    K, true = found.camera.K, camera.K
+    errors = np.array([K[0, 0] - true[0, 0], K[1, 1] - true[1, 1], *(K[:2, 2] - true[:2, 2])])
+    assert (np.abs(errors) < 4 * found.deviations).all()
+    assert np.abs(errors).max() < 1.0
+    assert found.error_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    assert not found.findings
+    assert not found.outliers
+
+
+def test_the_file_is_read_by_every_camera_option(views, tmp_path):
+    camera, sightings = views
+    found = calibrate_lens(sightings, camera.size).camera
+    write_camera(tmp_path / "camera.yaml", found)
+    again = read_camera(tmp_path / "camera.yaml")
+    assert again.size == found.size
+    assert np.array_equal(again.K, found.K)
+    assert again.distortion == found.distortion
+
+
+def test_a_view_that_contradicts_the_others_is_named_and_left_out(views):
+    camera, sightings = views
+    rng = np.random.default_rng(2)
+    bent = replace(
+        sightings[5], pixels=sightings[5].pixels + 6 * rng.normal(size=sightings[5].pixels.shape)
+    )
+    found = calibrate_lens([*sightings[:5], bent, *sightings[6:]], camera.size)
+    assert found.outliers == ("5.png",)
+    assert abs(found.camera.K[0, 0] - camera.K[0, 0]) < 1.5
+
+
+def test_views_in_the_middle_alone_are_not_trusted(views):
+    camera, sightings = views
+    wide = tuple(3 * side for side in camera.size)
+    middle = [replace(one, pixels=one.pixels + np.array(camera.size)) for one in sightings]
+    assert any("cover" in one for one in calibrate_lens(middle, wide).findings)
+
+
+def test_parallel_views_are_not_trusted(views):
+    camera, _ = views
+    board = parse_board("charuco:9x7:25:18")
+    parallel = [
+        Sighting(str(k), board.points, cv2.projectPoints(
+            board.points, np.array([0.01 * k, 0, 0.2 * k]), np.array([0.03 * k - 0.2, -0.1, 0.4]),
+            camera.K, camera.coefficients)[0][:, 0])
+        for k in range(8)
+    ]  # fmt: skip
+    assert any("parallel" in one for one in calibrate_lens(parallel, camera.size).findings)
+
+
+def test_two_views_are_refused(views):
+    with pytest.raises(UserError, match="at least 3"):
+        calibrate_lens(views[1][:2], views[0].size)

@@ -1,0 +1,73 @@
+"""The pages as a site: two builders read one mkdocs.yml, and refuse a link that leads nowhere."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOK = ROOT / "docs" / "notebooks" / "from_stl_to_poses.ipynb"
+
+
+def named(node: object) -> list[str]:
+    """Return the pages of a node of the navigation, in order."""
+    if isinstance(node, str):
+        return [node]
+    children = node.values() if isinstance(node, dict) else node
+    return [page for child in children for page in named(child)]
+
+
+def test_the_navigation_names_every_page_once():
+    pages = named(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    there = {path.name for path in (ROOT / "docs").glob("*.md")}
+    assert sorted(pages) == sorted(there)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("builder", ["mkdocs", "zensical"])
+def test_the_site_builds_without_a_complaint(builder, tmp_path):
+    """In a copy: Zensical writes where its configuration says, and its cache beside it."""
+    for name in ("docs", "dopepp"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "mkdocs.yml", tmp_path)
+    command = [sys.executable, "-m", builder, "build", "--strict"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    site = tmp_path / "build" / "site"
+    for page in named(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]):
+        folder = "" if page == "index.md" else page.removesuffix(".md")
+        assert (site / folder / "index.html").is_file()
+    reference = (site / "api" / "index.html").read_text()
+    assert "T_cam_obj" in reference
+    assert "PoseEstimator" in reference
+    assert ":class:" not in reference
+
+
+def test_the_notebook_and_its_page_say_the_same():
+    page = (ROOT / "docs" / "from_stl_to_poses.md").read_text()
+    notebook = json.loads(NOTEBOOK.read_text())
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"]).strip()
+        assert source in page
+        assert not cell.get("outputs")
+    pictures = list((ROOT / "docs" / "from_stl_to_poses").glob("*.jpg"))
+    assert pictures
+    assert sum(path.stat().st_size for path in pictures) < 300_000
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(monkeypatch, tmp_path):
+    nbclient = pytest.importorskip("nbclient")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    client = nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}})
+    client.execute()
+    printed = "".join(
+        one.get("text", "") for cell in client.nb.cells for one in cell.get("outputs", [])
+    )
+    assert "refined: found on 20 of 20" in printed

@@ -1,0 +1,106 @@
+"""The wheel: it holds every file that the program reads, and works where there is no repository."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import pytest
+from setuptools import Distribution
+
+import dopepp
+
+ROOT = Path(__file__).parents[1]
+COMPILED = shutil.ignore_patterns("__pycache__")
+
+
+def test_it_holds_every_file_that_the_program_reads(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("setuptools.setup", lambda **options: seen.update(options))
+    seen: dict[str, Any] = {}
+    exec((ROOT / "setup.py").read_text(), {})
+    build = Distribution({**seen, "script_name": "setup.py"}).get_command_obj("build_py")
+    build.ensure_finalized()
+    held = {str(Path(one).relative_to(build.build_lib)) for one in build.get_outputs(False)}
+    wanted = {
+        path.relative_to(ROOT)
+        for folder in ("dopepp", "hydra_plugins", "conf")
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    there = {str(Path("dopepp", one) if one.parts[0] == "conf" else one) for one in wanted}
+    assert there == held
+    assert {"dopepp/conf/train.yaml", "dopepp/conf/model/backbone/dsc.yaml"} <= held
+
+
+def test_the_version_is_said_once():
+    options = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert options["project"]["dynamic"] == ["version"]
+    assert options["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "dopepp.__version__"}
+
+
+Run = Callable[..., "CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Run:
+    """Build the wheel, install it beside this environment's libraries; run it in a bare folder."""
+    base = tmp_path_factory.mktemp("wheel")
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    for name in ("dopepp", "hydra_plugins", "conf"):  # a build leaves its own files in the sources
+        shutil.copytree(ROOT / name, base / "sources" / name, ignore=COMPILED)
+    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, base / "sources")
+
+    def pip(*arguments: str) -> None:
+        command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
+        subprocess.run(command, check=True, capture_output=True, env=own)
+
+    pip("wheel", f"{base}/sources", "--no-deps", "--no-build-isolation", "-w", str(base))
+    (path,) = base.glob("dopepp-*.whl")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", base / "venv"], check=True)
+    python = base / "venv" / "bin" / "python"
+    pip("--python", str(python), "install", "--no-deps", "--no-index", str(path))
+    (site,) = (base / "venv" / "lib").glob("python*/site-packages")
+    # Paths of a .pth file are searched, their own .pth files are not: no editable dopepp comes in.
+    (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
+
+    def run(*arguments: str, folder: Path) -> "CompletedProcess[str]":
+        command = [str(base / "venv" / "bin" / "dopepp"), *arguments]
+        return subprocess.run(
+            command, cwd=folder, env=own | {"WANDB_MODE": "offline"},
+            capture_output=True, text=True, timeout=600,
+        )  # fmt: skip
+
+    return run
+
+
+@pytest.mark.slow
+def test_a_wheel_trains_and_measures_in_an_empty_folder(installed, tiny_options, tmp_path):
+    def run(*arguments: str, code: int = 0) -> str:
+        done = installed(*arguments, folder=tmp_path)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    assert run("--version") == f"dopepp {dopepp.__version__}\n"
+    assert "experiment: " in run("train", "--help")
+    assert "name: dopepp_fast" in run("train", "--cfg", "job", "model=dopepp_fast")
+    assert "nearest seed" in run("train", "sed=1", code=2)
+    assert "got mesh none.stl" in run("train", "data=virtual", "data.parts=[none.stl]", code=2)
+    assert not list(tmp_path.iterdir()) or not list((tmp_path / "outputs").iterdir())
+    shown = run("train", *tiny_options)
+    assert "deprecat" not in shown.lower()
+    (best,) = tmp_path.glob("outputs/*/*/checkpoints/best.ckpt")
+    page = (best.parents[1] / "README.md").read_text()
+    assert "```bash\ndopepp train data=virtual" in page
+    assert "\ndopepp evaluate ckpt_path=outputs/" in page
+    run("evaluate", f"ckpt_path={best.relative_to(tmp_path)}", "data.num_test=1")
+    run("train", f"resume={best.parents[1].relative_to(tmp_path)}", "trainer.max_epochs=2")
+    run("train", "-m", *tiny_options, "hydra/launcher=joblib", "model/attention=none,se")
+    assert len(list(tmp_path.glob("outputs/compare/*/[01]/metrics.json"))) == 2
