@@ -47,7 +47,7 @@ def values(items: Iterable[Any]) -> dict[str, Any]:
     return {one.key or "/".join(one.nested_key): json.loads(one.value_json) for one in items}
 
 
-def tracked(path: Path) -> Any:
+def read(path: Path) -> Any:
     """Return what one file says of its run."""
     found = SimpleNamespace(config={}, summary={}, history=[])
     for record in records(path):
@@ -62,6 +62,14 @@ def tracked(path: Path) -> Any:
             found.history.append(values(record.history.item))
         elif kind == "exit":
             found.exit_code = record.exit.exit_code
+    return found
+
+
+def tracked(path: Path, patience: float = 30.0) -> SimpleNamespace:
+    """Read a run back once its end is in the file, which the service writes in its own time."""
+    end = time.monotonic() + patience
+    while not hasattr(found := read(path), "exit_code") and time.monotonic() < end:
+        time.sleep(0.2)
     return found
 
 
