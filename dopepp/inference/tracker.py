@@ -41,6 +41,9 @@ TRUSTED: Final = 0.6
 """Agreement below which no pose is taken over, except the first: half of a wrong one's outline may
 lie on edges of something else."""
 
+SURE: Final = 0.85
+"""Agreement below which the network looks, too."""
+
 USUAL: Final = 0.1
 """Weight of a frame in the usual agreement."""
 
@@ -89,7 +92,8 @@ class _State:
     @property
     def in_question(self) -> bool:
         """Whether the network is to look."""
-        return bool(self.unseen or self.doubts or self.disagreements)
+        unsure = _agreement(self.track.detection) < SURE
+        return bool(unsure or self.unseen or self.doubts or self.disagreements)
 
     def move_to(self, one: Detection) -> None:
         """Go on from where the network has found the part."""
@@ -200,7 +204,7 @@ class PoseTracker:
                 state.move_to(one)
             elif self._apart(state.track.detection, one) <= ELSEWHERE:
                 state.disagreements = 0
-            else:
+            elif _agreement(one) > _agreement(state.track.detection):
                 state.disagreements += 1
                 if state.disagreements == OUTVOTED:
                     state.move_to(one)
