@@ -42,7 +42,8 @@ TRUSTED: Final = 0.6
 lie on edges of something else."""
 
 SURE: Final = 0.85
-"""Agreement below which the network looks, too."""
+OFTEN: Final = 5
+"""Agreement below which the network looks at every so manieth frame."""
 
 USUAL: Final = 0.1
 """Weight of a frame in the usual agreement."""
@@ -92,8 +93,7 @@ class _State:
     @property
     def in_question(self) -> bool:
         """Whether the network is to look."""
-        unsure = _agreement(self.track.detection) < SURE
-        return bool(unsure or self.unseen or self.doubts or self.disagreements)
+        return bool(self.unseen or self.doubts or self.disagreements)
 
     def move_to(self, one: Detection) -> None:
         """Go on from where the network has found the part."""
@@ -145,12 +145,17 @@ class PoseTracker:
         image, K = checked_picture(image, K, cropped)
         for state in self._states:
             self._follow(state, image, K)
-        due = self._frame % self.detect_every == 0
-        if due or not self._states or any(one.in_question for one in self._states):
+        if self._is_due() or any(one.in_question for one in self._states):
             self._look(image, K)
         self._frame += 1
         self._states = [one for one in self._states if one.unseen <= FORGOTTEN]
         return [one.track for one in self._states if not one.unseen]
+
+    def _is_due(self) -> bool:
+        """Tell whether the network looks at this frame whatever became of the parts."""
+        unsure = any(_agreement(one.track.detection) < SURE for one in self._states)
+        every = min(OFTEN, self.detect_every) if unsure else self.detect_every
+        return not self._states or self._frame % every == 0
 
     def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
         """Look for a part where its motion takes it."""
@@ -204,7 +209,7 @@ class PoseTracker:
                 state.move_to(one)
             elif self._apart(state.track.detection, one) <= ELSEWHERE:
                 state.disagreements = 0
-            elif _agreement(one) > _agreement(state.track.detection):
+            elif _agreement(one) >= _agreement(state.track.detection):
                 state.disagreements += 1
                 if state.disagreements == OUTVOTED:
                     state.move_to(one)

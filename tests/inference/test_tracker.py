@@ -7,7 +7,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.inference.tracker import FORGOTTEN, PATIENCE, PoseTracker
+from dopepp.inference.tracker import FORGOTTEN, OFTEN, PATIENCE, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
@@ -163,6 +163,22 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     detected = [tracker.track(IMAGE, K)[0].detected for _ in range(6)]
     # Frame 5 disagrees, so frame 6 looks again.
     assert detected == [False] * 5 + [True]
+
+
+def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage):
+    tracker = PoseTracker(stage)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker.track(IMAGE, K)
+    stage.agreement = 0.84  # not enough less than usual to be in doubt
+    elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
+    beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
+    stage.predict = lambda image, K, cropped=False: [beside]
+    for _ in range(2 * OFTEN):
+        (track,) = tracker.track(IMAGE, K)
+    assert track.detection.T_cam_obj[1, 3] == pytest.approx(0.0, abs=1e-9)
+    beside = replace(beside, agreement=0.9)
+    places = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(OFTEN + 1)]
+    assert max(places) == pytest.approx(0.03)
 
 
 def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
