@@ -32,9 +32,8 @@ deeper than what lies below may allow."""
 ABOVE_BENCH: Final = 0.001
 """Metres that the pads' ends keep from the bench."""
 
-FLAT: Final = np.radians(30.0)
 LOW: Final = 0.005
-"""How far a part that lies on the bench may seem tilted, radians, or off it, metres."""
+"""How far the middle of a part that lies on the bench may seem to be off its height, metres."""
 
 STEEPEST: Final = np.radians(40.0)
 """Largest angle between an approach and straight down."""
@@ -89,9 +88,8 @@ class Plan:
 def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
     """Lay a part that seems to lie on the bench flat on it.
 
-    A picture from above tells a part's tilt and height least, the bench best. What is tilted by
-    more than :data:`FLAT`, or higher than :data:`LOW`, stays as it is: leaning on something, a
-    part's middle is higher than that.
+    A picture from above tells a part's tilt and height least, the bench best. A part whose middle
+    is higher than :data:`LOW` allows leans on something and stays as it is.
     """
     up = T_base_bench[:3, 2]
     normals = hull.rests[0] @ T_base_obj[:3, :3].T
@@ -104,7 +102,7 @@ def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transf
         turn @ T_base_obj[:3, :3], centre + turn @ (T_base_obj[:3, 3] - centre)
     )  # fmt: skip
     lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
-    if np.arctan2(sine, cosine) > FLAT or abs(lowest) > LOW:
+    if abs(lowest) > LOW:
         return T_base_obj
     flat[:3, 3] -= lowest * up
     return flat
