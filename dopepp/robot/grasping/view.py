@@ -109,7 +109,8 @@ class MujocoView:
         state.qpos[:JOINTS] = UPRIGHT  # out of sight, as the hand is
         mujoco.mj_forward(model, state)
         self._renderer.update_scene(state, camera=CAMERA)
-        return capture(np.ascontiguousarray(self._renderer.render()), self._sensors.draw(rng))
+        picture: Picture = np.ascontiguousarray(self._renderer.render())
+        return capture(picture, self._sensors.draw(rng))
 
 
 def table_seen(T_base_cam: Transform) -> Transform:

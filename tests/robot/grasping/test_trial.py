@@ -83,8 +83,8 @@ def test_there_is_no_plan(trials, scene, planner, shift, turn):
         (0, 0, True),
         (3, 0.002, True),
         (6, -0.003, True),
-        (20, 0, True),
-        (45, 0, False),
+        (30, 0, True),
+        (30, 0.02, False),
         (1, 0.02, False),
     ],
 )
