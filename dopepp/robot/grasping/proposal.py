@@ -29,10 +29,10 @@ PAIRS: Final = 1500
 FACES: Final = 8
 """Faces, the commonest, on which a part may lie."""
 
-TRIED: Final = 150
+TRIED: Final = 100
 """Pairs that are tried on every face."""
 
-SAMPLES: Final = 6000
+SAMPLES: Final = 5000
 """Points that stand for the surface where fingers are to go and to press."""
 
 THINNEST: Final = 0.002

@@ -117,7 +117,7 @@ def table_seen(T_base_cam: Transform) -> Transform:
     """Return T_cam_table: the bench's plane, its origin where the camera looks at it."""
     ahead = T_base_cam[:3, 2]
     origin = T_base_cam[:3, 3] - T_base_cam[2, 3] / ahead[2] * ahead
-    return invert_transform(T_base_cam) @ make_transform(np.eye(3), origin)
+    return np.asarray(invert_transform(T_base_cam) @ make_transform(np.eye(3), origin))
 
 
 @cache
