@@ -55,7 +55,6 @@ def doctor(
     from dopepp.geometry.camera import camera_matrix
     from dopepp.inference.lens import Lens, one_camera
     from dopepp.inference.sources.pictures import Pictures
-    from dopepp.parts.catalogue import with_meshes
 
     with report_errors():
         if refine not in (None, "region"):
@@ -65,6 +64,7 @@ def doctor(
         picture = read_photo(image)
         from dopepp.inference.diagnosis import Case, Finding, diagnose
         from dopepp.inference.estimator import PoseEstimator
+        from dopepp.parts.catalogue import with_meshes
 
         estimator = PoseEstimator.load(model, device)
         known = with_meshes(estimator.parts, parts, unit) if parts else estimator.parts
