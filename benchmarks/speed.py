@@ -10,9 +10,9 @@ and is left out under one. In a process all take turns, frame by frame of the sa
 frame of 640×480 is 416×320: their maps are made, timed and put aside, and poses are recovered from
 the true maps with a trained network's noise (:mod:`dopepp.experiment.cost`); int8 is calibrated on
 random pixels. ``tracker`` follows a part through a rendered sequence (``benchmarks/track.py``) with
-the released ``pivconnector_wide``. Milliseconds; parts are medians. *CPU* is the process's time on
-all its threads, the 10th percentile: with one thread it is what a frame takes on an idle core, and
-neighbours disturb it least.
+the released ``pivconnector_wide``. Milliseconds; *CPU*, the process's time on all its threads, and
+the parts are 10th percentiles, which neighbours disturb least: with one thread they are about what
+an idle core takes.
 """
 
 from __future__ import annotations
@@ -114,9 +114,9 @@ class Side:
         """Return first frame, median, 95th percentile, CPU, parts, frames a second, found."""
         later = self.frame[2:]  # the first allocates, compiles and chooses kernels
         p50, p95 = statistics.median(later), statistics.quantiles(later, n=20)[-1]
-        parts = [statistics.median(one) for one in zip(*self.steps[2:], strict=True)]
-        cpu = statistics.quantiles(self.cpu[2:], n=10)[0]
-        values = [self.frame[0], p50, p95, cpu, *parts]
+        spent = (self.cpu[2:], *zip(*self.steps[2:], strict=True))
+        least = [statistics.quantiles(one, n=10)[0] for one in spent]
+        values = [self.frame[0], p50, p95, *least]
         found = f"{self.num_found} of {len(self.frame)}"
         return [*(f"{value:.1f}" for value in values), f"{1000 / p50:.1f}", found]
 

@@ -34,7 +34,7 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     return cast("Callable[[Function], Function]", compiler)
 
 
-class _FirstTime(event.Listener):
+class _FirstTime(event.Listener):  # type: ignore[misc]  # numba has no types
     """Says once why the first call takes long; what is on disk already is not compiled."""
 
     told = False
