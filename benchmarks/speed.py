@@ -24,6 +24,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from itertools import count, islice
 from pathlib import Path
 
@@ -113,9 +114,12 @@ class Side:
     def row(self) -> list[str]:
         """Return first frame, median, 95th percentile, CPU, parts, frames a second, found."""
         later = self.frame[2:]  # the first allocates, compiles and chooses kernels
-        p50, p95 = statistics.median(later), statistics.quantiles(later, n=20)[-1]
+        p50, p95 = (
+            statistics.median(later),
+            statistics.quantiles(later, n=20, method="inclusive")[-1],
+        )
         spent = (self.cpu[2:], *zip(*self.steps[2:], strict=True))
-        least = [statistics.quantiles(one, n=10)[0] for one in spent]
+        least = [statistics.quantiles(one, n=10, method="inclusive")[0] for one in spent]
         values = [self.frame[0], p50, p95, *least]
         found = f"{self.num_found} of {len(self.frame)}"
         return [*(f"{value:.1f}" for value in values), f"{1000 / p50:.1f}", found]
@@ -124,39 +128,52 @@ class Side:
         """Yield a prediction on one rendered scene after the other."""
         import torch
 
-        from dopepp.data.sources.rendered import RenderedSource
         from dopepp.experiment.cost import likely_maps
         from dopepp.maps.encode import MapGeometry
-        from dopepp.parts.catalogue import pivconnector
-        from dopepp.virtual import PRESETS, Factory
 
         own, generator = self.estimator, torch.Generator().manual_seed(0)
         geometry = MapGeometry(own.network.stride, own.recovery.sigma)
-        factory = Factory([pivconnector()], PRESETS["quickstart"].reframed(*SIZE), 5)
-        source = RenderedSource(factory, SCENES, "test")
-        samples = [source.sample(number) for number in range(SCENES)]
-        answers = [None if trained else likely_maps(one, own, geometry, generator)
-                   for one in samples]  # fmt: skip
+        answers = [
+            None if trained else likely_maps(one, own, geometry, generator) for one in scenes()
+        ]
 
         def predict(number: int) -> list:
-            own.answer = answers[number]
-            return own.predict(samples[number].image, samples[number].K, cropped=True)
+            own.answer, sample = answers[number], scenes()[number]
+            return own.predict(sample.image, sample.K, cropped=True)
 
         for number in count():
             yield lambda number=number: predict(number % SCENES)
 
     def _tracked(self) -> Iterator[Callable[[], list]]:
         """Yield the following of a part from frame to frame, again and again."""
-        from track import sequence
-
         from dopepp.inference.tracker import PoseTracker
-        from dopepp.parts.catalogue import pivconnector
 
-        frames = [*islice(sequence(pivconnector(), 0, 300), TRACKED.start, TRACKED.stop)]
         while True:
             tracker = PoseTracker(self.estimator)
-            for one in frames:
+            for one in motion():
                 yield lambda one=one, tracker=tracker: tracker.track(one.image, one.K)
+
+
+@cache
+def scenes() -> list:
+    """Render the scenes that all networks see."""
+    from dopepp.data.sources.rendered import RenderedSource
+    from dopepp.parts.catalogue import pivconnector
+    from dopepp.virtual import PRESETS, Factory
+
+    factory = Factory([pivconnector()], PRESETS["quickstart"].reframed(*SIZE), 5)
+    source = RenderedSource(factory, SCENES, "test")
+    return [source.sample(number) for number in range(SCENES)]
+
+
+@cache
+def motion() -> list:
+    """Render the frames that the tracker follows."""
+    from track import sequence
+
+    from dopepp.parts.catalogue import pivconnector
+
+    return [*islice(sequence(pivconnector(), 0, 300), TRACKED.start, TRACKED.stop)]
 
 
 def measure(isa: str, folder: Path, seconds: float, only: str) -> None:
