@@ -52,10 +52,10 @@ class Camera:
         })  # fmt: skip
         self.node = rclpy.create_node("camera")
         self.publisher = self.node.create_publisher(
-            type(self.images[0]), TOPIC, QoSProfile(depth=1)
+            type(self.images[0]), TOPIC, QoSProfile(depth=10)
         )
         self.beside = self.node.create_publisher(
-            type(self.info), "/camera/camera_info", QoSProfile(depth=1)
+            type(self.info), "/camera/camera_info", QoSProfile(depth=10)
         )
         poses, told = (type(native(kind, {})) for kind in
                        ("geometry_msgs/PoseArray", "diagnostic_msgs/DiagnosticArray"))  # fmt: skip
@@ -66,7 +66,8 @@ class Camera:
         self.node.create_subscription(told, "/diagnostics", self.note, 10)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        threading.Thread(target=self.executor.spin, daemon=True).start()
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
 
     def hear(self, message) -> None:
         """Note when an answer came."""
@@ -77,6 +78,12 @@ class Camera:
     def note(self, message) -> None:
         """Keep what the node says of itself."""
         self.told = {one.key: one.value for one in message.status[0].values}
+
+    def counted(self) -> dict[str, int]:
+        """Return the node's counts of now."""
+        self.told = {}
+        wait_for("a diagnosis", lambda: "received" in self.told, 10.0)
+        return {key: int(self.told[key]) for key in ("received", "replaced by newer")}
 
     def send(self, number: int) -> None:
         """Publish a picture with its camera_info."""
@@ -113,22 +120,23 @@ def wait_for(what: str, holds: Callable[[], bool], seconds: float = START_S) -> 
 
 def measure(camera: Camera, count: int, rate: float) -> str:
     """Return a row: pictures sent, received, replaced, answered, and how late answers were."""
+    camera.late.clear()
     wait_for("the node", lambda: camera.publisher.get_subscription_count() > 0)
-    wait_for("its topics", lambda: bool(camera.node.count_publishers(f"/{NODE_NAME}/poses_{PART}")))
-    for number in range(3):  # numba compiles with the first
-        heard = len(camera.late)
+    number = 0
+    while not camera.late:  # until both sides know each other and numba has compiled
         camera.send(number)
-        wait_for("an answer", lambda heard=heard: len(camera.late) > heard)
+        number += 1
+        time.sleep(2.0)
+    before = camera.counted()
     camera.sent.clear()
     camera.late.clear()
     camera.run(count, rate)
-    camera.told = {}
     time.sleep(1.0)
-    wait_for("a diagnosis", lambda: bool(camera.told), 10.0)
-    received = int(camera.told["received"]) - 3
+    after = camera.counted()
+    received, replaced = (after[key] - before[key] for key in ("received", "replaced by newer"))
     late = np.array([*camera.late.values()])
     return (
-        f"| {count} | {received} | {count - received} | {camera.told['replaced by newer']} | "
+        f"| {count} | {received} | {count - received} | {replaced} | "
         f"{len(late)} | {np.median(late):.1f} | {np.percentile(late, 95):.1f} |"
     )
 
@@ -158,6 +166,8 @@ def main() -> None:
             code = node.wait(30)
         wait_for("its end", lambda: camera.publisher.get_subscription_count() == 0)
     print(f"ended with {code}; 143 is that of SIGTERM")
+    camera.executor.shutdown()
+    camera.thread.join(5.0)
     rclpy.try_shutdown()
 
 

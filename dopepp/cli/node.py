@@ -75,16 +75,17 @@ def node(
     """
     words = list(source or ())
     with resumable("the node has ended"):
-        from dopepp.inference.estimator import PoseEstimator
-        from dopepp.inference.lens import one_camera
-        from dopepp.inference.sources import open_sources
-        from dopepp.robot.nodes.worker import Settings, Worker
-
         ways = {"--ros2": ros2, "--ros1": ros1, "--bag": bag, "--json": json_lines, "--udp": udp}
         way = _way([one for one, given in ways.items() if given], words, out, params)
         if refine not in (None, "region"):
             raise UserError(f"--refine {refine}", "region, or none", "leave it out")
         known = _camera(intrinsics, camera)
+
+        from dopepp.inference.estimator import PoseEstimator
+        from dopepp.inference.lens import one_camera
+        from dopepp.inference.sources import open_sources
+        from dopepp.robot.nodes.worker import Settings, Worker
+
         sources = open_sources(words, topic) if way in LINES else []
         cameras = [known or one_camera(None, None, one) for one in sources]
         refining = "region" if track or refine else None

@@ -27,28 +27,32 @@ class Slot(Generic[Item]):
     """Hands each picture to a thread of its own; one that comes while it works replaces the last.
 
     Args:
-        handle: What the thread does with it. What it raises ends the thread, and is raised by the
-            next :meth:`put`.
+        handle: What the thread does with it. What it raises ends the thread, and is raised again
+            by :meth:`put` and :meth:`check`.
     """
 
     def __init__(self, handle: Callable[[Item], None]) -> None:
         self._handle = handle
         self._item: Item | None = None
         self._fresh, self._stopped = threading.Condition(), False
-        self._error: BaseException | None = None
+        self._error: Exception | None = None
         self.received = self.replaced = 0
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def put(self, item: Item) -> None:
         """Leave a picture, whatever was there."""
-        if self._error is not None:
-            raise self._error
+        self.check()
         with self._fresh:
             self.received += 1
             self.replaced += self._item is not None
             self._item = item
             self._fresh.notify()
+
+    def check(self) -> None:
+        """Raise what has ended the thread, if anything has."""
+        if self._error is not None:
+            raise self._error
 
     def stop(self, wait_s: float = 5.0) -> None:
         """Let the thread end once it has done what it is at."""
@@ -66,9 +70,8 @@ class Slot(Generic[Item]):
                     if item is None or self._stopped:
                         return
                 self._handle(item)
-        except BaseException as error:
+        except Exception as error:
             self._error = error
-            raise
 
 
 class Pace:
@@ -134,6 +137,7 @@ class Pump:
 
     def diagnosis(self, name: str) -> Message:
         """Return how the node of a name does."""
+        self.slot.check()
         counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
         values = {key: str(value) for key, value in counts.items()} | self._pace.values()
         now = self._now()

@@ -45,6 +45,7 @@ def run(worker: Worker, topic: str, name: str, words: Sequence[str] = ()) -> Non
             rospy.rostime.wallsleep(TICK_S)
             node.tick()
     finally:
+        node.stop()
         rospy.signal_shutdown("the node has ended")
 
 
@@ -70,6 +71,10 @@ class _Node:
         rospy.Subscriber(info_topic(topic), info, self._pump.take_info, **own)
         rospy.Subscriber(topic, kind, self._pump.take_picture, **own)
 
+    def stop(self) -> None:
+        """Let the picture that is looked at be the last."""
+        self._pump.slot.stop()
+
     def tick(self) -> None:
         """Take over changed parameters, and say how the node does."""
         import rospy
@@ -90,13 +95,13 @@ class _Node:
     def _advertise(self, topic: str, kind: str) -> None:
         import rospy
 
+        if kind.startswith("vision_msgs/"):
+            return
         own = topic if topic.startswith("/") else f"~{topic}"
         try:
             message = _type_of(kind)
         except ImportError:
             logger.warning("without %s: %s is not published", kind.partition("/")[0], own)
-            return
-        if kind.startswith("vision_msgs/"):
             return
         self._publishers[topic] = rospy.Publisher(own, message, queue_size=10)
 

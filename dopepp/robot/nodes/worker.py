@@ -184,7 +184,7 @@ class Worker:
             cropped = self._camera is None and info is not None and info.roi is not None
             frame = Frame(image, topic, self._number, stamp.seconds)
             result = self.result(frame, camera, cropped)
-        except UserError as error:
+        except ValueError as error:  # a UserError, or fields of odd lengths
             self._trouble("camera", str(error))
             return None
         self.trouble = ""

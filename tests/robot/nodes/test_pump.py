@@ -30,13 +30,13 @@ def test_whoever_is_slow_gets_the_newest():
     assert (slot.received, slot.replaced) == (10, 8)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_what_its_thread_raises_is_raised():
     slot = Slot(lambda item: 1 / item)
     slot.put(0)
     slot._thread.join(10)
-    with pytest.raises(ZeroDivisionError):
-        slot.put(1)
+    for call in (slot.check, lambda: slot.put(1)):
+        with pytest.raises(ZeroDivisionError):
+            call()
 
 
 def test_pace_tells_rate_and_latency():

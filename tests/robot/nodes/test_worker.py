@@ -139,6 +139,11 @@ def test_binned_and_cut_pictures_have_their_part_of_the_camera(worker, estimator
     np.testing.assert_allclose(answer.result.detections[0].T_cam_obj, expected.T_cam_obj, atol=1e-6)
 
 
+def test_a_p_of_another_length_ends_nothing(take, said):
+    assert take(topic="/camera/image_rect", p=[1.0] * 9) is None
+    assert len(said) == 1
+
+
 def test_rectified_pictures_have_the_lens_of_p(take, seen):
     P = np.c_[seen.K * [[0.98], [0.98], [1]], np.zeros(3)].ravel().tolist()
     answer = take(topic="/camera/image_rect", p=P)
