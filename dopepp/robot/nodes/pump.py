@@ -1,7 +1,7 @@
 """What live nodes share: the newest picture goes to the worker, its answer out as messages.
 
 A camera does not wait and a network takes its time, so a picture that comes while the last one is
-looked at waits alone, and a newer one takes its place: an answer is never two pictures late.
+looked at waits alone, and a newer one takes its place.
 """
 
 from __future__ import annotations
