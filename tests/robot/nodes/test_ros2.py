@@ -27,6 +27,30 @@ def test_messages_are_filled_by_their_own_types():
     np.testing.assert_array_equal(np.frombuffer(filled.data, np.uint8).reshape(2, 4, 3), image)
 
 
+def test_parameters_change_while_it_runs(estimator, tmp_path):
+    rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
+    from rclpy.parameter import Parameter
+
+    from dopepp.robot.nodes.ros2 import _Node
+    from dopepp.robot.nodes.worker import Settings, Worker
+
+    params = tmp_path / "dope.yaml"
+    params.write_text("/**:\n  ros__parameters:\n    confidence: 0.25\n")
+    rclpy.init(args=["--ros-args", "--params-file", str(params)])
+    try:
+        worker = Worker(estimator)
+        node = _Node(worker, "/camera/image_raw", "dope_of_a_test")
+        assert worker.settings == Settings(confidence=0.25)
+        for value, taken in ((0.75, True), (7.0, False)):
+            (result,) = node.handle.set_parameters([Parameter("confidence", value=value)])
+            assert result.successful == taken
+        assert "a number from 0 to 1" in result.reason
+        assert worker.settings == Settings(confidence=0.75)
+        node.stop()
+    finally:
+        rclpy.try_shutdown()
+
+
 @pytest.mark.slow
 def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
