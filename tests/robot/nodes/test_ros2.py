@@ -51,6 +51,37 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
         rclpy.try_shutdown()
 
 
+def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
+    rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import qos_profile_sensor_data
+
+    from dopepp.robot.nodes.messages import picture
+    from dopepp.robot.nodes.ros2 import _Node, native
+    from dopepp.robot.nodes.worker import Worker
+
+    rclpy.init()
+    try:
+        node, camera = (
+            _Node(Worker(estimator), "/best", "dope_of_a_test"),
+            rclpy.create_node("camera"),
+        )
+        image = native("sensor_msgs/Image", picture(seen.pictures[0], {}))
+        publisher = camera.create_publisher(type(image), "/best", qos_profile_sensor_data)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node.handle)
+        for _ in range(100):
+            publisher.publish(image)
+            executor.spin_once(timeout_sec=0.1)
+            if node._pump.slot.received:
+                break
+        assert node._pump.slot.received
+        assert "best effort" in caplog.text
+        node.stop()
+    finally:
+        rclpy.try_shutdown()
+
+
 @pytest.mark.slow
 def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
