@@ -17,10 +17,12 @@ from dopepp.cli import (
     calibrate,
     check,
     compare,
+    doctor,
     download,
     entries,
     export,
     grasp,
+    node,
     predict,
     release,
     render,
@@ -33,6 +35,8 @@ COMMANDS: Final = (
     entries.train,
     entries.evaluate,
     predict.predict,
+    doctor.doctor,
+    node.node,
     serve.serve,
     export.export,
     benchmark.benchmark,
@@ -61,11 +65,7 @@ class _OneLine(TyperGroup):
             raise typer.Exit(USERS_MISTAKE) from error
 
 
-app = typer.Typer(
-    cls=_OneLine,
-    no_args_is_help=True,
-    help="The console command ``dopepp``; each subcommand imports what it needs when it is called.",
-)
+app = typer.Typer(cls=_OneLine, no_args_is_help=True)
 
 
 def _show_version(asked: bool) -> None:
@@ -80,7 +80,7 @@ def _configure(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="print it")
     ] = False,
 ) -> None:
-    """Poses of weakly textured parts: train, measure, predict, render, check and compare."""
+    """6D poses of weakly textured parts, from the CAD file: train, measure, predict, export."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
 
