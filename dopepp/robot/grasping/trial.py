@@ -127,7 +127,7 @@ class Record:
         recognised: Whether it was right: ADD below a tenth of the diameter.
         add_mm: ADD of it, millimetres; NaN without one. Like the others in the arm's base frame,
             so that the calibration's error is in it.
-        error_mm: How far the part's origin was from where the arm looked for it, millimetres, and
+        error_mm: How far the part's origin was off, before the part was laid flat, millimetres, and
         error_deg: how it was turned, degrees.
         caught: Whether the part was held after lift and shake.
         failure: Which of :data:`FAILURES` it was; empty for none.
