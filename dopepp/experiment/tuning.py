@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
+from dopepp.data.transforms.shading import shade
 from dopepp.experiment.build import sources
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
@@ -33,6 +35,11 @@ from dopepp.parts.part import Part, Parts
 from dopepp.recovery import calibration
 from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
+
+HIDDEN: Final = 0.4
+"""Share of each object that is hidden on the validation images that refined poses' scores learn
+from a second time: a network names a part that is hidden with little belief, and the picture may
+agree all the same."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,8 @@ def tune(
         # Features are of the network's score, which an earlier tuning's would hide.
         candidate = min(new.min_score, calibration.CANDIDATE)
         heard = replace(new.unrefined(), min_score=candidate)
-        refined = choose(scored(heard, validation), scored(heard, empty), rate, refined=True)
+        shown = joined(scored(heard, validation), scored(heard, Hidden(validation)))
+        refined = choose(shown, scored(heard, empty), rate, refined=True)
         chosen |= refined
         threshold = refined.pop("refined_min_score")
         heard = replace(new, **refined)  # type: ignore[arg-type]
@@ -250,6 +258,36 @@ def _by_object(
             own = [one for one in found if one.object == part.name]
             true = [one for one in sample.instances if one.label == part.name]
             yield number, sample, part, own, true
+
+
+class Hidden:
+    """Images of a source with :data:`HIDDEN` of every object's visible pixels covered.
+
+    Objects without a mask stay as they are.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source, self.name = source, f"{source.name}, hidden"
+
+    def __len__(self) -> int:
+        """Return how many images there are."""
+        return len(self._source)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return an image."""
+        return shade(self._source.sample(index, epoch), [HIDDEN], 0, index)[0].sample
+
+
+def joined(one: Scored, other: Scored) -> Scored:
+    """Return the detections on two sets of images together."""
+    return Scored(
+        np.concatenate([one.features, other.features]),
+        np.concatenate([one.scores, other.scores]),
+        np.concatenate([one.correct, other.correct]),
+        np.concatenate([one.image, other.image + one.num_images]),
+        one.num_images + other.num_images,
+        one.num_instances + other.num_instances,
+    )
 
 
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:

@@ -235,14 +235,14 @@ class PoseEstimator:
                 continue
             result = refiner(one, image, K, depth)
             if result.covariance is None:
-                refined.append(replace(one, kept=result.reason, agreement=None))
+                refined.append(replace(one, kept=result.reason, agreement=None, support=None))
                 continue
             T, covariance = result.T_cam_obj, result.covariance
             keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
             refined.append(
                 replace(
                     one, T_cam_obj=T, keypoints=keypoints, covariance=covariance, kept="",
-                    agreement=result.agreement,
+                    agreement=result.agreement, support=result.support,
                 )
             )  # fmt: skip
         return refined

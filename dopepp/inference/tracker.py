@@ -20,9 +20,12 @@ from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Step, project_keypoints, transform
-from dopepp.inference.estimator import PoseEstimator, checked_picture
+from dopepp.inference.estimator import PoseEstimator, Region, checked_picture
 from dopepp.inference.motion import Motion, at_rest
 from dopepp.recovery.detection import Detection
+
+AROUND: Final = 0.5
+"""Of a part's extent on the picture, beyond it: where the network looks for one in doubt."""
 
 NEAR: Final = 0.5
 """Diameters between the centres of a track and a detection that may be the same part."""
@@ -40,6 +43,10 @@ rendered sequences, right poses kept 0.97 of it and wrong ones half."""
 TRUSTED: Final = 0.6
 """Agreement below which no pose is taken over, except the first: half of a wrong one's outline may
 lie on edges of something else."""
+
+SURE: Final = 0.85
+OFTEN: Final = 5
+"""Agreement below which the network looks at every so manieth frame."""
 
 USUAL: Final = 0.1
 """Weight of a frame in the usual agreement."""
@@ -85,11 +92,6 @@ class _State:
     unseen: int = 0
     doubts: int = 0
     disagreements: int = 0
-
-    @property
-    def in_question(self) -> bool:
-        """Whether the network is to look."""
-        return bool(self.unseen or self.doubts or self.disagreements)
 
     def move_to(self, one: Detection) -> None:
         """Go on from where the network has found the part."""
@@ -142,11 +144,19 @@ class PoseTracker:
         for state in self._states:
             self._follow(state, image, K)
         due = self._frame % self.detect_every == 0
-        if due or not self._states or any(one.in_question for one in self._states):
+        asked = [one for one in self._states if self._is_asked(one)]
+        if due or not self._states or any(one.unseen for one in asked):
             self._look(image, K)
+        elif asked:
+            self._look(image, K, _around([one.track.detection for one in asked], image))
         self._frame += 1
         self._states = [one for one in self._states if one.unseen <= FORGOTTEN]
         return [one.track for one in self._states if not one.unseen]
+
+    def _is_asked(self, state: _State) -> bool:
+        """Tell whether the network is to look for a part on this frame."""
+        unsure = _agreement(state.track.detection) < SURE and self._frame % OFTEN == 0
+        return bool(unsure or state.unseen or state.doubts or state.disagreements)
 
     def _follow(self, state: _State, image: Picture, K: CameraMatrix) -> None:
         """Look for a part where its motion takes it."""
@@ -182,9 +192,9 @@ class PoseTracker:
         )
         state.doubts += 1
 
-    def _look(self, image: Picture, K: CameraMatrix) -> None:
+    def _look(self, image: Picture, K: CameraMatrix, roi: Region | None = None) -> None:
         """Let the network look, and tell known parts from new ones."""
-        found = self._estimator.predict(image, K, cropped=True)  # checked before
+        found = self._estimator.predict(image, K, roi=roi, cropped=True)  # checked before
         found = [one for one in found if not one.kept]
         for state, one in self._matched(found):
             if state is None:
@@ -200,7 +210,7 @@ class PoseTracker:
                 state.move_to(one)
             elif self._apart(state.track.detection, one) <= ELSEWHERE:
                 state.disagreements = 0
-            else:
+            elif _agreement(one) >= _agreement(state.track.detection):
                 state.disagreements += 1
                 if state.disagreements == OUTVOTED:
                     state.move_to(one)
@@ -231,6 +241,19 @@ class PoseTracker:
         first, second = (transform(pose.T_cam_obj, cuboid) for pose in (one, other))
         apart = np.linalg.norm(first - second, axis=1).mean()
         return float(apart / self._diameters[one.object])
+
+
+def _around(found: Sequence[Detection], image: Picture) -> Region | None:
+    """Return the region in which parts may be that were there; None is the whole image."""
+    points = np.concatenate([one.keypoints for one in found])
+    reach = AROUND * max(np.ptp(one.keypoints, axis=0).max() for one in found)
+    limits = np.array(image.shape[1::-1])
+    start = np.clip(np.floor(points.min(axis=0) - reach), 0, limits)
+    end = np.clip(np.ceil(points.max(axis=0) + reach), 0, limits)
+    if (end - start).min() < reach:  # hardly in view
+        return None
+    (x, y), (width, height) = start.astype(int), (end - start).astype(int)
+    return x, y, width, height
 
 
 def _agreement(one: Detection) -> float:

@@ -40,10 +40,10 @@ from dopepp.recovery.detection import Detection
 FEATURES: Final = ("bias", "belief", "spread", "misfit", "found")
 """What the score is made of, in this order."""
 
-REFINED_FEATURES: Final = ("bias", "score", "agreement")
+REFINED_FEATURES: Final = ("bias", "score", "agreement", "support")
 """What the score of a refined pose is made of, in this order."""
 
-CANDIDATE: Final = 0.01
+CANDIDATE: Final = 0.005
 """Score from which a detection is refined where the refined poses have a score of their own: the
 picture, looked at closely, tells a ghost from a part that the network was in doubt about."""
 
@@ -122,6 +122,7 @@ class RecoveryOptions:
     refined_bias: float = 0.0
     refined_score: float = 1.0
     refined_agreement: float = 0.0
+    refined_support: float = 0.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -198,12 +199,13 @@ def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Det
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
-    """Return the features of a detection after refinement; a pose that was kept has no agreement.
+    """Return the features of a detection after refinement; one that was kept has no agreement.
 
     Its score is still the network's.
     """
     sure = float(np.clip(detection.score, _CERTAIN, 1 - _CERTAIN))
-    return np.array([1.0, np.log(sure / (1 - sure)), detection.agreement or 0.0])
+    known = detection.agreement or 0.0, detection.support or 0.0
+    return np.array([1.0, np.log(sure / (1 - sure)), *known])
 
 
 def fit_distance_factor(

@@ -54,8 +54,10 @@ class Detection:
         covariance: Of a small turn about the object's origin (rotation vector in the camera
             frame, radians) and a small shift (camera frame, metres), from the peaks' covariances.
         kept: Why a refinement that was asked for kept the network's pose; empty elsewhere.
-        agreement: Share of the refined outline that the picture agrees with, in [0, 1]; None where
-            none was refined.
+        agreement: Share of what the picture tells about the refined outline that agrees with it, in
+            [0, 1]; None where none was refined.
+        support: Share of the refined outline that the picture tells about and that agrees, in
+            [0, 1]: what is hidden has none. None where none was refined.
     """
 
     object: str
@@ -68,6 +70,7 @@ class Detection:
     covariance: Float[np.ndarray, "6 6"]
     kept: str = ""
     agreement: float | None = None
+    support: float | None = None
 
 
 def peaks_of_object(

@@ -11,10 +11,13 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.tuning import (
+    HIDDEN,
     FalsePositiveTarget,
+    Hidden,
     Scored,
     choose,
     fit_factors,
+    joined,
     matched_poses,
     score_images,
     write_tuned,
@@ -81,6 +84,8 @@ def test_nothing_to_learn_from_is_said(correct, what):
 
 class Images:
     """Two images of one part: at a place, and nowhere."""
+
+    name = "two"
 
     def __init__(self, T: np.ndarray, visible_fraction: float = 1.0) -> None:
         keypoints = project_keypoints(PART.cuboid, T, K)
@@ -163,14 +168,32 @@ def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
 
 
 def test_refined_poses_are_scored_by_their_agreement():
-    sure = replace(found(POSE, 0.3), agreement=0.9)
+    sure = replace(found(POSE, 0.3), agreement=0.9, support=0.6)
     result = score_images(estimator(sure, refiner=True), [PART], Images(POSE))
-    expected = [1.0, np.log(0.3 / 0.7), 0.9]
+    expected = [1.0, np.log(0.3 / 0.7), 0.9, 0.6]
     np.testing.assert_allclose(result.features, [expected, expected])
     kept = score_images(estimator(found(POSE, 0.3), refiner=True), [PART], Images(POSE))
-    assert kept.features[0, 2] == 0.0
+    assert kept.features[0, 2:].tolist() == [0.0, 0.0]
     nothing = score_images(estimator(refiner=True), [PART], Images(POSE))
-    assert nothing.features.shape == (0, 3)
+    assert nothing.features.shape == (0, 4)
+
+
+def test_scores_of_refined_poses_learn_from_hidden_parts_too():
+    images = Images(POSE)
+    mask = np.zeros((128, 128), bool)
+    mask[40:90, 30:100] = True
+    images.samples[0].image[:] = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
+    images.samples[0].instances[0].mask = mask
+    (shown,) = Hidden(images).sample(0, 0).instances
+    assert shown.mask.sum() == pytest.approx((1 - HIDDEN) * mask.sum(), abs=1)
+    assert np.array_equal(shown.T_cam_obj, POSE)
+    assert not Hidden(images).sample(1, 0).instances
+    one, other = scored(0, 30), scored(1, 20, right=False)
+    both = joined(one, other)
+    assert (both.num_images, both.num_instances) == (50, 50)
+    loudest = both.loudest(both.scores)
+    np.testing.assert_array_equal(loudest[:30], one.loudest(one.scores))
+    np.testing.assert_array_equal(loudest[30:], other.loudest(other.scores))
 
 
 def test_a_symmetric_part_is_right_at_any_of_its_poses():

@@ -7,7 +7,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, project_keypoints
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.inference.tracker import FORGOTTEN, PATIENCE, PoseTracker
+from dopepp.inference.tracker import FORGOTTEN, OFTEN, PATIENCE, PoseTracker
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.recovery.detection import Detection
 
@@ -33,8 +33,9 @@ class Stage:
         pose = make_transform(rotation_vector_to_matrix(np.array(turn)), np.array(place))
         self.actors[name] = part.name, pose
 
-    def predict(self, image, K, cropped=False):
+    def predict(self, image, K, roi=None, cropped=False):
         self.looks += 1
+        self.roi = roi
         return [
             replace(self._detection(part, pose), agreement=self.network_agreement)
             for name, (part, pose) in self.actors.items()
@@ -165,6 +166,22 @@ def test_the_network_outvotes_a_track_that_sits_elsewhere(stage):
     assert detected == [False] * 5 + [True]
 
 
+def test_the_network_looks_at_what_agrees_little_and_must_agree_more(stage):
+    tracker = PoseTracker(stage)
+    stage.put("a", pivconnector(), (0.0, 0.0, 0.3))
+    tracker.track(IMAGE, K)
+    stage.agreement = 0.84  # not enough less than usual to be in doubt
+    elsewhere = make_transform(np.eye(3), np.array([0.0, 0.03, 0.3]))
+    beside = replace(stage._detection("pivconnector", elsewhere), agreement=0.8)
+    stage.predict = lambda image, K, roi=None, cropped=False: [beside]
+    for _ in range(2 * OFTEN):
+        (track,) = tracker.track(IMAGE, K)
+    assert track.detection.T_cam_obj[1, 3] == pytest.approx(0.0, abs=1e-9)
+    beside = replace(beside, agreement=0.9)
+    places = [tracker.track(IMAGE, K)[0].detection.T_cam_obj[1, 3] for _ in range(OFTEN + 1)]
+    assert max(places) == pytest.approx(0.03)
+
+
 def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
     tracker = PoseTracker(stage)
     for frame in range(10):
@@ -179,8 +196,14 @@ def test_a_part_in_doubt_goes_on_as_it_was_going(stage):
         place = track.detection.T_cam_obj[:3, 3]
         assert 0.045 < place[0] < 0.045 + 0.005 * number
         assert place[1] == 0.0
+        # The network looks around where the part goes on.
+        x, y, width, height = stage.roi
+        for corner in track.detection.keypoints:
+            assert np.all((corner > (x, y)) & (corner < (x + width, y + height)))
+        assert width * height < IMAGE[..., 0].size / 2
     assert stage.looks == 1 + PATIENCE
     assert tracker.track(IMAGE, K) == []
+    assert stage.roi is None
     stage.agreement, stage.unknown_to_network = 0.95, set()
     (track,) = tracker.track(IMAGE, K)
     assert (track.identity, track.detected) == (0, True)

@@ -125,14 +125,17 @@ def test_refined_poses_keep_the_networks_score_until_another_is_fitted():
     assert options.of_candidates() is options
     fitted = RecoveryOptions(
         min_score=0.5, refined_bias=-2.0, refined_score=1.0, refined_agreement=6.0,
-        refined_min_score=0.4,
+        refined_support=2.0, refined_min_score=0.4,
     )  # fmt: skip
     assert fitted.of_candidates().min_score == CANDIDATE
     assert fitted.unrefined() == RecoveryOptions(min_score=0.5)
-    judged = [replace(said[0], agreement=0.9), replace(said[1], agreement=None, kept="no")]
+    judged = [
+        replace(said[0], agreement=0.9, support=0.4),
+        replace(said[1], agreement=None, kept="no"),
+    ]
     (only,) = rescored(judged, fitted)
     assert only.agreement == 0.9
-    assert only.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9))
+    assert only.score == pytest.approx(expit(-2 + np.log(0.2 / 0.8) + 6 * 0.9 + 2 * 0.4))
 
 
 def test_missing_keypoints_and_worse_fits_are_seen():

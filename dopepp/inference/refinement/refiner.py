@@ -9,6 +9,7 @@ where part and background are of one colour.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -18,8 +19,9 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import make_prior
-from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
 from dopepp.inference.refinement.solver import Refinement, Solution, UndecidedError
+from dopepp.inference.refinement.starts import poses_of_four
 from dopepp.inference.refinement.visible import FEWEST_POINTS, Depth, PoseMatrix, surface_points
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
@@ -42,10 +44,15 @@ def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
     """
     terms = checked_terms(refine)
     refiners = {part.name: PartRefiner(part, terms) for part in parts}
+    cuboids = {part.name: part.cuboid for part in parts}
 
     def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
         followed = one.agreement is not None  # which only refinement gives
-        return refiners[one.object].refine(image, K, one.T_cam_obj, one.covariance, depth, followed)
+        # A tracker knows how far a part may have moved; a network may be wrong about that.
+        starts = None if followed else partial(poses_of_four, cuboids[one.object], one.peaks, K)
+        return refiners[one.object].refine(
+            image, K, one.T_cam_obj, one.covariance, depth, followed, starts
+        )
 
     return refined
 
@@ -84,6 +91,7 @@ class PartRefiner:
         covariance: PoseMatrix | None = None,
         depth: Depth | None = None,
         followed: bool = False,
+        starts: Starts | None = None,
     ) -> Refinement:
         """Refine one pose.
 
@@ -95,6 +103,7 @@ class PartRefiner:
                 in camera axes, radians and metres. Without it, a broad one is taken.
             depth: Metres along z, aligned to the image, 0 where unknown.
             followed: Whether the pose follows from one that was refined on the frame before.
+            starts: As :meth:`RegionRefiner.refine` takes it.
 
         Returns:
             The refined pose with its covariance, or the given one with the reason why it was kept.
@@ -104,7 +113,7 @@ class PartRefiner:
             return Refinement(given, reason="the pose is not finite")
         alone = None
         if self._region is not None:
-            alone = self._region.refine(image, K, given, covariance, followed)
+            alone = self._region.refine(image, K, given, covariance, followed, starts)
         if alone is not None and (depth is None or not self._by_depth):
             return alone
         try:
@@ -173,7 +182,7 @@ def _together(
     """Refine on both; an :class:`UndecidedError` where one of them speaks against the end."""
     end, agreement = region.refine_with(image, K, measured, start)
     measured.check(end.T_cam_obj)
-    return Refinement(end.T_cam_obj, np.linalg.inv(end.information), agreement=agreement)
+    return refinement(end, agreement)
 
 
 def _region(part: Part) -> RegionRefiner:

@@ -3,9 +3,11 @@
 Colours inside a part's outline and around it are learned at the pose that is to be refined. Along
 the normals of the outline they and the picture's edges tell where the part ends
 (:mod:`~dopepp.inference.refinement.lines`), and a few Gauss–Newton steps follow, from coarse to
-fine, with the given pose and its covariance as prior. Where that leads nowhere, several starts are
-drawn from that covariance and ranked by likelihood. Where the picture does not decide, the given
-pose is kept.
+fine, with the given pose and its covariance as prior. Where the picture does not agree with what
+that leads to, the descent starts from elsewhere too (:mod:`~dopepp.inference.refinement.starts`),
+with a prior that lets go, and the end that the picture agrees with best is taken. That is for poses
+whose covariance may be wrong, as a network's of a part that is hidden. Where the picture does not
+decide, the given pose is kept.
 
 Errors of neighbouring points are alike, and an offset may be common to all: a covariance that took
 them for independent would let a blurred edge overrule the network's distance. Edges and creases
@@ -17,22 +19,23 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dopepp.geometry.camera import CameraMatrix, Transform, moved
+from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.inference.refinement.crop import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import DepthEvidence
 from dopepp.inference.refinement.fit import Prior, make_prior
 from dopepp.inference.refinement.lines import FOLLOWED, FOUND, Weights, outline_rows
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.rounds import Round, Stage
+from dopepp.inference.refinement.rounds import Agreement, Round, Stage
 from dopepp.inference.refinement.silhouette import posed
 from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, UndecidedError
+from dopepp.inference.refinement.starts import drawn_poses
 from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(120, reach=1.0, steps=3, points=100, tiles=1, weights=FOUND)
@@ -40,12 +43,27 @@ MIDDLE: Final = Stage(200, reach=0.5, steps=2, points=120, tiles=2, weights=FOUN
 FINE: Final = Stage(300, reach=0.25, steps=3, points=160, tiles=3, weights=FOUND)
 """The coarse round is every start's, the others only the best one's."""
 
-NUM_DRAWS: Final = 4
-"""Starts drawn from the covariance where the given pose's own descent is doubtful."""
-
 WIDENED: Final = 2.0
 """Factor on the prior's deviations in the coarse round: a start that is far off shows a picture
 that agrees with itself too little to overrule the prior, until it has come nearer."""
+
+SURE: Final = 0.85
+"""Share of what the picture tells of the outline that agrees, below which it is looked for farther
+away, and from which it is believed there."""
+
+SUPPORTED: Final = 0.35
+MORE: Final = 0.02
+"""Share of the whole outline that must agree there, and by how much more than where it began."""
+
+FAR: Final = 3.0
+"""Deviations there, besides the given pose's own: so many times those of a pose that nothing is
+known about."""
+
+NUM_STARTS: Final = 4
+"""The likeliest ones there, besides the given pose."""
+
+CERTAIN: Final = 0.95
+"""Share of what the picture tells that ends the search."""
 
 REACH: Final = (2.5, 0.15)
 """Standard deviations of the outline under the prior; not above such a share of its extent."""
@@ -53,6 +71,13 @@ REACH: Final = (2.5, 0.15)
 ENOUGH: Final = 0.6
 """Of the first reach, which is then one and a half standard deviations: a round that looks as far
 needs none before it."""
+
+
+Starts = Callable[[], Sequence[Transform]]
+"""Where else a part may be; called where that is asked for."""
+
+Found = tuple[Solution, Agreement]
+"""Where a descent ended, and how well the outline agrees there."""
 
 
 class RegionRefiner:
@@ -77,6 +102,7 @@ class RegionRefiner:
         T_cam_obj: Transform,
         covariance: Float[np.ndarray, "6 6"] | None = None,
         followed: bool = False,
+        starts: Starts | None = None,
     ) -> Refinement:
         """Refine one pose.
 
@@ -87,6 +113,9 @@ class RegionRefiner:
             covariance: Of the given pose: rotation vector about the object's origin and shift, both
                 in camera axes, radians and metres. Without it, a broad one is taken.
             followed: Whether the pose follows from one that was refined on the frame before.
+            starts: Asked for further poses, where the picture does not agree with what is near the
+                given one: then those, and some that are drawn, are started from too. None: the
+                covariance is believed.
 
         Returns:
             The refined pose with its covariance, or the given one with the reason why it was kept.
@@ -96,11 +125,11 @@ class RegionRefiner:
             return Refinement(given, reason="the pose is not finite")
         try:
             prior = _prior(given, self._diameter, covariance)
-            weights = FOLLOWED if followed else FOUND
-            end, agreement = _search(self._rounds(image, K, given, weights), prior)
+            loose, weights = _loosened(prior, self._diameter), FOLLOWED if followed else FOUND
+            rounds = self._rounds(image, K, given, weights)
+            return refinement(*_search(rounds, prior, loose, starts))
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
-        return Refinement(end.T_cam_obj, np.linalg.inv(end.information), agreement=agreement)
 
     def refine_with(
         self,
@@ -108,7 +137,7 @@ class RegionRefiner:
         K: CameraMatrix,
         depth: DepthEvidence,
         start: Solution,
-    ) -> tuple[Solution, float]:
+    ) -> Found:
         """Refine a pose on the picture and with depth at once.
 
         Args:
@@ -118,7 +147,7 @@ class RegionRefiner:
             start: Where one of them alone has led.
 
         Returns:
-            The end, and the share of the outline that agrees there.
+            The end, and how well the outline agrees there.
 
         Raises:
             UndecidedError: The picture does not decide.
@@ -128,7 +157,7 @@ class RegionRefiner:
         reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
         end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
         known = depth.information(end.T_cam_obj)
-        return end, rounds[-1].agreement(end, depth.prior, reach, known)
+        return end, rounds[-1].believed(end, depth.prior, reach, known)
 
     def _rounds(
         self,
@@ -153,6 +182,12 @@ class RegionRefiner:
         return rounds
 
 
+def refinement(end: Solution, agreement: Agreement) -> Refinement:
+    """Return what a descent has made of a pose."""
+    covariance = np.linalg.inv(end.information)
+    return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
+
+
 def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None) -> Prior:
     """Return the given pose with its covariance as it is, or with a broad one."""
     if covariance is None or not np.isfinite(covariance).all():
@@ -162,36 +197,84 @@ def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6
     return Prior(given, np.linalg.inv(np.asarray(covariance, np.float64) + floor))
 
 
-def _search(rounds: Sequence[Round], prior: Prior) -> tuple[Solution, float]:
-    """Descend from the given pose and, where that is doubtful, from the best of several draws.
+def _loosened(prior: Prior, diameter: float) -> Prior:
+    """Return a prior around the same pose that lets go of it."""
+    broad = make_prior(prior.T_cam_obj, diameter).information
+    covariance = np.linalg.inv(prior.information) + FAR**2 * np.linalg.inv(broad)
+    return Prior(prior.T_cam_obj, np.linalg.inv(covariance))
 
-    Returns:
-        The end, and the share of the outline that agrees there.
+
+def _search(rounds: Sequence[Round], prior: Prior, loose: Prior, starts: Starts | None) -> Found:
+    """Descend from the given pose and, where that is doubtful, from farther away.
 
     Raises:
         UndecidedError: No descent is to be believed.
     """
+    near, doubt = None, None
+    try:
+        near = _near(rounds, prior)
+    except UndecidedError as undecided:
+        doubt = undecided
+    if starts is not None and (near is None or near[1].share < SURE):
+        near = _far(rounds, prior, loose, starts(), near) or near
+    if near is None:
+        assert doubt is not None
+        raise doubt
+    return near
+
+
+def _near(rounds: Sequence[Round], prior: Prior) -> Found:
+    """Descend from the given pose; see :func:`_search`."""
     given = prior.T_cam_obj
     reach = _first_reach(rounds[0], prior)
     rounds = _needed(rounds, reach)
     if rounds[0] is rounds[-1]:  # the last one alone
         return _refined(rounds, given, prior, reach)
-    rounds[0].learn(given, reach)
-    wide = Prior(given, prior.information / WIDENED**2)
-    try:
-        return _refined(rounds[1:], rounds[0].descend(given, wide, reach).T_cam_obj, prior, reach)
-    except UndecidedError as doubt:
-        ends = []
-        for start in _starts(prior):
+    return _from_afar(rounds, given, prior, reach)
+
+
+def _far(
+    rounds: Sequence[Round],
+    prior: Prior,
+    loose: Prior,
+    starts: Sequence[Transform],
+    near: Found | None,
+) -> Found | None:
+    """Descend from the likeliest starts; return the end that agrees best.
+
+    None where none agrees well, or with no more of the outline than ``near`` or the given pose.
+    """
+    best: Found | None = None
+    with contextlib.suppress(UndecidedError):
+        reach = _first_reach(rounds[0], loose)
+        if near is None:
+            rounds[-1].learn(prior.T_cam_obj, reach)
+        before = rounds[-1].agreement(prior.T_cam_obj, reach) if near is None else near[1]
+        supported = max(SUPPORTED, before.support + MORE)
+        rounds[0].learn(prior.T_cam_obj, reach)
+        others = [*starts, *drawn_poses(loose, 1 / FAR)]
+        others.sort(key=lambda start: -rounds[0].log_likelihood(start, loose))
+        for start in (prior.T_cam_obj, *others[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
-                ends.append(rounds[0].descend(start, wide, reach).T_cam_obj)
-        if not ends:
-            raise
-        best = max(ends, key=lambda end: rounds[0].log_likelihood(end, prior))
-        try:
-            return _refined(rounds[1:], best, prior, reach)
-        except UndecidedError:
-            raise doubt from None
+                end, _ = _from_afar(rounds, start, loose, reach)
+                # A prior that admits where that led, and holds the pose no less than it must.
+                away = prior.offset(end.T_cam_obj)
+                surprise = max(1.0, float(away @ prior.information @ away) / len(away))
+                admitting = Prior(prior.T_cam_obj, prior.information / surprise)
+                found = _refined(rounds[-1:], end.T_cam_obj, admitting, reach)
+                least = SURE if best is None else best[1].share
+                if found[1].share >= least and found[1].support >= supported:
+                    best = found
+            if best is not None and best[1].share >= CERTAIN:
+                break
+    return best
+
+
+def _from_afar(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Found:
+    """Descend in all rounds, in the first one with a prior that lets go."""
+    rounds[0].learn(start, reach)
+    wide = Prior(prior.T_cam_obj, prior.information / WIDENED**2)
+    return _refined(rounds[1:], rounds[0].descend(start, wide, reach).T_cam_obj, prior, reach)
 
 
 def _needed(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
@@ -204,16 +287,14 @@ def _needed(rounds: Sequence[Round], reach: float) -> Sequence[Round]:
     return rounds
 
 
-def _refined(
-    rounds: Sequence[Round], start: Transform, prior: Prior, reach: float
-) -> tuple[Solution, float]:
+def _refined(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Found:
     """Descend in one round after the other, and see whether to believe where that leads.
 
     Raises:
         UndecidedError: Not to be believed.
     """
     end = _descended(rounds, start, prior, reach)
-    return end, rounds[-1].agreement(end, prior, reach, prior.information)
+    return end, rounds[-1].believed(end, prior, reach, prior.information)
 
 
 def _descended(rounds: Sequence[Round], start: Transform, prior: Prior, reach: float) -> Solution:
@@ -223,13 +304,6 @@ def _descended(rounds: Sequence[Round], start: Transform, prior: Prior, reach: f
         one.learn(end.T_cam_obj, reach)
         end = one.descend(end.T_cam_obj, prior, reach)
     return end
-
-
-def _starts(prior: Prior) -> list[Transform]:
-    """Return draws from a prior, always the same ones."""
-    spread = np.linalg.cholesky(np.linalg.inv(prior.information))
-    draws = np.random.default_rng(0).normal(size=(NUM_DRAWS, 6))
-    return [moved(prior.T_cam_obj, spread @ draw) for draw in draws]
 
 
 def _first_reach(coarse: Round, prior: Prior) -> float:

@@ -54,6 +54,9 @@ AGREE_PX: Final = 2.0
 LEAST_AGREEING: Final = 0.3
 """Share of a refined outline, by information, that the picture's is so near to."""
 
+TOLD: Final = 0.1
+"""Pixels⁻²: information from which on the picture tells where the part ends."""
+
 FARTHEST: Final = 4.5
 """Standard deviations (Mahalanobis distance of six numbers) that a pose may be moved."""
 
@@ -77,6 +80,20 @@ class Stage:
     points: int
     tiles: int
     weights: Weights
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a refined outline agrees with the picture.
+
+    Attributes:
+        share: Of what the picture tells about the outline, by information, in [0, 1].
+        support: Share of the outline that the picture tells about and that agrees, in [0, 1]: what
+            is hidden, or before its own colour, has none.
+    """
+
+    share: float
+    support: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,27 +176,28 @@ class Round:
         offset = prior.offset(pose)
         return inside - 0.5 * float(offset @ prior.information @ offset)
 
-    def agreement(
+    def agreement(self, pose: Transform, reach: float) -> Agreement:
+        """Return how well an outline agrees with the picture, in the colours learned last."""
+        return self._agreement(self._outline(pose), reach)
+
+    def believed(
         self, end: Solution, prior: Prior, reach: float, known: Float[np.ndarray, "6 6"]
-    ) -> float:
-        """Return the share of a refined outline, by information, that the picture agrees with.
+    ) -> Agreement:
+        """Return how well the outline agrees where a descent has ended.
 
         ``known`` is the information that was there without the outline.
 
         Raises:
             UndecidedError: The picture does not decide for this pose.
         """
-        contour = self.contour(end.T_cam_obj)
-        if contour is None:
-            raise UndecidedError("the part's outline left the picture")
+        contour = self._outline(end.T_cam_obj)
+        agreement = self._agreement(contour, reach)
         if self._gain(end, known) < LEAST_GAIN:
             raise UndecidedError("colours inside and around the part are too alike")
-        shifts = self._shifts(contour, reach)
-        weights = shifts.information
-        away = np.abs(shifts.mean - np.average(shifts.mean, weights=weights + LEAST_INFORMATION))
-        agreeing = float(weights[away <= AGREE_PX].sum() / max(weights.sum(), LEAST_INFORMATION))
-        if agreeing < LEAST_AGREEING:
-            raise UndecidedError(f"only {agreeing:.0%} of the outline agrees with the picture")
+        if agreement.share < LEAST_AGREEING:
+            raise UndecidedError(
+                f"only {agreement.share:.0%} of the outline agrees with the picture"
+            )
         offset = prior.offset(end.T_cam_obj)
         distance = math.sqrt(float(offset @ prior.information @ offset))
         if distance > FARTHEST:
@@ -192,7 +210,21 @@ class Round:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the picture fits the given pose no worse")
-        return agreeing
+        return agreement
+
+    def _outline(self, pose: Transform) -> Contour:
+        contour = self.contour(pose)
+        if contour is None:
+            raise UndecidedError("the part's outline left the picture")
+        return contour
+
+    def _agreement(self, contour: Contour, reach: float) -> Agreement:
+        shifts = self._shifts(contour, reach)
+        weights = shifts.information
+        away = np.abs(shifts.mean - np.average(shifts.mean, weights=weights + LEAST_INFORMATION))
+        agrees = away <= AGREE_PX
+        share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
+        return Agreement(share, float((agrees & (weights > TOLD)).mean()))
 
     def _gain(self, end: Solution, known: Float[np.ndarray, "6 6"]) -> float:
         """Return by how much the outline makes the covariance's volume smaller, its logarithm.

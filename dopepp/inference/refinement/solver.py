@@ -40,13 +40,17 @@ class Refinement:
         covariance: Of the refined pose, as :class:`~dopepp.geometry.pnp.PnPResult` defines it; None
             where the given pose was kept.
         reason: Why the given pose was kept; empty where it was refined.
-        agreement: Share of the refined outline that the picture agrees with; None without it.
+        agreement: Share of what the picture tells about the refined outline that agrees with it;
+            None without it.
+        support: Share of the refined outline that the picture tells about and that agrees; None
+            without it.
     """
 
     T_cam_obj: Transform
     covariance: Float[np.ndarray, "6 6"] | None = None
     reason: str = ""
     agreement: float | None = None
+    support: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

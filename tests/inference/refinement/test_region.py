@@ -27,10 +27,11 @@ from dopepp.inference.refinement.lines import (
     region_terms,
 )
 from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, RegionRefiner
+from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
 from dopepp.inference.refinement.rounds import Round
 from dopepp.inference.refinement.silhouette import filled_mask, posed
 from dopepp.inference.refinement.solver import descend
+from dopepp.inference.refinement.starts import NUM_QUADRUPLES, poses_of_four
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 
@@ -397,3 +398,68 @@ def test_large_pictures_are_read_smaller(refiner: RegionRefiner) -> None:
 def test_faces_without_area_are_refused() -> None:
     with pytest.raises(ValueError, match="no triangle"):
         RegionRefiner(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+
+
+def tiled(part: Part, share: float, seed: int = 0) -> np.ndarray:
+    """Hide that share of a drawn part under patches of the colours around it."""
+    rng = np.random.default_rng(seed)
+    image = picture(part)
+    shown = np.abs(image.astype(int) - PART_COLOUR).max(axis=2) < 12
+    rows, columns = np.nonzero(shown)
+    hidden = np.zeros_like(shown)
+    while (hidden & shown).sum() < share * len(rows):
+        at = rng.integers(len(rows))
+        hidden[rows[at] - 18 : rows[at] + 18, columns[at] - 18 : columns[at] + 18] = True
+    image[hidden] = np.array(AROUND_COLOUR) + rng.normal(size=(hidden.sum(), 3)).astype(int)
+    return image
+
+
+def test_support_falls_with_what_is_hidden_agreement_hardly(refiner: RegionRefiner) -> None:
+    bare, hidden = (
+        refiner.refine(tiled(pivconnector(), share), K, started(2), np.diag(DEVIATIONS**2))
+        for share in (0.0, 0.4)
+    )
+    assert max(off(bare.T_cam_obj)) < 0.5
+    assert max(off(hidden.T_cam_obj)) < 1.5
+    assert bare.agreement is not None
+    assert bare.support is not None
+    assert hidden.agreement is not None
+    assert hidden.support is not None
+    assert bare.support > 0.85 > 0.75 > hidden.support > 0.2
+    assert hidden.agreement > hidden.support + 0.15
+
+
+def test_far_from_a_covariance_that_is_too_sure_the_part_is_found_where_it_is_asked_for(
+    refiner: RegionRefiner,
+) -> None:
+    sure = np.diag(np.repeat([math.radians(1.5), 0.0015], 3) ** 2)
+    start = moved(TRUE, np.array([0.15, 0.2, -0.2, 0.012, -0.008, 0.02]))
+    image = tiled(pivconnector(), 0.3)
+    near = refiner.refine(image, K, start, sure)
+    assert max(off(near.T_cam_obj)) > 5
+    found = refiner.refine(image, K, start, sure, starts=list)
+    assert not found.reason
+    assert max(off(found.T_cam_obj)) < 1.5
+    assert found.agreement is not None
+    assert found.agreement >= SURE
+    # Nothing there: the given pose stays, however far one looks.
+    nothing = refiner.refine(np.full_like(image, 128), K, start, sure, starts=list)
+    assert "alike" in nothing.reason
+    # Where the picture agrees near the given pose, nobody asks.
+    asked: list[int] = []
+    refiner.refine(
+        picture(pivconnector()), K, started(2), np.diag(DEVIATIONS**2),
+        starts=lambda: (asked.append(1), [])[1],
+    )  # fmt: skip
+    assert not asked
+
+
+def test_four_right_keypoints_among_wrong_ones_give_the_pose() -> None:
+    cuboid = pivconnector().cuboid
+    peaks = project(transform(TRUE, cuboid), K)
+    peaks[:3] += [[40, -25], [30, 30], [-35, 20]]
+    peaks[4] = np.nan
+    errors = [max(off(T)) for T in poses_of_four(cuboid, peaks, K)]
+    assert 0 < len(errors) <= NUM_QUADRUPLES
+    assert min(errors) < 0.01
+    assert poses_of_four(cuboid, np.full((9, 2), np.nan), K) == []
