@@ -28,7 +28,7 @@ def root(tmp_path_factory):
     """Two coloured boxes and four pictures with depth, no training images, no masks."""
     folder = tmp_path_factory.mktemp("bop") / "set"
     parts = []
-    for name, size in (("red", 0.08), ("blue", 0.10)):
+    for name, size in (("red", 0.08), ("blue", 0.09)):
         box = trimesh.creation.box((size, 0.7 * size, 0.5 * size))
         shades = np.full((8, 3), (200, 30, 30) if name == "red" else (20, 40, 190), np.uint8)
         mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32), colours=shades)

@@ -362,7 +362,7 @@ def test_wrong_changes_are_refused_in_one_line(changes, message):
 
 def test_unknown_presets_are_refused():
     with pytest.raises(
-        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"
+        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, upright, table, bin"
     ):
         customised_preset("shelf", {})
 
