@@ -6,5 +6,8 @@ setup(
     packages=[*find_namespace_packages(include=["dopepp*", "hydra_plugins*"]), "dopepp.conf"],
     package_dir={"dopepp.conf": "conf"},
     include_package_data=False,  # only what stands here, whatever version control knows
-    package_data={"dopepp": ["py.typed", "pretrained/*"], "dopepp.conf": ["**/*.yaml"]},
+    package_data={
+        "dopepp": ["py.typed", "pretrained/*", "robot/nodes/share/*"],
+        "dopepp.conf": ["**/*.yaml"],
+    },
 )

@@ -63,20 +63,27 @@ def pivconnector():
     return "pivconnector", *load_network(Path("pretrained/pivconnector"))
 
 
-def untrained(model: str):
-    """Return an untrained network in its full width."""
-    import torch
+def config_of(model: str, *overrides: str):
+    """Return a training's config with a model in its full width, on renders of one part."""
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    from dopepp.experiment.build.sources import build_parts
-    from dopepp.experiment.build.system import build_untrained
     from dopepp.experiment.config.run import RunConfig
 
     conf = Path(__file__).parents[1] / "conf"
+    chosen = ["data.parts=[pivconnector]", "data=virtual", f"model={model}", *overrides]
     with initialize_config_dir(str(conf), version_base="1.3"):
-        node = compose("train", ["data.parts=[pivconnector]", "data=virtual", f"model={model}"])
-    config = RunConfig.of(OmegaConf.to_container(node, resolve=True))
+        return RunConfig.of(OmegaConf.to_container(compose("train", chosen), resolve=True))
+
+
+def untrained(model: str):
+    """Return an untrained network in its full width."""
+    import torch
+
+    from dopepp.experiment.build.sources import build_parts
+    from dopepp.experiment.build.system import build_untrained
+
+    config = config_of(model)
     torch.manual_seed(0)
     return model, *build_untrained(config, build_parts(config.data))
 

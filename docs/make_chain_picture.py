@@ -16,11 +16,10 @@ from dopepp.core.files import write_picture
 from dopepp.data.sources.rendered import RenderedSource
 from dopepp.drawing.overlay import Wireframe, overlay
 from dopepp.drawing.pictures import Picture
-from dopepp.drawing.sheet import Tile, contact_sheet, grid
+from dopepp.drawing.sheet import Tile, contact_sheet, grid, heat_picture
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts import Part, pivconnector
-from dopepp.training.callbacks.pictures import heat_picture
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Light, Material, Scene, SceneObject

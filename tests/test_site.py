@@ -1,5 +1,6 @@
 """The pages as a site: two builders read one mkdocs.yml, and refuse a link that leads nowhere."""
 
+import ast
 import json
 import shutil
 import subprocess
@@ -58,6 +59,24 @@ def test_the_notebook_and_its_page_say_the_same():
     pictures = list((ROOT / "docs" / "from_stl_to_poses").glob("*.jpg"))
     assert pictures
     assert sum(path.stat().st_size for path in pictures) < 300_000
+
+
+def test_what_scripts_and_the_notebook_import_is_there():
+    scripts = {str(path): path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
+    scripts |= {str(path): path.read_text() for path in (ROOT / "docs").rglob("*.py")}
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    scripts[str(NOTEBOOK)] = "\n".join(code)
+    missing = []
+    for path, source in scripts.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dopepp"):
+                for one in node.names:
+                    try:
+                        exec(f"from {node.module} import {one.name}", {})
+                    except ImportError as error:
+                        missing.append(f"{path}: {error}")
+    assert missing == []
 
 
 @pytest.mark.slow

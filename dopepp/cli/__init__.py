@@ -17,9 +17,11 @@ from dopepp.cli import (
     calibrate,
     check,
     compare,
+    doctor,
     download,
     entries,
     export,
+    node,
     predict,
     release,
     render,
@@ -32,6 +34,8 @@ COMMANDS: Final = (
     entries.train,
     entries.evaluate,
     predict.predict,
+    doctor.doctor,
+    node.node,
     serve.serve,
     export.export,
     benchmark.benchmark,
@@ -60,11 +64,7 @@ class _OneLine(TyperGroup):
             raise typer.Exit(USERS_MISTAKE) from error
 
 
-app = typer.Typer(
-    cls=_OneLine,
-    no_args_is_help=True,
-    help="The console command ``dopepp``; each subcommand imports what it needs when it is called.",
-)
+app = typer.Typer(cls=_OneLine, no_args_is_help=True)
 
 
 def _show_version(asked: bool) -> None:
@@ -79,7 +79,7 @@ def _configure(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="print it")
     ] = False,
 ) -> None:
-    """Poses of weakly textured parts: train, measure, predict, render, check and compare."""
+    """6D poses of weakly textured parts, from the CAD file: train, measure, predict, export."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
 

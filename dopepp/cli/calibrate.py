@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -13,11 +14,13 @@ from dopepp.core.errors import UserError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from dopepp.drawing.pictures import Picture
     from dopepp.robot.calibration.board import Board, Sighting
     from dopepp.robot.calibration.explanation import Explanation
     from dopepp.robot.calibration.hand_eye import BoardPose, HandEye
     from dopepp.robot.calibration.lens import LensCalibration
     from dopepp.robot.calibration.robot_poses import Reading
+    from dopepp.robot.calibration.tool import Bench
 
 BOARD: Final = "e.g. charuco:8x11:20:15, chess:7x10:25, circles:4x11:40 (columns × rows, mm)"
 
@@ -56,7 +59,18 @@ def board(
 
 
 @app.command()
-def camera(pictures: Pictures, board: BoardSpec, out: Out, force: Force = False) -> None:
+def camera(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="pictures of the board: a folder, a video, a ROS bag, a "
+            "camera's number or address (Ctrl-C ends it)"
+        ),
+    ],
+    board: BoardSpec,
+    out: Out,
+    force: Force = False,
+) -> None:
     """Calibrate a camera's lens from pictures of a board; write the file that --camera reads."""
     from dopepp.core.files import check_target
     from dopepp.robot.calibration.board import parse_board
@@ -65,7 +79,11 @@ def camera(pictures: Pictures, board: BoardSpec, out: Out, force: Force = False)
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
-        seen, size = _sightings(pictures, parse_board(board))
+        target = parse_board(board)
+        if Path(source).is_dir() and not (Path(source) / "metadata.yaml").exists():
+            seen, size = _sightings(Path(source), target)
+        else:
+            seen, size = _chosen_views(source, target)
         found = calibrate_lens(seen, size)
         _show_lens(found)
         check_trust(found.findings, force)
@@ -103,20 +121,49 @@ def tcp(
 
 @app.command()
 def bench(
-    points: Annotated[Path, typer.Argument(help="CSV with x, y, z that the tip has touched")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with x, y, z that the tip has touched, or a folder with pictures of a board "
+            "that lies on the bench"
+        ),
+    ],
     out: Out,
+    board: Annotated[str | None, typer.Option(help=BOARD)] = None,
+    camera: Annotated[Path | None, typer.Option(help="with --board: camera file")] = None,
+    hand_eye: Annotated[
+        Path | None, typer.Option(help="with --board: what `dopepp calibrate handeye` wrote")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="with --board and a camera in the hand: the robot's poses")
+    ] = None,
     unit: Unit = "m",
+    angles: Angles = "rad",
+    quaternion: Quaternion = "wxyz",
+    direction: Direction = "flange-to-base",
     force: Force = False,
 ) -> None:
-    """Find the bench's plane and frame: origin at the first point, x towards the second."""
+    """Find the bench's plane and frame.
+
+    From touched points: origin at the first, x towards the second, z up. From a board: its first
+    point and its columns, z out of the board.
+    """
     from dopepp.robot.calibration.files import transform_record, write_calibration
     from dopepp.robot.calibration.robot_poses import check_unit, read_points
     from dopepp.robot.calibration.tool import find_bench
 
     with report_errors():
-        found = find_bench(read_points(points, check_unit(unit)))
-        for number, residual in enumerate(found.residuals):
-            typer.echo(f"point {number + 1}: {1000 * residual:+.2f} mm off the plane")
+        reading = _reading(unit, angles, quaternion, direction)
+        if board is None and source.is_dir():
+            got = f"{source}, a folder, without --board"
+            raise UserError(got, "a CSV, or pictures with --board", "say which board it is")
+        if board is None:
+            found = find_bench(read_points(source, check_unit(unit)))
+            names = [f"point {number + 1}" for number in range(len(found.residuals))]
+        else:
+            found, names = _bench_of_board(source, board, camera, hand_eye, poses, reading)
+        for name, residual in zip(names, found.residuals, strict=True):
+            typer.echo(f"{name}: {1000 * residual:+.2f} mm off the plane")
         values = {"T_base_bench": transform_record(found.T_base_bench)}
         write_calibration(out, "bench", values, found.findings, force)
     typer.echo(f"written: {out}")
@@ -202,16 +249,103 @@ def _sightings(folder: Path, board: Board) -> tuple[list[Sighting], tuple[int, i
             got = f"{folder / name} of {own[0]}×{own[1]} among pictures of {size[0]}×{size[1]}"
             raise UserError(got, "pictures of one size", "leave out those of another camera")
         size = own
-        sighting = board.find(picture, name)
-        if sighting is None:
-            typer.echo(f"{name}: no board", err=True)
-        else:
+        sighting = _found(board, picture, name, quiet=False)
+        if sighting is not None:
             seen.append(sighting)
     if not seen or size is None:
-        got = f"{folder}: the board is on none of {len(_names(folder))} pictures"
-        fix = "check --board: kind, numbers of columns and rows, dictionary"
-        raise UserError(got, "pictures of the board that --board describes", fix)
+        raise _unseen(f"{folder}: the board is on none of {len(_names(folder))} pictures")
     return seen, size
+
+
+def _found(board: Board, picture: Picture, name: str, quiet: bool) -> Sighting | None:
+    """Find the board on a picture; where there is none, or more than one, say so."""
+    try:
+        sighting = board.find(picture, name)
+    except UserError as error:
+        typer.echo(f"{name}: left out, {error}", err=True)
+        return None
+    if sighting is None and not quiet:
+        typer.echo(f"{name}: no board", err=True)
+    return sighting
+
+
+def _unseen(got: str) -> UserError:
+    fix = "check --board: kind, numbers of columns and rows, dictionary"
+    return UserError(got, "pictures of the board that --board describes", fix)
+
+
+def _chosen_views(source: str, board: Board) -> tuple[list[Sighting], tuple[int, int]]:
+    """Find the board in a video or before a camera, until it ends, Ctrl-C, or views are enough."""
+    from contextlib import suppress
+
+    from dopepp.core.interrupts import Interruption, interruptible
+    from dopepp.inference.sources import open_sources
+    from dopepp.robot.calibration.views import LOOKS_PER_S, Views
+
+    views, size, looked = Views(0), None, 0
+    with suppress(Interruption), interruptible(""):
+        for one in open_sources([source]):
+            stride = 1 if one.count is None else max(1, round((one.rate or 0) / LOOKS_PER_S))
+            for frame in one.frames(stride):
+                own = (frame.image.shape[1], frame.image.shape[0])
+                if size is None:
+                    views, size = Views(own[0]), own
+                name = Path(frame.name).name if one.rate is None else f"frame {frame.number}"
+                sighting = _found(board, frame.image, name, quiet=True) if own == size else None
+                looked += 1
+                if sighting is not None and views.offer(sighting):
+                    typer.echo(f"{name}: view {len(views.kept)}", err=True)
+                if views.is_full:
+                    break
+    if not views.kept or size is None:
+        raise _unseen(f"{source}: the board is on none of {looked} pictures")
+    typer.echo(f"{len(views.kept)} views that differ, of {looked} pictures", err=True)
+    return views.kept, size
+
+
+def _bench_of_board(
+    folder: Path,
+    spec: str,
+    camera: Path | None,
+    hand_eye: Path | None,
+    poses: Path | None,
+    reading: Reading,
+) -> tuple[Bench, list[str]]:
+    """Find the bench from pictures of a board on it; return their names, too."""
+    from dopepp.core.yaml import read_yaml
+    from dopepp.geometry.camera_file import read_camera
+    from dopepp.robot.calibration.board import parse_board
+    from dopepp.robot.calibration.files import read_transform
+    from dopepp.robot.calibration.hand_eye import board_pose
+    from dopepp.robot.calibration.robot_poses import matched, read_robot_poses
+    from dopepp.robot.calibration.tool import bench_of_board
+
+    if camera is None or hand_eye is None:
+        got = "--board without --camera and --hand-eye"
+        raise UserError(got, "both", "pass what `dopepp calibrate` camera and handeye have written")
+    content = read_yaml(hand_eye)
+    record = content if isinstance(content, dict) else {}
+    in_hand = "T_flange_cam" in record
+    if in_hand != (poses is not None):
+        got = f"{hand_eye} of a camera {'in the hand' if in_hand else 'on the bench'}, and "
+        got += "no --poses" if in_hand else "--poses"
+        fix = "add the robot's poses" if in_hand else "leave them out"
+        raise UserError(got, "--poses with a camera in the hand, and only then", fix)
+    T_mount_cam = read_transform(hand_eye, "T_flange_cam" if in_hand else "T_base_cam")
+    seen, size = _sightings(folder, parse_board(spec))
+    lens = read_camera(camera).for_picture(size)
+    boards = {one.name: board_pose(one, lens).T_cam_board for one in seen}
+    mounts = dict.fromkeys(boards, T_mount_cam)
+    if poses is not None:
+        robot, names = read_robot_poses(poses), _names(folder)
+        flanges = robot.transforms(reading)
+        paired = {names[picture]: flanges[row] @ T_mount_cam
+                  for row, picture in matched(robot, names)}  # fmt: skip
+        mounts = {name: paired[name] for name in boards if name in paired}
+    found = bench_of_board([mounts[name] @ boards[name] for name in mounts], parse_board(spec))
+    if record.get("trusted") is not True:
+        found = replace(found, findings=(*found.findings, f"{hand_eye} is not to be trusted"))
+    return found, [*mounts]
 
 
 def _show_lens(found: LensCalibration) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 from numpy.typing import NDArray
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 """An argument of a compiled function; its docstring gives shape and type."""
@@ -28,3 +32,20 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
     """
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     return cast("Callable[[Function], Function]", compiler)
+
+
+class _FirstTime(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Says once why the first call takes long; what is on disk already is not compiled."""
+
+    told = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.told:
+            self.told = True
+            _log.info("compiling inner loops, once on this machine: half a minute or so")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _FirstTime())

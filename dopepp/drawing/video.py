@@ -79,9 +79,11 @@ class VideoFile:
             return
         self._writer.release()
         self._writer = None
-        reader = cv2.VideoCapture(str(self._partial), cv2.CAP_FFMPEG)
-        there = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-        reader.release()
+        there = 0
+        if self._written:
+            reader = cv2.VideoCapture(str(self._partial), cv2.CAP_FFMPEG)
+            there = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+            reader.release()
         if there:
             self._partial.replace(self.path)
         self._partial.unlink(missing_ok=True)

@@ -19,10 +19,11 @@ from dopepp.experiment.build.sources import validation_renders
 from dopepp.experiment.config.data import trained_on
 from dopepp.experiment.reports.evaluators import EstimatorMethod
 from dopepp.experiment.reports.report import measure
+from dopepp.experiment.runs.program import typed
 from dopepp.inference import runtimes
 from dopepp.inference.agreement import Agreement, compare
 from dopepp.inference.estimator import PoseEstimator, letterboxed
-from dopepp.inference.export import EXPORTERS, PRECISIONS
+from dopepp.inference.export import EXPORTERS, PRECISIONS, check_possible
 from dopepp.inference.runtimes.description import Export
 from dopepp.inference.runtimes.runtime import Pixels
 from dopepp.inference.scales import letterboxes
@@ -69,6 +70,7 @@ def export(
     target = _target(path, layout, precision, out)
     if runtimes.is_export(path):
         raise UserError(f"{path}, which is an export", "a checkpoint", "export the checkpoint")
+    check_possible(layout, precision)
     network, checkpoint = load_network(path)
     cost = network_cost(network, checkpoint.input_size)
     source = validation_renders(checkpoint, path, 2 * num_images)
@@ -168,4 +170,4 @@ def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
     if not config.get("root") and any(Path(one).suffix for one in parts):
         words.append(f"data.parts=[{','.join(parts)}]")
     predict = f"dopepp predict {shlex.quote(str(path))} PICTURE --K FX FY CX CY"
-    return predict, " ".join(["python evaluate.py", *map(shlex.quote, words)])
+    return predict, " ".join([typed("evaluate"), *map(shlex.quote, words)])

@@ -293,7 +293,7 @@ def joined(one: Scored, other: Scored) -> Scored:
 def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
     """Write a checkpoint with other recovery options beside the old one; returns its path."""
     tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
-    target = path.with_name(f"{path.stem}_tuned{path.suffix}")
+    target = path.with_name(f"{path.stem}_tuned.ckpt")
     write_atomic(tuned.to_file(), target)
     return target
 

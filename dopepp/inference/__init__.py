@@ -1,5 +1,1 @@
 """Inference: an image and a camera matrix in, poses out; no training, no data sets."""
-
-from dopepp.inference.estimator import PoseEstimator
-
-__all__ = ["PoseEstimator"]

@@ -38,7 +38,14 @@ Save = Callable[[Path, Checkpoint, Export], None]
 Exporter = Callable[[PoseNetwork, str, Sequence[Pixels]], Save]
 """Makes a graph of a network in a precision; int8 is measured on images of the network's input.
 
-A UserError: an extra is missing, or the network has what the format or the precision has not."""
+A UserError: the network has what the format or the precision has not. What is missing here,
+:func:`check_possible` tells before."""
+
+_PACKAGES: Final = {
+    "onnx": ("onnx", "onnxscript", "onnxruntime"),
+    "openvino": ("openvino",),
+    "safetensors": (),
+}
 
 _CHATTY: Final = ("torch.onnx", "onnxscript", "onnx_ir")
 """Loggers that tell every step of a translation."""
@@ -61,10 +68,19 @@ class _Maps(nn.Module):
         return belief.float(), field.float()
 
 
+def check_possible(layout: str, precision: str) -> None:
+    """Check that a format has a precision and that their extras are there; a UserError if not."""
+    if layout == "safetensors" and precision == "int8":
+        allowed, fix = "fp32 or fp16", "choose --format onnx or openvino for int8"
+        raise UserError("--format safetensors --precision int8", allowed, fix)
+    for package in _PACKAGES[layout]:
+        require(package, f"--format {layout}", layout)
+    for package in ("openvino", "nncf") if precision == "int8" else ():
+        require(package, "--precision int8", "openvino")
+
+
 def to_onnx(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
     """Make an ONNX model; see :data:`Exporter`."""
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        require(package, "--format onnx", "onnx")
     program = _traced(network)
     with _translating(network, "ONNX"):
         made: Any = torch.onnx.export(
@@ -113,9 +129,6 @@ def to_openvino(network: PoseNetwork, precision: str, images: Sequence[Pixels]) 
 
 def to_safetensors(network: PoseNetwork, precision: str, images: Sequence[Pixels]) -> Save:
     """Keep the weights as they are, or in half precision, for PyTorch; see :data:`Exporter`."""
-    if precision == "int8":
-        allowed, fix = "fp32 or fp16", "choose --format onnx or openvino for int8"
-        raise UserError("--format safetensors --precision int8", allowed, fix)
     weights = network.state_dict()
 
     def save(path: Path, checkpoint: Checkpoint, export: Export) -> None:
@@ -233,7 +246,6 @@ def _quantised(model: Any, images: Sequence[Any], ends: Sequence[str]) -> Any:
     overflow.
     """
     load_openvino("--precision int8")
-    require("nncf", "--precision int8", "openvino")
     logging.getLogger("nncf").setLevel(logging.ERROR)
     with redirect_stdout(StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
 from dopepp.geometry.camera_files.values import Size
-from dopepp.inference.refinement.view import Depth32, read_depth, undistorted_depth
 from dopepp.inference.sources import Source
+
+if TYPE_CHECKING:
+    from dopepp.inference.refinement.view import Depth32
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +39,8 @@ class Lens:
 
     def depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
         """Read a depth image, metres, and return it without distortion."""
+        from dopepp.inference.refinement.view import read_depth, undistorted_depth
+
         metres, lens = read_depth(path, scale), self.camera.coefficients
         return metres if lens is None else undistorted_depth(metres, K, lens)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy  # its parts load when they are used
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
@@ -227,7 +227,8 @@ class PoseTracker:
                     [[_distance(one.track.detection, other) for other in left] for one in states]
                 ).reshape(len(states), len(left))
                 taken = set()
-                for row, column in zip(*linear_sum_assignment(distances), strict=True):
+                assigned = scipy.optimize.linear_sum_assignment(distances)
+                for row, column in zip(*assigned, strict=True):
                     if distances[row, column] <= limit:
                         pairs.append((states[row], left[column]))
                         taken.add(column)

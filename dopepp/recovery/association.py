@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # its parts load when they are used
 from jaxtyping import Float
-from scipy.optimize import linear_sum_assignment
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS
@@ -128,7 +128,7 @@ def associate(
     score[:, CENTROID] = peaks.centroid_score
     chosen = _unrivalled(gain)
     for k in np.flatnonzero((chosen == RIVALS).any(0)):
-        instance, peak = linear_sum_assignment(gain[:, k], maximize=True)
+        instance, peak = scipy.optimize.linear_sum_assignment(gain[:, k], maximize=True)
         chosen[:, k] = -1
         chosen[instance, k] = np.where(gain[instance, k, peak] > 0, peak, -1)
     instance, corner = np.nonzero(chosen >= 0)

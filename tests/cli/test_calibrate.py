@@ -2,6 +2,7 @@
 
 import csv
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -14,7 +15,11 @@ from dopepp.geometry.camera import camera_matrix, invert_transform, make_transfo
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.robot.calibration.board import parse_board
 from dopepp.robot.calibration.drawn import draw_view
-from dopepp.robot.calibration.files import read_transform
+from dopepp.robot.calibration.files import (
+    read_transform,
+    transform_record,
+    write_calibration,
+)
 from dopepp.robot.calibration.lens import write_camera
 
 BOARD = "charuco:8x6:25:19"
@@ -131,6 +136,46 @@ def test_a_tip_and_a_bench_are_written(tmp_path):
     assert read_transform(tmp_path / "bench.yaml", "T_base_bench")[2, 2] > 0.99
 
 
+@pytest.fixture(scope="module")
+def video(cell):
+    """The cell's pictures as a video, in which each is in sight for three frames."""
+    path = cell[0] / "board.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (640, 480))
+    for number in range(10):
+        for _ in range(3):
+            writer.write(cv2.imread(str(cell[0] / f"{number}.png")))
+    writer.release()
+    return path
+
+
+def test_of_a_video_the_views_that_differ_are_taken(cell, video, tmp_path):
+    out = tmp_path / "camera.yaml"
+    done = call("camera", video, "--board", BOARD, "--out", out, "--force")
+    assert done.exit_code == 0, done.output
+    assert "10 views that differ, of 15 pictures" in done.stderr
+    assert read_camera(out).K[0, 0] == pytest.approx(cell[2].K[0, 0], rel=0.02)
+
+
+def test_a_bench_is_found_from_a_board_on_it(cell, tmp_path):
+    """The board of the cell lies still: the hand-eye calibration says where."""
+    folder, X, _ = cell
+    hand_eye, out = tmp_path / "hand_eye.yaml", tmp_path / "bench.yaml"
+    write_calibration(hand_eye, "hand-eye", {"T_flange_cam": transform_record(X)}, (), False)
+    words = ("--board", BOARD, "--camera", folder / "camera.yaml", "--out", out)
+    done = call("bench", folder, *words, "--hand-eye", hand_eye, "--poses", folder / "poses.csv")
+    assert done.exit_code == 0, done.output
+    T = read_transform(out, "T_base_bench")
+    assert np.linalg.norm(T[:3, 3] - [0.5, 0.1, 0.02]) < 0.001  # the board's place, as drawn
+    for more, said in (
+        ((), "--camera and --hand-eye"),
+        (("--hand-eye", hand_eye), "no --poses"),
+        (("--hand-eye", tmp_path / "none.yaml"), "none.yaml"),
+    ):
+        done = call("bench", folder, *words, *more)
+        assert done.exit_code == 2
+        assert said in done.output
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -141,6 +186,8 @@ def test_a_tip_and_a_bench_are_written(tmp_path):
         (("tcp", "none.csv", "--out", "t.yaml"), "none.csv"),
         (("tcp", "none.csv", "--out", "t.yaml", "--unit", "feet"), "--unit feet"),
         (("bench", "none.csv", "--out", "t.yaml"), "none.csv"),
+        (("bench", ".", "--out", "t.yaml"), "without --board"),
+        (("camera", "none.mp4", "--board", BOARD, "--out", "c.yaml"), "none.mp4"),
         (("tcp", "none.csv", "--out", "t.yaml", "--angles", "grad"), "--angles grad"),
     ],
 )

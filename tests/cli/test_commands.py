@@ -377,3 +377,17 @@ def test_a_full_disk_is_one_line_and_code_1(tmp_path, monkeypatch):
 def test_the_command_line_starts_light(command):
     code = "import sys, dopepp.cli; print({'numpy', 'cv2', 'torch', 'numba'} & set(sys.modules))"
     assert command("-c", code).out == "set()\n"
+
+
+@pytest.mark.parametrize("verb", [["predict", "x.ckpt"], ["doctor", "--model", "x.ckpt"]])
+def test_a_missing_camera_is_told_before_pytorch_is_imported(verb, command, tmp_path):
+    picture = tmp_path / "a.png"
+    cv2.imwrite(str(picture), np.zeros((8, 8, 3), np.uint8))
+    code = f"""
+import sys
+from typer.testing import CliRunner
+from dopepp.cli import app
+done = CliRunner().invoke(app, [{", ".join(map(repr, verb))}, {str(picture)!r}])
+print(done.exit_code, {{"torch", "numba", "scipy"}} & set(sys.modules), done.stderr)
+"""
+    assert command("-c", code).out.startswith("2 set() got neither --K nor --camera")

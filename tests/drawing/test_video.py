@@ -68,6 +68,14 @@ def test_a_full_disk_ends_it_in_one_line(tmp_path, monkeypatch):
     assert len(frames(video.path)) == 1
 
 
+def test_a_disk_that_is_full_before_the_first_picture(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(RunError, match="no space left"), VideoFile(tmp_path / "a.mp4", 10) as video:
+        video.write(level(0), 0)
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""  # OpenCV would say that the file cannot be read
+
+
 def test_what_did_not_arrive_is_told(tmp_path):
     video = VideoFile(tmp_path / "a.mp4", 10)
     for number in range(30):

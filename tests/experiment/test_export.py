@@ -30,7 +30,7 @@ def test_a_released_checkpoint_for_pytorch(tmp_path):
     assert done.agreement.num_poses > 0
     assert done.commands == (
         "dopepp predict pivconnector.safetensors PICTURE --K FX FY CX CY",
-        "python evaluate.py ckpt_path=pivconnector.safetensors",
+        "dopepp evaluate ckpt_path=pivconnector.safetensors",
     )
     again = export(done.path, "safetensors", "fp16", tmp_path / "half.safetensors")
     assert again.path.stat().st_size < 0.6 * done.path.stat().st_size
@@ -73,7 +73,8 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(monkeypatch, tmp_path)
         ({"path": Path("none.ckpt")}, "which is no file"),
     ],
 )
-def test_wrong_options(options, message, tmp_path):
+def test_wrong_options(options, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "validation_renders", None)  # which takes a minute
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
     before = sorted(tmp_path.rglob("*"))

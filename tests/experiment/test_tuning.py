@@ -205,11 +205,12 @@ def test_a_symmetric_part_is_right_at_any_of_its_poses():
     assert score_images(turned, [symmetric], Images(POSE)).correct.tolist() == [True, False]
 
 
-def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path):
+@pytest.mark.parametrize("name", ["best.ckpt", "best.safetensors"])
+def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path, name):
     weights = build_network(tiny_spec).state_dict()
     old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
     path = write_tuned(
-        old, tmp_path / "best.ckpt", {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
+        old, tmp_path / name, {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
     )
     assert path == tmp_path / "best_tuned.ckpt"
     tuned = PoseEstimator.load(path)

@@ -50,7 +50,7 @@ PORTRAIT = View(cut=(0.35, 0.0, 0.35, 0.0))
 VIEWS = st.builds(
     View,
     cut=st.tuples(*[st.floats(0.0, 0.5)] * 4),
-    scale=st.floats(0.35, 1.0),
+    scale=st.floats(0.4, 1.0),
     turns=st.integers(0, 3),
     lens=st.booleans(),
     flipped=st.booleans(),

@@ -28,6 +28,10 @@ from dopepp.recovery.detection import Detection
 
 TERMS: Final = ("region", "depth")
 
+LOOSER: Final = 2.0
+"""Factor on the deviations of a network's pose: its covariance was learned on pictures like those
+of its training, and it is farther off on others."""
+
 Refine = str | Sequence[str]
 """What ``refine=`` takes: one of :data:`TERMS`, or several."""
 
@@ -50,8 +54,9 @@ def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
         followed = one.agreement is not None  # which only refinement gives
         # A tracker knows how far a part may have moved; a network may be wrong about that.
         starts = None if followed else partial(poses_of_four, cuboids[one.object], one.peaks, K)
+        covariance = one.covariance if followed else LOOSER**2 * one.covariance
         return refiners[one.object].refine(
-            image, K, one.T_cam_obj, one.covariance, depth, followed, starts
+            image, K, one.T_cam_obj, covariance, depth, followed, starts
         )
 
     return refined

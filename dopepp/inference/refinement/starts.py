@@ -43,9 +43,12 @@ def poses_of_four(
     poses = []
     for number in order:
         few = list(quadruples[number])
-        found, turn, place = cv2.solvePnP(
-            cuboid[few], peaks[few], K, None, flags=cv2.SOLVEPNP_SQPNP
-        )
+        try:
+            found, turn, place = cv2.solvePnP(
+                cuboid[few], peaks[few], K, None, flags=cv2.SOLVEPNP_SQPNP
+            )
+        except cv2.error:  # all four in one place
+            continue
         if found and np.isfinite(turn).all() and place[2, 0] > 0:
             poses.append(make_transform(rotation_vector_to_matrix(turn[:, 0]), place[:, 0]))
     return poses

@@ -12,8 +12,8 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+import scipy  # its parts load when they are used
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import Transform
@@ -75,7 +75,7 @@ def surface_points(points: Points) -> SurfacePoints:
     if len(points) > MOST_POINTS:
         points = points[np.linspace(0, len(points) - 1, MOST_POINTS).astype(int)]
     count = min(NEIGHBOURS + 1, len(points))
-    found = KDTree(points).query(points, count)
+    found = scipy.spatial.KDTree(points).query(points, count)
     distances, neighbours = np.asarray(found[0]), np.asarray(found[1])
     # Of a surface with ρ points a unit of area, πρr² lie within r; the point itself is one of them.
     spacing = float(np.median(distances[:, -1])) * math.sqrt(math.pi / (count - 0.5))

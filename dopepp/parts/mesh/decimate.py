@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+import scipy  # its parts load when they are used
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dopepp.parts.mesh.measure import Faces, Vertices, face_areas
 
@@ -146,5 +145,7 @@ def _islands(faces: Faces, cells: Int[np.ndarray, " vertices"]) -> Int[np.ndarra
     start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     inside = cells[start] == cells[end]
     edges = (np.ones(int(inside.sum()), bool), (start[inside], end[inside]))
-    joined = coo_array(edges, shape=(len(cells), len(cells)))
-    return np.asarray(connected_components(joined, directed=False)[1], np.int64)
+    joined = scipy.sparse.coo_array(edges, shape=(len(cells), len(cells)))
+    return np.asarray(
+        scipy.sparse.csgraph.connected_components(joined, directed=False)[1], np.int64
+    )

@@ -11,12 +11,9 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy  # its parts load when they are used
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, KDTree
-from scipy.spatial.distance import cdist
 
 from dopepp.drawing.pictures import Picture
 
@@ -114,7 +111,7 @@ def largest_distance(points: Points) -> float:
         corners = points[[along.argmin(), along.argmax()]]
     else:
         flat = offsets @ axes[:rank].T
-        corners = points if _is_round(flat) else points[ConvexHull(flat).vertices]
+        corners = points if _is_round(flat) else points[scipy.spatial.ConvexHull(flat).vertices]
     if len(corners) <= _FEW_CORNERS:
         return _farthest(corners, corners)[0]
     distance, end = max(_longest_of_directions(corners))
@@ -131,7 +128,7 @@ def _is_round(points: Float[np.ndarray, "points axes"]) -> bool:
         return False
     sample = points[:: len(points) // _FEW_CORNERS + 1]
     # "QJ" moves points a little, so that a sample in a plane has a hull too.
-    return 2 * len(ConvexHull(sample, qhull_options="QJ").vertices) > len(sample)
+    return 2 * len(scipy.spatial.ConvexHull(sample, qhull_options="QJ").vertices) > len(sample)
 
 
 def _farthest(some: Float[np.ndarray, "some 3"], points: Points) -> tuple[float, int]:
@@ -139,7 +136,7 @@ def _farthest(some: Float[np.ndarray, "some 3"], points: Points) -> tuple[float,
     best, end = -1.0, 0
     # 512 rows at a time keep the distances of a 100,000-vertex hull under 0.5 GB.
     for start in range(0, len(some), 512):
-        distances = cdist(some[start : start + 512], points)
+        distances = scipy.spatial.distance.cdist(some[start : start + 512], points)
         if distances.max() > best:
             best, end = float(distances.max()), int(distances.argmax()) % len(points)
     return best, end
@@ -195,8 +192,10 @@ def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"
     """
     positions, corners = weld(vertices, faces)
     one, other = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
-    joined = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(positions),) * 2)
-    count, of_vertex = connected_components(joined, directed=False)
+    joined = scipy.sparse.coo_array(
+        (np.ones(len(one), bool), (one, other)), shape=(len(positions),) * 2
+    )
+    count, of_vertex = scipy.sparse.csgraph.connected_components(joined, directed=False)
     if count == 1:
         return [np.ptp(positions, axis=0)]
     lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
@@ -234,7 +233,7 @@ class SurfaceTree:
         points, self._owners = self.spread(NUM_COVERING, seed=17)
         own = np.arange(len(a))
         # Corners and centres give each triangle of a fine mesh a point of its own.
-        self._tree = KDTree(
+        self._tree = scipy.spatial.KDTree(
             np.concatenate([points, a, b, c, self.triangles.mean(axis=1)]), balanced_tree=False
         )
         self._owners = np.concatenate([self._owners, own, own, own, own])

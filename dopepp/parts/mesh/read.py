@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import scipy  # its parts load when they are used
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from dopepp.core.errors import UserError
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
@@ -270,8 +269,12 @@ def _minority(areas: Float[np.ndarray, " faces"], topology: Topology) -> Bool[np
     swap = np.where(topology.opposed, num_faces, 0)
     rows = np.concatenate([one, one + num_faces])
     columns = np.concatenate([other + swap, other + num_faces - swap])
-    joined = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(2 * num_faces,) * 2)
-    as_is, over = connected_components(joined, directed=False)[1].reshape(2, num_faces)
+    joined = scipy.sparse.coo_array(
+        (np.ones(len(rows), bool), (rows, columns)), shape=(2 * num_faces,) * 2
+    )
+    as_is, over = scipy.sparse.csgraph.connected_components(joined, directed=False)[1].reshape(
+        2, num_faces
+    )
     weight = np.bincount(as_is, areas, minlength=int(max(as_is.max(), over.max())) + 1)
     better = weight[over] > weight[as_is]
     tied = (weight[over] == weight[as_is]) & (over < as_is)
@@ -283,8 +286,10 @@ def _inverted_bodies(
 ) -> Bool[np.ndarray, " faces"]:
     """Return the triangles of closed bodies that face inwards and lie in no other body's box."""
     one, other = topology.neighbours.T
-    joined = coo_array((np.ones(len(one), bool), (one, other)), shape=(len(faces),) * 2)
-    num_bodies, bodies = connected_components(joined, directed=False)
+    joined = scipy.sparse.coo_array(
+        (np.ones(len(one), bool), (one, other)), shape=(len(faces),) * 2
+    )
+    num_bodies, bodies = scipy.sparse.csgraph.connected_components(joined, directed=False)
     volumes = np.bincount(bodies, _signed_volumes(vertices, faces), minlength=num_bodies)
     corners = vertices[faces]
     lower, upper = np.full((num_bodies, 3), np.inf), np.full((num_bodies, 3), -np.inf)

@@ -85,7 +85,10 @@ class Board:
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     def find(self, picture: Picture, name: str) -> Sighting | None:
-        """Find the board on an RGB picture; None where fewer than 8 points are seen."""
+        """Find the board on an RGB picture; None where fewer than 8 points are seen.
+
+        A :class:`UserError`: two ChArUco boards of one kind are in sight.
+        """
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         chosen, pixels = getattr(self, f"_find_{self.kind}")(grey)
         if len(chosen) < MIN_POINTS:
@@ -142,7 +145,9 @@ class Board:
         return cv2.aruco.CharucoDetector(self._charuco)
 
     def _find_charuco(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[Any, Any]:
-        pixels, numbers, _, _ = self._detector.detectBoard(grey)
+        pixels, numbers, _, markers = self._detector.detectBoard(grey)
+        if markers is not None and len(np.unique(markers)) < len(markers):
+            raise UserError("two boards with the same markers", "one in sight", "cover the other")
         return ([], []) if numbers is None else (np.ravel(numbers), pixels)
 
     def _find_chess(self, grey: UInt8[np.ndarray, "h w"]) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,6 +12,8 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import Vector
+from dopepp.robot.calibration.board import Board
+from dopepp.robot.calibration.hand_eye import nearest_rotation
 
 MIN_POSES: Final = 4
 
@@ -143,6 +146,34 @@ def find_bench(touched: Float[np.ndarray, "points 3"], up: Vector | None = None)
             "again, or is the bench not flat?"
         )
     return Bench(make_transform(rotation, origin), residuals, tuple(findings))
+
+
+def bench_of_board(T_base_board: Sequence[Transform], board: Board) -> Bench:
+    """Return the bench under a board that lies on it, from where pictures show the board.
+
+    z points out of the board, towards who sees it; origin and x are the board's. Residuals are how
+    far, along z, the middle of each picture's board is from the mean. A :class:`UserError`: there
+    is no picture.
+    """
+    if not len(T_base_board):
+        raise UserError("no picture with a pose", "one or more", "add the robot's poses of them")
+    poses, middle = np.stack(T_base_board), board.points.mean(axis=0)
+    R = nearest_rotation(poses[:, :3, :3].sum(axis=0)) @ np.diag([1.0, -1.0, -1.0])
+    seen = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+    away = seen - seen.mean(axis=0)
+    at = seen.mean(axis=0) - R @ (np.array([1.0, -1.0, -1.0]) * middle)
+    worst = int(np.linalg.norm(away, axis=1).argmax())
+    far = float(np.linalg.norm(away[worst]))
+    findings = []
+    if len(poses) == 1:
+        findings.append("one picture is no check: take two more, from elsewhere if the camera is "
+                        "in the hand")  # fmt: skip
+    if far > MAX_RESIDUAL:
+        findings.append(
+            f"picture {worst + 1} shows the board {1000 * far:.1f} mm from where the others do: "
+            "was it moved, or is the hand-eye calibration of another setup?"
+        )
+    return Bench(make_transform(R, at), away @ R[:, 2], tuple(findings))
 
 
 def named(axis: Vector) -> str:

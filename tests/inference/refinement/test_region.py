@@ -463,3 +463,4 @@ def test_four_right_keypoints_among_wrong_ones_give_the_pose() -> None:
     assert 0 < len(errors) <= NUM_QUADRUPLES
     assert min(errors) < 0.01
     assert poses_of_four(cuboid, np.full((9, 2), np.nan), K) == []
+    assert poses_of_four(cuboid, np.full((9, 2), 300.0), K) == []

@@ -5,7 +5,13 @@ import pytest
 from PIL import Image
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, invert_transform, project, transform
+from dopepp.geometry.camera import (
+    camera_matrix,
+    invert_transform,
+    make_transform,
+    project,
+    transform,
+)
 from dopepp.geometry.camera_file import Camera
 from dopepp.robot.calibration.board import parse_board
 from dopepp.robot.calibration.drawn import draw_view
@@ -78,3 +84,17 @@ def test_squares_of_a_printed_charuco_board_are_as_long_as_said():
 def test_a_board_that_is_none_is_refused(what, said):
     with pytest.raises(UserError, match=re.escape(said)):
         parse_board(what)
+
+
+def test_two_boards_of_one_kind_are_refused():
+    board, rng = parse_board("charuco:8x6:25:19"), np.random.default_rng(0)
+    camera = Camera((960, 480), camera_matrix(560, 560, 480, 240), (), "true")
+    left, right = (
+        draw_view(board, make_transform(np.eye(3), np.array([x, -0.07, 0.35])), camera, rng)
+        for x in (-0.25, 0.02)
+    )
+    both = left.copy()
+    both[:, 480:] = right[:, 480:]
+    assert board.find(left, "one") is not None
+    with pytest.raises(UserError, match="two boards"):
+        board.find(both, "two")

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import make_transform, transform
-from dopepp.robot.calibration.tool import find_bench, find_tip
+from dopepp.robot.calibration.board import parse_board
+from dopepp.robot.calibration.tool import bench_of_board, find_bench, find_tip
 
 TIP, PIVOT = np.array([0.01, -0.02, 0.15]), np.array([0.4, 0.1, 0.05])
 
@@ -82,3 +83,18 @@ def test_points_that_are_no_plane_are_refused(points, said):
 def test_a_point_off_the_plane_is_named():
     points = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0.3, 0.3, 0], [0.15, 0.15, 0.02]])
     assert any("point 5" in one for one in find_bench(points).findings)
+
+
+def test_a_bench_is_found_under_a_board():
+    board, rng = parse_board("charuco:8x6:25:19"), np.random.default_rng(0)
+    T = make_transform(Rotation.from_euler("xyz", [184, 3, 40], degrees=True).as_matrix(), PIVOT)
+    seen = [make_transform(T[:3, :3], T[:3, 3] + 2e-4 * rng.normal(size=3)) for _ in range(5)]
+    found = bench_of_board(seen, board)
+    assert not found.findings
+    # The board's z goes into the bench.
+    flipped = make_transform(T[:3, :3] @ np.diag([1.0, -1, -1]), T[:3, 3])
+    assert np.allclose(found.T_base_bench, flipped, atol=5e-4)
+    assert np.abs(found.residuals).max() < 1e-3
+    seen[3] = make_transform(T[:3, :3], T[:3, 3] + [0, 0, 0.01])
+    assert any("picture 4" in one for one in bench_of_board(seen, board).findings)
+    assert "no check" in bench_of_board(seen[:1], board).findings[0]

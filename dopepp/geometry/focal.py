@@ -1,0 +1,78 @@
+"""How long a lens's focal length is, told by the perspective of a part whose size is known.
+
+A lens that is twice as long shows the same part twice as far away in the same size: what differs is
+how much larger its near end is than its far one. A thin part that faces the camera has neither.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import OptimizeResult, least_squares
+
+from dopepp.geometry.camera import CameraMatrix, Transform, moved, project_keypoints
+from dopepp.geometry.cuboid import Cuboid
+
+MIN_POINTS: Final = 8
+"""With fewer of the nine keypoints, one that is off looks like perspective."""
+
+MILD: Final = 0.02
+"""Error of a keypoint, share of the part's extent, from which it counts less than quadratically."""
+
+LENGTHS: Final = (0.5, 1.0, 2.0)
+"""Factors at which the search begins; it ends at half and twice of these."""
+
+
+class Focal(NamedTuple):
+    """What keypoints say of a camera matrix.
+
+    Attributes:
+        factor: By which its focal lengths are to be multiplied.
+        deviation: Standard deviation of the factor's logarithm.
+        gain: How many times as well the keypoints fit then: the ratio of the squared errors.
+    """
+
+    factor: float
+    deviation: float
+    gain: float
+
+
+def focal_factor(
+    cuboid: Cuboid, keypoints: Float[np.ndarray, "9 2"], T_cam_obj: Transform, K: CameraMatrix
+) -> Focal | None:
+    """Fit a focal length to an object's keypoints; None where too few of them are known.
+
+    ``keypoints`` are pixels, NaN where unknown; the pose is the one found with K, metres.
+    """
+    known = np.isfinite(keypoints).all(axis=1)
+    if known.sum() < MIN_POINTS:
+        return None
+    extent = float(np.ptp(keypoints[known], axis=0).max())
+
+    def errors(values: Float[np.ndarray, "unknowns"], first: float) -> Float[np.ndarray, "errors"]:
+        step, lens, start = values[:6].copy(), K.copy(), T_cam_obj.copy()
+        factor = first * math.exp(values[6]) if len(values) > 6 else first
+        lens[[0, 1], [0, 1]] *= factor
+        start[2, 3] *= factor  # where the part appears as large
+        step[3:] *= start[2, 3]
+        seen = project_keypoints(cuboid, moved(start, step), lens)[known]
+        return np.asarray(np.nan_to_num((seen - keypoints[known]) / extent, nan=10.0).ravel())
+
+    def fitted(unknowns: int, first: float) -> OptimizeResult:
+        """Fit the pose and, with a seventh unknown, the logarithm of the factor over ``first``."""
+        most = np.array([*6 * [math.inf], math.log(2)])[:unknowns]
+        start, bounds = np.zeros(unknowns), (-most, most)
+        return least_squares(
+            errors, start, loss="soft_l1", f_scale=MILD, bounds=bounds, max_nfev=50, args=(first,)
+        )
+
+    free = {first: fitted(7, first) for first in LENGTHS}
+    first = min(free, key=lambda one: float(free[one].cost))
+    best = free[first]
+    spare = 2 * int(known.sum()) - 7
+    covariance = np.linalg.pinv(best.jac.T @ best.jac) * 2 * best.cost / spare
+    gain = (2 * fitted(6, 1.0).cost / (spare + 1)) / max(2 * best.cost / spare, 1e-12)
+    return Focal(first * math.exp(best.x[6]), math.sqrt(covariance[6, 6]), float(gain))

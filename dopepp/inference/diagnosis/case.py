@@ -1,0 +1,150 @@
+"""Case: a picture, its camera and who looks at it, with what comes of that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
+from dopepp.geometry.cuboid import NUM_KEYPOINTS
+from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.scales import letterboxes
+from dopepp.parts.part import Part
+from dopepp.parts.seen import Seen, widest
+from dopepp.recovery.detection import Detection
+
+NEARER, FARTHER = 2.0, 4.0
+"""Factors on the distances where nothing is found at these."""
+
+BELIEVED: Final = (0.4, 6)
+"""Mean belief and number of keypoints of a part that is found elsewhere; ghosts have less."""
+
+LEAST_PX: Final = 24
+"""Side of a picture that tells how sharp it is."""
+
+
+class Case:
+    """A picture, its camera and who looks at it, with what comes of that.
+
+    Args:
+        estimator: Who looks.
+        image: RGB, without distortion.
+        K: Its camera matrix, pixels.
+        parts: The estimator's, with meshes where there are any.
+        distances: Nearest and farthest, metres; None for those of training.
+        cropped: As :meth:`PoseEstimator.predict` takes it.
+    """
+
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        image: Picture,
+        K: CameraMatrix,
+        parts: Sequence[Part],
+        distances: tuple[float, float] | None = None,
+        cropped: bool = False,
+    ) -> None:
+        self.estimator, self.image, self.K = estimator, image, K
+        self.parts, self.distances, self.cropped = parts, distances, cropped
+
+    @cached_property
+    def expected(self) -> Detection | None:
+        """The best part that is found where it is looked for."""
+        return self._best(self.distances)
+
+    @cached_property
+    def elsewhere(self) -> Detection | None:
+        """The best one that is found nearer or farther, where there is none."""
+        known = self.estimator.checkpoint.seen.values()
+        if self.expected is not None or not known:
+            return None
+        usual = widest([*known])[2:]
+        near, far = zip(usual, self.distances or usual, strict=True)
+        one = self._best((min(near) / NEARER, max(far) * FARTHER))
+        belief, keypoints = BELIEVED
+        if one is None or one.belief < belief or num_keypoints(one) < keypoints:
+            return None
+        return one if np.isfinite(one.keypoints).all() else None
+
+    @property
+    def found(self) -> Detection | None:
+        """The best part that is found at all."""
+        return self.expected or self.elsewhere
+
+    @cached_property
+    def part(self) -> Part:
+        """The part in question: the one that is found, else the checkpoint's first."""
+        known = {part.name: part for part in self.estimator.parts}
+        return known[self.found.object] if self.found else self.estimator.parts[0]
+
+    @property
+    def seen(self) -> Seen | None:
+        """How training had the part; None where an earlier version wrote the checkpoint."""
+        return self.estimator.checkpoint.seen.get(self.part.name)
+
+    @property
+    def length_px(self) -> float:
+        """Diameter of the found part in the picture, pixels."""
+        assert self.found is not None
+        return self.part.diameter * focal_length(self.K) / float(self.found.T_cam_obj[2, 3])
+
+    @cached_property
+    def box(self) -> Letterbox:
+        """The size in which the network sees the found part best, or the picture."""
+        boxes = letterboxes(self.estimator.checkpoint, self.K, self.image, self.distances)
+        if self.found is None or self.seen is None:
+            return boxes[-1]
+        usual = math.sqrt(self.seen.smallest_px * self.seen.largest_px)
+        return min(boxes, key=lambda one: abs(math.log(self.length_px * one.scale_x / usual)))
+
+    @cached_property
+    def closer(self) -> Detection | None:
+        """What is found, with the agreement of its outline; None where there is no mesh."""
+        if self.found is None or any(part.mesh is None for part in self.parts):
+            return None
+        if self.estimator.refiner is not None:
+            return self.found
+        estimator = self.estimator.refining("region", self.parts)
+        return estimator.refined([self.found], self.image, self.K)[0]
+
+    def around(self) -> Picture:
+        """Return the found part's surroundings in :attr:`box`, or all of the picture."""
+        picture = self.box.image(self.image)
+        if self.found is None:
+            return picture
+        points = self.box.points(self.found.keypoints[np.isfinite(self.found.keypoints[:, 0])])
+        size = (picture.shape[1], picture.shape[0])
+        low = np.clip(np.floor(points.min(axis=0)), 0, size).astype(int)
+        high = np.clip(np.ceil(points.max(axis=0)) + 1, 0, size).astype(int)
+        cut = picture[low[1] : high[1], low[0] : high[0]]
+        return cut if min(cut.shape[:2]) >= LEAST_PX else picture
+
+    def strongest_beliefs(self) -> Float[np.ndarray, "9"]:
+        """Return the strongest belief of each keypoint of the part, in the sizes looked at."""
+        estimator = self.estimator
+        number = [part.name for part in estimator.parts].index(self.part.name)
+        own = slice(number * NUM_KEYPOINTS, (number + 1) * NUM_KEYPOINTS)
+        strongest = np.zeros(NUM_KEYPOINTS)
+        for box in letterboxes(estimator.checkpoint, self.K, self.image, self.distances):
+            belief, _ = estimator.maps(
+                letterboxed(self.image, box, estimator.network.size_multiple)
+            )
+            strongest = np.maximum(strongest, belief[own].flatten(1).amax(1).cpu().numpy())
+        return strongest
+
+    def _best(self, distances: tuple[float, float] | None) -> Detection | None:
+        found = self.estimator.predict(
+            self.image, self.K, distances=distances, cropped=self.cropped
+        )
+        return found[0] if found else None
+
+
+def num_keypoints(one: Detection) -> int:
+    """Return how many keypoints the maps have of a part."""
+    return int(np.isfinite(one.peaks[:, 0]).sum())

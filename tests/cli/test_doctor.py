@@ -1,0 +1,95 @@
+"""``dopepp doctor`` and ``dopepp serve`` as their users call them."""
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from dopepp.cli import app
+from dopepp.core import errors
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory
+
+MODEL = "pretrained/pivconnector"
+
+
+def doctor(*arguments):
+    return CliRunner().invoke(app, ["doctor", *map(str, arguments), "--model", MODEL])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("patient")
+    rendered = Factory([pivconnector()], PRESETS["quickstart"], 411).render(0, 0)
+    cv2.imwrite(str(folder / "good.png"), rendered.image[..., ::-1])
+    cv2.imwrite(str(folder / "plain.png"), np.full((128, 128, 3), 90, np.uint8))
+    np.savetxt(folder / "K.txt", rendered.scene.K)
+    mesh = pivconnector().mesh
+    trimesh.Trimesh(1000 * mesh.vertices, mesh.faces).export(folder / "piv.stl")
+    return folder
+
+
+def test_a_good_picture_is_well(folder):
+    done = doctor(folder / "good.png", "--camera", folder / "K.txt", "--refine", "region")
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        f"ok {subject}"
+        for subject in ("part", "exposure", "sharpness", "camera", "size", "visibility", "pose")
+    ]
+    assert "pivconnector measures 105 × 52 × 7.0 mm" in lines[0]
+    assert "of its outline agrees" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["plain.png", "--camera", "K.txt"], "!! visibility: nothing like pivconnector is seen"),
+        (["good.png", "--K", "220", "220", "127.5", "127.5"], "!! camera: K with fx=220"),
+        (
+            ["good.png", "--camera", "K.txt", "--part", "piv.stl", "--unit", "cm"],
+            "!! part: pivconnector measures 105 × 52 × 7.0 mm, and its mesh 1050 × 520 × 70 mm, "
+            "10 times that; fix: it was read in cm and is in mm: --unit mm",
+        ),
+    ],
+)
+def test_what_is_wrong_comes_first(folder, options, line):
+    paths = [str(folder / one) if "." in one and one[0].isalpha() else one for one in options]
+    done = doctor(*paths)
+    assert done.exit_code == 1, done.output
+    assert done.stdout.startswith(line)
+    assert "; fix: " in done.stdout.splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["good.png"], "neither --K nor --camera"),
+        (["K.txt", "--camera", "K.txt"], "cannot identify the format"),
+        (["good.png", "--camera", "K.txt", "--refine", "magic"], "--refine magic; allowed: region"),
+        (["good.png", "--camera", "K.txt", "--distance", "2", "1"], "distances=(2.0, 1.0)"),
+    ],
+)
+def test_wrong_input_is_one_line(folder, options, line):
+    paths = [str(folder / one) if one[-4:] in (".png", ".txt") else one for one in options]
+    done = doctor(*paths)
+    assert done.exit_code == 2, done.output
+    assert line in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "missing", "line"),
+    [
+        ([], True, "pip install 'dopepp[web]'"),
+        (["--refine", "depth"], False, "region, or none"),
+        (["--port", "0"], False, "--help"),
+    ],
+)
+def test_a_page_that_cannot_be_served_is_one_line(monkeypatch, options, missing, line):
+    if missing:
+        monkeypatch.setattr(errors, "find_spec", lambda name: None)
+    done = CliRunner().invoke(app, ["serve", MODEL, *options])
+    assert done.exit_code == 2, done.output
+    assert line in done.stderr

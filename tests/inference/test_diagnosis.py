@@ -1,0 +1,159 @@
+"""What a diagnosis names first on rendered pictures whose fault is known."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dopepp import PoseEstimator
+from dopepp.geometry.camera import project_keypoints
+from dopepp.inference.diagnosis import CHECKS, Case, diagnose
+from dopepp.models.checkpoint.schema import load_network
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import PRESETS, Factory
+from dopepp.virtual.scene import Sensor
+from dopepp.virtual.sensor import capture, defocus
+
+PART, PRESET, SEED = pivconnector(), PRESETS["quickstart"], 411
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return PoseEstimator.load("pretrained/pivconnector")
+
+
+@pytest.fixture(scope="module")
+def factory():
+    return Factory([PART], PRESET, SEED)
+
+
+@pytest.fixture(scope="module")
+def empty():
+    return Factory([PART], replace(PRESET, targets_per_image=(0, 0)), SEED)
+
+
+def first(estimator, image, K, parts=None, **options):
+    """Return the subject of the first thing that is wrong, or nothing."""
+    findings = diagnose(Case(estimator, image, K, parts or estimator.parts, **options))
+    assert len(findings) == len(CHECKS)
+    assert all(one.sentence and str(one).startswith(f"{one.subject}: ") for one in findings)
+    return next((one.subject for one in findings if one.fix), "")
+
+
+def longer(K, factor):
+    return K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+
+
+def test_good_pictures_raise_no_alarm(estimator, factory):
+    firsts = Counter()
+    for index in range(12):
+        rendered = factory.render(0, index)
+        firsts[first(estimator, rendered.image, rendered.scene.K)] += 1
+    # Of a hundred pictures a few are lost, and those are told.
+    assert firsts[""] >= 10, firsts
+    assert not set(firsts) - {"", "visibility", "pose"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "subject"),
+    [
+        (lambda image, K: (defocus(image, 5.0), K), "sharpness"),
+        (lambda image, K: (capture(image, Sensor(exposure_ev=-4)), K), "exposure"),
+        (lambda image, K: (capture(image, Sensor(exposure_ev=4)), K), "exposure"),
+        (lambda image, K: (image, longer(K, 2.0)), "camera"),
+        (lambda image, K: (image, longer(K, 0.5)), "camera"),
+    ],
+    ids=["blurred", "dark", "bright", "K too long", "K too short"],
+)
+def test_what_spoils_a_picture_is_named_first(estimator, factory, fault, subject):
+    firsts = Counter()
+    for index in range(6):
+        rendered = factory.render(0, index)
+        firsts[first(estimator, *fault(rendered.image, rendered.scene.K))] += 1
+    assert firsts[subject] >= 5, firsts
+
+
+def test_a_part_that_is_too_small_is_named_with_its_distance(estimator, factory):
+    rendered = factory.render(0, 3, scale=0.4)
+    case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts)
+    (wrong,) = [one for one in diagnose(case) if one.fix]
+    true = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj[2, 3]
+    assert wrong.subject == "size"
+    assert f"{case.elsewhere.T_cam_obj[2, 3]:.3g} m" in wrong.sentence
+    assert case.elsewhere.T_cam_obj[2, 3] == pytest.approx(true, rel=0.1)
+    near, far = map(float, wrong.fix.split("--distance ")[1].split()[:2])
+    assert near < true < far
+    again = first(estimator, rendered.image, rendered.scene.K, distances=(near, far))
+    assert again in ("", "pose")
+
+
+def test_a_part_out_of_the_picture_or_covered_is_missed(estimator, factory, empty):
+    missing, covered = Counter(), Counter()
+    for index in range(4):
+        without, rendered = empty.render(0, index), factory.render(0, index)
+        missing[first(estimator, without.image, without.scene.K)] += 1
+        image, K = rendered.image.copy(), rendered.scene.K
+        T = rendered.scene.objects[rendered.scene.targets[0]].T_cam_obj
+        points = project_keypoints(PART.cuboid, T, K).clip(0, 127)
+        (left, top), (right, bottom) = points.min(0).astype(int), points.max(0).astype(int)
+        place = np.s_[top:bottom, left + (right - left) // 3 : right]
+        image[place] = without.image[place]
+        covered[first(estimator, image, K)] += 1
+    assert missing["visibility"] >= 3, missing
+    assert covered["visibility"] + covered["pose"] >= 3, covered
+
+
+def test_a_part_that_is_larger_than_the_picture_is_missed(estimator, factory):
+    rendered = [factory.render(0, index, scale=2.0) for index in range(4)]
+    firsts = Counter(first(estimator, one.image, one.scene.K) for one in rendered)
+    assert firsts["visibility"] + firsts["size"] >= 3, firsts
+
+
+def test_a_distance_where_the_part_is_not_is_told(estimator, factory):
+    rendered = factory.render(0, 1)
+    case = Case(estimator, rendered.image, rendered.scene.K, estimator.parts, distances=(1.0, 3.0))
+    wrong = next(one for one in diagnose(case) if one.fix)
+    assert wrong.subject == "size"
+    assert "unit" in wrong.fix
+
+
+@pytest.mark.parametrize(
+    ("factor", "fix"), [(10, "--unit mm"), (1 / 25.4, "--unit inch"), (1.3, "--part")]
+)
+def test_a_mesh_of_another_size_is_named_before_all_else(estimator, factory, factor, fix):
+    mesh = replace(PART.mesh, vertices=factor * PART.mesh.vertices)
+    image, K = np.zeros((128, 128, 3), np.uint8), factory.scene(0, 0).K
+    case = Case(estimator, image, K, [replace(estimator.parts[0], mesh=mesh)])
+    wrong = next(one for one in diagnose(case) if one.fix)
+    assert wrong.subject == "part"
+    assert f"{factor:.3g} times" in wrong.sentence
+    assert fix in wrong.fix
+
+
+def test_a_checkpoint_of_an_earlier_version_is_diagnosed(factory):
+    network, checkpoint = load_network("pretrained/pivconnector")
+    checkpoint.seen.clear()
+    checkpoint.parts[0] = replace(checkpoint.parts[0], mesh=None)
+    rendered = factory.render(0, 0)
+    for image in (rendered.image, np.full_like(rendered.image, 90)):
+        case = Case(PoseEstimator(network, checkpoint), image, rendered.scene.K, checkpoint.parts)
+        findings = {one.subject: one for one in diagnose(case)}
+        assert "earlier version" in findings["size"].sentence
+        assert (findings["visibility"].fix == "") == (image is rendered.image)
+
+
+@pytest.mark.slow
+def test_the_faults_of_many_pictures_are_named(estimator, factory, empty):
+    """Each on forty pictures, as docs/doctor.md lists them."""
+    right = Counter()
+    for index in range(40):
+        rendered, without = factory.render(0, index), empty.render(0, index)
+        image, K = rendered.image, rendered.scene.K
+        small = factory.render(0, index, scale=0.4)
+        right["good"] += first(estimator, image, K) == ""
+        right["sharpness"] += first(estimator, defocus(image, 5.0), K) == "sharpness"
+        right["camera"] += first(estimator, image, longer(K, 2.0)) == "camera"
+        right["size"] += first(estimator, small.image, small.scene.K) == "size"
+        right["absent"] += first(estimator, without.image, without.scene.K) == "visibility"
+    assert min(right.values()) >= 34, right

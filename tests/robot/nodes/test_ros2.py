@@ -1,0 +1,99 @@
+"""The node of ROS 2: messages filled by their own types, and a camera in another process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_messages_are_filled_by_their_own_types():
+    pytest.importorskip("rclpy", reason="needs the extra ros2")
+    from dopepp.robot.nodes.messages import diagnosis, picture
+    from dopepp.robot.nodes.ros2 import native
+    from dopepp.robot.nodes.worker import Stamp
+
+    message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
+    told = native(message.kind, message.fields)
+    assert (told.header.stamp.sec, told.status[0].level) == (3, b"\x01")
+    assert told.status[0].values[0].value == "30"
+    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    filled = native("sensor_msgs/Image", picture(image, {}))
+    np.testing.assert_array_equal(np.frombuffer(filled.data, np.uint8).reshape(2, 4, 3), image)
+
+
+def test_parameters_change_while_it_runs(estimator, tmp_path):
+    rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
+    from rclpy.parameter import Parameter
+
+    from dopepp.robot.nodes.ros2 import _Node
+    from dopepp.robot.nodes.worker import Settings, Worker
+
+    params = tmp_path / "dope.yaml"
+    params.write_text("/**:\n  ros__parameters:\n    confidence: 0.25\n")
+    rclpy.init(args=["--ros-args", "--params-file", str(params)])
+    try:
+        worker = Worker(estimator)
+        node = _Node(worker, "/camera/image_raw", "dope_of_a_test")
+        assert worker.settings == Settings(confidence=0.25)
+        for value, taken in ((0.75, True), (7.0, False)):
+            (result,) = node.handle.set_parameters([Parameter("confidence", value=value)])
+            assert result.successful == taken
+        assert "a number from 0 to 1" in result.reason
+        assert worker.settings == Settings(confidence=0.75)
+        node.stop()
+    finally:
+        rclpy.try_shutdown()
+
+
+def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
+    rclpy = pytest.importorskip("rclpy", reason="needs the extra ros2")
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import qos_profile_sensor_data
+
+    from dopepp.robot.nodes.messages import picture
+    from dopepp.robot.nodes.ros2 import _Node, native
+    from dopepp.robot.nodes.worker import Worker
+
+    rclpy.init()
+    try:
+        node, camera = (
+            _Node(Worker(estimator), "/best", "dope_of_a_test"),
+            rclpy.create_node("camera"),
+        )
+        image = native("sensor_msgs/Image", picture(seen.pictures[0], {}))
+        publisher = camera.create_publisher(type(image), "/best", qos_profile_sensor_data)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node.handle)
+        for _ in range(100):
+            publisher.publish(image)
+            executor.spin_once(timeout_sec=0.1)
+            if node._pump.slot.received:
+                break
+        assert node._pump.slot.received
+        assert "best effort" in caplog.text
+        node.stop()
+    finally:
+        rclpy.try_shutdown()
+
+
+@pytest.mark.slow
+def test_no_picture_is_lost_between_two_processes_and_a_killed_node_starts_again():
+    pytest.importorskip("rclpy", reason="needs the extra ros2")
+    command = [sys.executable, str(ROOT / "benchmarks" / "node.py"), "--rate", "10"]
+    done = subprocess.run(
+        [*command, "--pictures", "50"], capture_output=True, text=True, timeout=280, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines() if line.startswith("| 50")]
+    assert len(rows) == 2
+    for row in rows:
+        sent, received, lost, _, answered, *_ = (float(one) for one in row)
+        assert (sent, received, lost) == (50, 50, 0)
+        assert answered > 0
+    assert "ended with 143" in done.stdout

@@ -1,0 +1,73 @@
+"""Launch files, parameters and layouts of the package name what there is."""
+
+import os
+import runpy
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import typer.main
+import yaml
+
+from dopepp.cli import app
+from dopepp.robot.nodes.messages import DIAGNOSTICS, Speaker
+from dopepp.robot.nodes.worker import Settings
+
+SHARE = Path(__file__).parents[3] / "dopepp" / "robot" / "nodes" / "share"
+
+
+def test_what_is_shipped_names_what_there_is(estimator):
+    topics = {f"/dope/{topic}" for topic, _ in Speaker(estimator.solid_parts).topics()}
+    topics.add(DIAGNOSTICS[0])
+    for name in ("dope.rviz", "dope.foxglove.json"):
+        content = yaml.safe_load((SHARE / name).read_text())
+        named = {one for one in words(content) if one.startswith("/")}
+        assert len(named) >= 2
+        assert {one.partition(".")[0] for one in named} <= topics
+    (parameters,) = yaml.safe_load((SHARE / "dope.yaml").read_text()).values()
+    Settings(**parameters["ros__parameters"])
+
+
+def test_the_launch_file_starts_the_command_with_options_it_has(monkeypatch):
+    """Of ``launch``, which is no wheel, what the file uses."""
+    seen = []
+    made = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {
+            "DeclareLaunchArgument": lambda name, **_: name,
+            "ExecuteProcess": lambda cmd, **_: seen.extend(cmd),
+        },
+        "launch.substitutions": {"LaunchConfiguration": lambda name: f"<{name}>"},
+    }
+    for name, content in made.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
+    declared = runpy.run_path(str(SHARE / "dope_launch.py"))["generate_launch_description"]()
+    assert seen[:4] == ["dopepp", "node", "<model>", "--ros2"]
+    assert {f"<{one}>" for one in declared[:-1]} == {one for one in seen if one[0] == "<"}
+    assert {one for one in seen if one.startswith("--")} <= options()
+
+
+def test_the_launch_file_of_ros_1_starts_it_too():
+    root = ElementTree.parse(SHARE / "dope.launch").getroot()
+    (node,) = root.iter("node")
+    assert os.access(SHARE / node.get("type"), os.X_OK)
+    assert ElementTree.parse(SHARE / "package.xml").find("name").text == node.get("pkg")
+    assert {one for one in node.get("args").split() if one.startswith("--")} <= options()
+    assert {one.get("name") for one in node.iter("param")} == set(vars(Settings()))
+
+
+def options():
+    command = typer.main.get_command(app).commands["node"]
+    return {text for one in command.params for text in one.opts}
+
+
+def words(content):
+    """Yield every text in nested lists and mappings."""
+    if isinstance(content, dict):
+        content = [*content, *content.values()]
+    if isinstance(content, list):
+        for one in content:
+            yield from words(one)
+    elif isinstance(content, str):
+        yield content
