@@ -1,20 +1,29 @@
 """The symmetries of the objects to learn: found, read from a file, or left out.
 
-A file is BOP's ``models_info.json``, or one entry of it, as ``dopepp symmetries`` prints.
+A file is BOP's ``models_info.json``, or one entry of it, as ``dopepp symmetries`` prints; a config
+may have such entries by name.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.models import ModelInfo, model_info, parse_models
+from dopepp.data.formats.bop.models import (
+    SYMMETRY_FIELDS,
+    Continuous,
+    Discrete,
+    ModelInfo,
+    model_info,
+    parse_models,
+    parse_symmetries,
+)
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Part
 from dopepp.parts.symmetry import TOLERANCE, find_symmetries
@@ -24,14 +33,15 @@ _log = logging.getLogger(__name__)
 AUTO: Final = "auto"
 NONE: Final = "none"
 
-_SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 
-
-def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
+def choose_symmetries(
+    parts: Sequence[Part], choice: str | Mapping[str, object] | None
+) -> list[Part]:
     """Give parts the symmetries that a user has chosen.
 
     The choice None leaves them as they are; ``none`` takes their symmetries away; ``auto`` finds
-    them on the mesh; anything else is a file that has them for every part, by name.
+    them on the mesh; another text is a file that has them for every part, by name. A mapping has
+    entries like that file's for some parts, by name; the others are left as they are.
     """
     if choice is None:
         return list(parts)
@@ -39,6 +49,9 @@ def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
         return [replace(part, symmetries_discrete=None, symmetries_continuous=()) for part in parts]
     if choice == AUTO:
         return [with_found_symmetries(part) for part in parts]
+    if isinstance(choice, Mapping):
+        given = {name: parse_symmetries(name, entry) for name, entry in choice.items()}
+        return [_with(part, *given[part.name]) if part.name in given else part for part in parts]
     infos = _read_infos(choice)
     for part in parts:
         if part.name not in infos:
@@ -47,9 +60,13 @@ def choose_symmetries(parts: Sequence[Part], choice: str | None) -> list[Part]:
                 f'add an entry with "name": "{part.name}"',
             )  # fmt: skip
     return [
-        replace(part, **{field: getattr(infos[part.name], field) for field in _SYMMETRY_FIELDS})
+        _with(part, infos[part.name].symmetries_discrete, infos[part.name].symmetries_continuous)
         for part in parts
     ]
+
+
+def _with(part: Part, discrete: Discrete | None, continuous: Continuous) -> Part:
+    return replace(part, symmetries_discrete=discrete, symmetries_continuous=continuous)
 
 
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
@@ -67,9 +84,10 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
         "%s: %d discrete symmetries and %d axes of continuous symmetry within %.3g mm",
         part.name, len(discrete), len(continuous), 1000 * tolerance * part.diameter,
     )  # fmt: skip
-    if part.mesh.texture is not None and (len(discrete) or continuous):
+    is_coloured = part.mesh.texture is not None or part.mesh.colours is not None
+    if is_coloured and (len(discrete) or continuous):
         _log.warning(
-            "%s has a texture, which is not looked at: a print that tells the sides apart "
+            "%s has colours, which are not looked at: a print that tells the sides apart "
             "leaves no symmetry", part.name,
         )  # fmt: skip
     found = discrete if len(discrete) else None
@@ -79,7 +97,7 @@ def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
 def describe_symmetries(path: Path | str, unit: str | None, tolerance: float) -> str:
     """Return the ``models_info.json`` entry of a mesh file or built-in part, as JSON."""
     entry = model_info(with_found_symmetries(load_part(path, unit), tolerance))
-    entry |= {field: entry.get(field, []) for field in _SYMMETRY_FIELDS}
+    entry |= {field: entry.get(field, []) for field in SYMMETRY_FIELDS}
     return json.dumps(entry, indent=2, ensure_ascii=False)
 
 

@@ -31,6 +31,7 @@ class Instance:
         visible_fraction: Visible share of the object's full silhouette, occlusion and truncation
             both counted, in [0, 1].
         mask: Visible pixels, or None where the source has none.
+        wanted: Whether the test set's list of targets names it; None where there is no list.
         masked_fraction: Share of the visible pixels that random mask local processing has covered;
             ``visible_fraction`` and ``mask`` are already reduced by it.
     """
@@ -41,6 +42,7 @@ class Instance:
     visible_fraction: float = 1.0
     mask: Mask | None = None
     masked_fraction: float = 0.0
+    wanted: bool | None = None
 
 
 @dataclass

@@ -84,7 +84,8 @@ def measure_and_record(
         conditions.SCALE.check_methods(methods)
     scaled = {one: build_scaled_test_source(data, parts, one) for one in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
-    measured = measure(methods, samples, num_pictures)
+    is_bop = data.root is not None and data.format in ("bop", "webdataset")
+    measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
     for file in files.values():
         file.check_used()
     reports = measured.reports
@@ -94,6 +95,8 @@ def measure_and_record(
     main.details.update(details or {})
     for report in reports:
         display.show_report(report, all_measures)
+        if report.name in measured.bop:
+            display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_silence(methods, measured.silent, source)
     if refines:
         main.refined, share = reports[-1], made_worse(main, reports[-1])
@@ -164,7 +167,7 @@ def _write_results(
     """Write every method's poses as a BOP challenge CSV."""
     dataset, split = data.name, "test"
     if data.root is not None and not data.is_rendered("test"):
-        dataset, split = data.root.resolve().name, data.image_sets["test"]
+        dataset, split = data.root.resolve().name, data.image_set("test")
     for method, found in poses.items():
         rows = [
             PoseResult(

@@ -112,6 +112,18 @@ def random_rotation(rng: np.random.Generator) -> RotationMatrix:
     return quaternion_to_matrix(rng.normal(size=4))
 
 
+def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Return the rotation nearest to each matrix, by the sum of squares (Umeyama 1991).
+
+    That is U diag(1, 1, det U·det V) Vᵀ of the singular value decomposition.
+    """
+    left, _, right = np.linalg.svd(matrices)
+    sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    scales = np.ones_like(matrices[..., 0])
+    scales[..., 2] = sign
+    return np.asarray((left * scales[..., None, :]) @ right)
+
+
 def is_rotation(rotation: RotationMatrix, tolerance: float = 1e-3) -> bool:
     """Tell whether a 3×3 matrix is finite, orthogonal within ``tolerance`` and right-handed."""
     rotation = np.asarray(rotation, np.float64)

@@ -85,6 +85,10 @@ class TruePose(Protocol):
     def visible_fraction(self) -> float:
         """Visible share of the full silhouette, in [0, 1]."""
 
+    @property
+    def wanted(self) -> bool | None:
+        """Whether a list of targets names it; None where there is no list."""
+
 
 def assign(
     centre: Vector, detections: Sequence[PredictedPose], instances: Sequence[TruePose]
@@ -113,7 +117,9 @@ def assign(
 
 
 def counted(instance: TruePose) -> bool:
-    """Tell whether enough of an instance is visible for it to count."""
+    """Tell whether an instance is a target or, without a list of these, visible enough."""
+    if instance.wanted is not None:
+        return instance.wanted
     return instance.visible_fraction >= MIN_VISIBLE_FRACTION
 
 
@@ -280,6 +286,8 @@ class Gathered:
         matched = int(errors.add.isfinite().sum())
         row.median_translation = finite_median(errors.translation)
         row.p90_translation = finite_p90(errors.translation)
+        near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)
+        row.pass_5cm_5deg = float(near.double().mean())
         row.miss_rate = 1 - matched / len(errors.add)
         row.precision = matched / max(matched + num_false, 1)
         row.false_positives = num_false

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dopepp.geometry.cuboid import CENTROID
-from dopepp.geometry.rotation import random_rotation
+from dopepp.geometry.rotation import nearest_rotation, random_rotation
 from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.row import PoseErrors, PoseRow, extreme_points, summarise, symmetries
 from dopepp.parts.part import Part
@@ -113,9 +113,7 @@ def _best_constant(
     rotations: Float[np.ndarray, "n 3 3"], points: Tensor, threshold: float
 ) -> Float[np.ndarray, "n 3 3"]:
     """Try every test rotation and their mean as the answer to all; equal rates go by mean ADD."""
-    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
-    # Nearest rotation to the mean (chordal L2): a reflection is turned at the smallest axis.
-    mean = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    mean = nearest_rotation(rotations.mean(axis=0))
     candidates = np.concatenate([rotations, mean[None]])
     Q = rotations.transpose(0, 2, 1)[None] @ candidates[:, None]
     guess = torch.from_numpy(Q.reshape(-1, 3, 3))

@@ -115,6 +115,10 @@ class PoseRow:
         pass_5cm: Share with ADD below 0.05 m.
         pass_10cm: Share with ADD below 0.1 m.
         auc_10cm: Exact area under the ADD accuracy-threshold curve up to 0.1 m.
+        add_or_s_01d: Share with ADD, of a part with symmetries ADD-S, below a tenth of the
+            diameter.
+        auc_or_s_10cm: Exact area under the curve of the same error up to 0.1 m.
+        pass_5cm_5deg: Share off by less than 0.05 m and, of the nearest symmetry, 5°.
         add_s_01d: Share with ADD-S below a tenth of the diameter.
         auc_s_10cm: Exact area under the ADD-S curve up to 0.1 m.
         median_rotation_deg: Over matched instances, degrees.
@@ -155,6 +159,9 @@ class PoseRow:
     ar_mssd: float | None = None
     ar_mspd: float | None = None
     median_rotation_s_deg: float | None = None
+    add_or_s_01d: float | None = None
+    auc_or_s_10cm: float | None = None
+    pass_5cm_5deg: float | None = None
     num_symmetries: int = 1
 
     def to_record(self) -> dict[str, str | int | float | None]:
@@ -201,6 +208,9 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("pass_5cm", "ADD<5cm %", 100, 1, "ADD"),
     Column("pass_10cm", "ADD<10cm %", 100, 1, "ADD"),
     Column("auc_10cm", "AUC[0,10cm] %", 100, 1, "ADD"),
+    Column("pass_5cm_5deg", "5 cm 5° %", 100, 1, "ADD"),
+    Column("add_or_s_01d", "ADD(-S)-0.1d %", 100, 1, "symmetry", symmetric=True),
+    Column("auc_or_s_10cm", "AUC(-S)[0,10cm] %", 100, 1, "symmetry", symmetric=True),
     Column("add_s_01d", "ADD-S-0.1d %", 100, 1, "symmetry", symmetric=True),
     Column("auc_s_10cm", "AUC-S[0,10cm] %", 100, 1, "symmetry", symmetric=True),
     Column("mssd_01d", "MSSD-0.1d %", 100, 1, "symmetry", symmetric=True),
@@ -234,6 +244,7 @@ def summarise(
 
     Symmetries count with the identity.
     """
+    add_or_s = errors.add_s if num_symmetries > 1 else errors.add
     return PoseRow(
         object=name,
         method=method,
@@ -252,6 +263,8 @@ def summarise(
         ar_mssd=average_recall(errors.mssd, [share * diameter for share in BOP_THRESHOLDS]),
         ar_mspd=None if errors.mspd is None else average_recall(errors.mspd, BOP_MSPD_THRESHOLDS),
         median_rotation_s_deg=finite_median(errors.rotation_s_deg),
+        add_or_s_01d=pass_rate(add_or_s, 0.1 * diameter),
+        auc_or_s_10cm=auc(add_or_s, 0.1),
         num_symmetries=num_symmetries,
     )
 

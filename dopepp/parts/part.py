@@ -22,6 +22,7 @@ from dopepp.geometry.symmetry import ContinuousSymmetry
 from dopepp.parts import record as fields
 from dopepp.parts.mesh.decimate import MAX_FACES, decimate
 from dopepp.parts.mesh.measure import (
+    Colours,
     Faces,
     Points,
     SurfaceTree,
@@ -54,12 +55,16 @@ class Mesh:
         faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
         uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
         texture: RGB texture image, uint8, first row on top; None for an untextured part.
+        colours: sRGB of each vertex, uint8; None where there are none, or a texture.
+        normals: Normal of each vertex as the file has it, of any length, not checked; None without.
     """
 
     vertices: Vertices
     faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
     texture: Picture | None = None
+    colours: Colours | None = None
+    normals: Float[np.ndarray, "vertices 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -217,8 +222,9 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
     """Return a mesh of at most ``MAX_FACES`` triangles, and the farthest move of a vertex."""
     if len(mesh.faces) <= MAX_FACES:
         return mesh, 0.0
+    values = mesh.uv if mesh.colours is None else mesh.colours.astype(np.float64)
     try:
-        vertices, faces, uv, moved = decimate(mesh.vertices, mesh.faces, mesh.uv)
+        vertices, faces, values, moved = decimate(mesh.vertices, mesh.faces, values)
     except ValueError as error:
         raise UserError(
             f"part {name!r}: {error}", f"up to {MAX_FACES} triangles", "reduce its triangles"
@@ -227,7 +233,10 @@ def _renderable(mesh: Mesh, name: str) -> tuple[Mesh, float]:
         "part %r: %d triangles decimated to %d to render; no point moved by more than %.2g mm",
         name, len(mesh.faces), len(faces), 1000 * moved,
     )  # fmt: skip
-    return Mesh(vertices, faces.astype(np.int32), uv, mesh.texture), moved
+    if mesh.colours is None or values is None:
+        return Mesh(vertices, faces.astype(np.int32), values, mesh.texture), moved
+    colours = np.rint(values).astype(np.uint8)
+    return Mesh(vertices, faces.astype(np.int32), colours=colours), moved
 
 
 def _check_diameter(diameter: float, name: str, unit: str) -> None:

@@ -52,7 +52,8 @@ class Material:
     """How a surface reflects light (Lambert plus GGX, metallic workflow).
 
     Attributes:
-        colour: Linear albedo in [0, 1] per channel; a factor on the texture where there is one.
+        colour: Linear albedo in [0, 1] per channel; a factor on a surface's own colours where it
+            has some.
         roughness: GGX roughness in (0, 1]; 1 is chalk.
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
         metallic: 0 is a dielectric, 1 a metal: no diffuse light, and the colour is its reflectance

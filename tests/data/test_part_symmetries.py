@@ -73,3 +73,32 @@ def test_a_round_part_has_its_axis_in_millimetres(tmp_path):
     assert axis["axis"] == pytest.approx([0, 0, 1], abs=1e-6)
     assert axis["offset"] == pytest.approx([0, 12, 0], abs=1e-3)
     assert len(entry["symmetries_discrete"]) == 1
+
+
+HALF_TURN = [-1, 0, 0, 10, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def test_entries_by_name_are_of_the_parts_they_name(stl):
+    part = load_part(stl, "mm")
+    entry = {"symmetries_discrete": [HALF_TURN]}
+    (given,) = choose_symmetries([part], {"block": entry, "absent": entry})
+    np.testing.assert_allclose(given.symmetries_discrete[0, :3, 3], [0.01, 0, 0])
+    assert choose_symmetries([given], {"other": entry}) == [given]
+    (round_part,) = choose_symmetries(
+        [given], {"block": {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}}
+    )
+    assert round_part.symmetries_discrete is None
+    assert round_part.symmetries_continuous == (((0, 0, 1), (0, 0, 0)),)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ([HALF_TURN], r"data.symmetries.block: .*symmetries_discrete and symmetries_continuous"),
+        ({"half_turns": 1}, r"data.symmetries.block: .*symmetries_discrete and"),
+        ({"symmetries_discrete": [[1] * 16]}, r"block: symmetries_discrete\[0\]: no rotation"),
+    ],
+)
+def test_entries_that_are_none_are_named(stl, entry, message):
+    with pytest.raises(UserError, match=message):
+        choose_symmetries([load_part(stl, "mm")], {"block": entry})

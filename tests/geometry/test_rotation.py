@@ -3,12 +3,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.rotation import (
     is_rotation,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
+    nearest_rotation,
     quaternion_to_matrix,
     random_rotation,
     rotation_angle,
@@ -118,3 +120,19 @@ def test_is_rotation():
     assert not is_rotation(1.01 * rotation)
     assert not is_rotation(np.full((3, 3), np.nan))
     assert not is_rotation(np.eye(4))
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_the_nearest_rotation_is_the_polar_factor(seed):
+    rng = np.random.default_rng(seed)
+    bent = random_rotation(rng) + rng.normal(scale=0.05, size=(4, 3, 3))
+    found = nearest_rotation(bent)
+    assert_allclose(found, [polar(one)[0] for one in bent], atol=1e-12)
+    # Of a mirror image, too, it is a rotation, and none beside it is nearer.
+    mirrored = -bent[0]
+    (nearest,) = nearest_rotation(mirrored[None])
+    assert is_rotation(nearest, 1e-9)
+    beside = Rotation.from_rotvec(rng.normal(scale=0.05, size=(50, 3))).as_matrix() @ nearest
+    distances = np.linalg.norm(beside - mirrored, axis=(1, 2))
+    assert (distances >= np.linalg.norm(nearest - mirrored)).all()

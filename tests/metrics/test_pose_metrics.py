@@ -84,6 +84,9 @@ def test_rows_agree_with_the_functions():
         auc_10cm=pytest.approx(auc(errors, 0.1), rel=1e-12),
         add_s_01d=pass_rate(errors_s, 0.012),
         auc_s_10cm=pytest.approx(auc(errors_s, 0.1), rel=1e-12),
+        add_or_s_01d=pass_rate(errors_s, 0.012),
+        auc_or_s_10cm=pytest.approx(auc(errors_s, 0.1), rel=1e-12),
+        pass_5cm_5deg=1.0,
         median_rotation_deg=pytest.approx(np.median(np.degrees(relative.magnitude())), rel=1e-9),
         median_translation=pytest.approx(np.median(np.linalg.norm(split[1] - split[3], axis=1))),
         p90_rotation_deg=pytest.approx(np.percentile(np.degrees(relative.magnitude()), 90)),
@@ -180,7 +183,8 @@ def test_all_missed_gives_zero_and_no_nan():
         metric.update([], [truth("box", pose())])
     row = metric.compute()["box"]
     zeros = ("add_01d", "add_005d", "add_002d", "pass_5cm", "pass_10cm", "auc_10cm", "add_s_01d",
-             "auc_s_10cm", "precision", "average_precision", "mssd_01d", "ar_mssd")  # fmt: skip
+             "auc_s_10cm", "precision", "average_precision", "mssd_01d", "ar_mssd",
+             "add_or_s_01d", "auc_or_s_10cm", "pass_5cm_5deg")  # fmt: skip
     expected = PoseRow("box", "estimate", 3, miss_rate=1.0, false_positives=0)
     assert row == replace(expected, **dict.fromkeys(zeros, 0.0))
 

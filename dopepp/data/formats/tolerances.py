@@ -1,9 +1,10 @@
 """What a pose, a camera and a box in the image must fulfil, in any layout.
 
-Tolerances: a rotation is orthogonal to 1e-3; what is visible of an object lies in the reprojected
-box within 8 px (released poses of YCB-Video sit up to 6 px off) or 5 % of the box's longer side; an
-object that is fully visible covers at least a third of that box in width or in height; the camera
-is 0.1 to 300 diameters away from an object, which no mix-up of mm and m leaves so.
+Tolerances: a rotation is orthogonal to 1e-3, BOP's to 1e-2; what is visible of an object lies in
+the reprojected box within 8 px (released poses of YCB-Video sit up to 6 px off) or 5 % of the box's
+longer side; an object that is fully visible covers at least a third of that box in width or in
+height; the camera is 0.1 to 300 diameters away from an object, which no mix-up of mm and m leaves
+so.
 """
 
 from __future__ import annotations
@@ -80,13 +81,14 @@ class Box(NamedTuple):
         return f"({self.left:.0f}, {self.top:.0f})–({self.right:.0f}, {self.bottom:.0f})"
 
 
-def rotation_problem(rotation: RotationMatrix) -> str | None:
+def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
     """Say why a matrix is no rotation, None where it is one or not known (NaN)."""
-    if is_rotation(rotation) or not np.isfinite(rotation).all():
+    if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     determinant = np.linalg.det(rotation)
-    return f"no rotation: R·Rᵀ off by {deviation:.2g} (allowed 1e-3), determinant {determinant:.3g}"
+    allowed = f"{deviation:.2g} (allowed {tolerance:.0e}), determinant {determinant:.3g}"
+    return f"no rotation: R·Rᵀ off by {allowed}"
 
 
 def translation_problem(translation: Vector, diameter: float | None) -> tuple[str, str] | None:

@@ -203,10 +203,11 @@ def _nested(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def _part_record(part: Part) -> dict[str, Any]:
-    """Describe a part by its name, its size and hashes of its shape and its texture."""
+    """Describe a part by its name, its size and hashes of its shape and its looks."""
     mesh = part.mesh
     appearance = hashlib.sha256()
-    for array in () if mesh is None else (mesh.uv, mesh.texture):
+    looks = () if mesh is None else (mesh.uv, mesh.texture, mesh.colours, mesh.normals)
+    for array in looks:
         if array is not None:
             appearance.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     return {

@@ -6,6 +6,9 @@ import logging
 from dataclasses import replace
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.experiment.build.sources import labelled_images
+from dopepp.experiment.config.data import LensConfig
 from dopepp.experiment.config.run import RunConfig
 from dopepp.parts.part import Parts
 
@@ -15,10 +18,12 @@ _log = logging.getLogger(__name__)
 def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     """Choose, where a camera is given, scale and input size by how large the parts appear in it.
 
+    Who learns from renders of a BOP data set's models and gives none has that of its pictures.
     What was chosen stands in the config as if it had been given, and the log says it. A
     :class:`UserError`: the parts are larger than the picture or too small in it, or a given input
     size has no room for them.
     """
+    config = _with_camera_of_pictures(config, parts)
     data, virtual = config.data, config.data.virtual
     view = virtual.view
     if view is None:
@@ -42,3 +47,38 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
     }
     seen = replace(data, input_size=size, virtual=replace(virtual, camera_scale=scale))
     return replace(config, plain=plain, data=seen)
+
+
+def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
+    """Return a config with the camera, and the distances, of the test's BOP pictures.
+
+    Only where renders alone are learned, those pictures are the test, and no camera is given.
+    """
+    data, virtual = config.data, config.data.virtual
+    rendered = data.real_fraction == 0 and data.format == "bop"
+    if not rendered or virtual.camera is not None or data.is_rendered("test"):
+        return config
+    source = labelled_images(data, parts, data.eval_seed, "test")
+    view = source.view() if isinstance(source, BopSource) else None
+    if view is None:
+        return config
+    (width, height), K, distance = view
+    if virtual.working_distance is None:
+        _log.info(
+            "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
+            "camera=FILE working_distance=[near,far] say it otherwise", source.name, *distance,
+        )  # fmt: skip
+    lens = LensConfig(
+        width=width, height=height,
+        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
+    )  # fmt: skip
+    chosen = replace(virtual, camera=lens, working_distance=virtual.working_distance or distance)
+    plain = {
+        **config.plain,
+        "virtual": {
+            **config.plain["virtual"],
+            "camera": vars(lens),
+            "working_distance": list(chosen.working_distance or ()),
+        },
+    }
+    return replace(config, plain=plain, data=replace(data, virtual=chosen))

@@ -115,8 +115,9 @@ def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
 
     In a camera of its own, these are windows; all others who measure take the whole pictures.
     """
-    if data.virtual.view is None or not data.is_rendered("val"):
-        return held_out_source(data, parts, "val")
+    source = held_out_source(data, parts, "val")
+    if data.virtual.view is None or not isinstance(source, RenderedSource):
+        return source
     factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
     return RenderedSource(factory, data.num_val, "val")
 
@@ -124,11 +125,21 @@ def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
     """Build the validation or the test images alone, at their native resolution.
 
-    They are labelled ones where there is a root, else a range of renders that no other uses.
+    They are labelled ones where there is a root, else a range of renders that no other uses; so
+    is validation where the labelled images show no object and all can be rendered, which the log
+    says.
     """
     if data.is_rendered(split):
         return held_out_renders(data, parts, split)
-    return labelled_images(data, parts, data.eval_seed, split)
+    labelled = labelled_images(data, parts, data.eval_seed, split)
+    seen = split == "test" or any(labelled.contains(part.name) for part in parts)
+    if seen or any(part.mesh is None for part in parts):
+        return labelled
+    _log.warning(
+        "%s shows none of %s: validation is on renders, as with data.image_sets.val=null",
+        labelled.name, ", ".join(part.name for part in parts),
+    )  # fmt: skip
+    return held_out_renders(data, parts, split)
 
 
 def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
@@ -204,7 +215,7 @@ def synthetic_companions(
     if data.root is None or data.format != "ycb_video":
         return None
     image_set = data.image_sets["train"]
-    if not read_image_set(data.root, image_set, "synthetic"):
+    if image_set is None or not read_image_set(data.root, image_set, "synthetic"):
         return None
     return YcbVideoSource(
         data.root, parts, image_set, "synthetic",
@@ -212,7 +223,7 @@ def synthetic_companions(
     )  # fmt: skip
 
 
-def share_of(image_sets: Mapping[str, str], split: Split) -> tuple[float, float]:
+def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
     """Return the range of its folder's images that a split takes, as fractions.
 
     A folder that several splits name is divided in order (training, validation, test): 80 % to
@@ -233,19 +244,19 @@ Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
 FORMATS: Final[dict[str, Opener]] = {
     # An image set of real frames, or the listed frames, the same for every split.
     "ycb_video": lambda data, root, parts, seed, split: YcbVideoSource(
-        root, parts, data.image_sets[split] if data.frames is None else None,
+        root, parts, data.image_set(split) if data.frames is None else None,
         frames=data.frames, seed=seed, read_depth=split == "test",
     ),
     "bop": lambda data, root, parts, seed, split: BopSource(
-        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
         targets=data.targets if split == "test" else None, read_depth=split == "test",
     ),
     "ndds": lambda data, root, parts, seed, split: NddsSource(
-        root / data.image_sets[split], parts, part_of=share_of(data.image_sets, split),
+        root / data.image_set(split), parts, part_of=share_of(data.image_sets, split),
         classes=data.classes, read_depth=split == "test",
     ),
     "webdataset": lambda data, root, parts, seed, split: WebdatasetSource(
-        root, parts, data.image_sets[split], part_of=share_of(data.image_sets, split),
+        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
         download_dir=data.download_dir, read_depth=split == "test",
     ),
 }  # fmt: skip

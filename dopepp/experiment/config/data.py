@@ -112,14 +112,16 @@ class DataConfig:
         objects: Objects of the root to learn; None takes the paper's five of YCB-Video, else all.
         parts: Built-in names or mesh files, without a root and for NDDS.
         unit: Of the mesh files: m, cm, mm or inch; None as :mod:`dopepp.parts.mesh` takes them.
-        symmetries: Of the objects: None as the data set states them, else ``none``, ``auto`` or a
-            file (:mod:`dopepp.data.part_symmetries`).
+        symmetries: Of the objects: None as the data set states them, else ``none``, ``auto``, a
+            file, or some objects' by name (:mod:`dopepp.data.part_symmetries`).
         real_fraction: Share of labelled images in an epoch.
         synthetic_fraction: Share of YCB-Video's own synthetic images in what is not labelled.
         frames: Frames of YCB-Video for training and test alike, instead of image sets.
         image_sets: What each split takes of the root, by ``train``, ``val`` and ``test``: an image
-            set of YCB-Video, of other formats a folder, which several splits may share.
-        targets: BOP's list of test images to use; None takes all.
+            set of YCB-Video, of other formats a folder, which several splits may share; None
+            renders the split.
+        targets: BOP's list of test images to use; None takes all, ``auto`` BOP's own list where
+            the root has it.
         classes: Class in NDDS files to part, where the names differ.
         download_dir: Where shards from URLs are kept; None downloads nothing.
         masking: Node of the random masks; without a target there are none.
@@ -145,11 +147,11 @@ class DataConfig:
     objects: tuple[str, ...] | None
     parts: tuple[str, ...]
     unit: str | None
-    symmetries: str | None = None
+    symmetries: str | Mapping[str, Any] | None = None
     real_fraction: Share
     synthetic_fraction: Share
     frames: tuple[str, ...] | None
-    image_sets: Mapping[str, str]
+    image_sets: Mapping[str, str | None]
     targets: str | None = None
     classes: Mapping[str, str] | None = None
     download_dir: str | None = None
@@ -193,7 +195,20 @@ class DataConfig:
 
     def is_rendered(self, split: Split) -> bool:
         """Tell whether a held-out split's images are renders."""
-        return self.root is None or (split == "test" and self.test.renderer is not None)
+        if self.root is None or (split == "test" and self.test.renderer is not None):
+            return True
+        return self.image_sets[split] is None
+
+    def image_set(self, split: Split) -> str:
+        """Return what a split takes of the root; a :class:`UserError` where that is nothing."""
+        chosen = self.image_sets[split]
+        if chosen is None:
+            raise UserError(
+                f"data.image_sets.{split}=null with data.real_fraction={self.real_fraction:g}",
+                f"data.image_sets.{split}=FOLDER, or data.real_fraction=0 for renders alone",
+                "set one of the two",
+            )
+        return chosen
 
 
 def chosen_data(data: Node | None, virtual: Node | None, stored: object, source: str) -> DataConfig:

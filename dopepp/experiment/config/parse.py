@@ -74,9 +74,9 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         check = check_integer if arguments[0] is int else check_number
         check(name, value, bounds.lowest, bounds.highest)
         return value  # as it was written: 1 stays an integer where any number is allowed
-    if origin in (Union, UnionType):  # X | None, or X | tuple[X, ...] | None
-        listed = isinstance(value, list | tuple) and len(arguments) > 2
-        return None if value is None else _value(arguments[listed], value, name)
+    if origin in (Union, UnionType):  # X | None, or X | tuple[X, ...] or a mapping | None
+        grouped = isinstance(value, list | tuple | Mapping) and len(arguments) > 2
+        return None if value is None else _value(arguments[grouped], value, name)
     if origin is Literal:
         if value not in arguments:
             raise UserError(f"{name}={value!r:.100}", ", ".join(arguments), "choose one of them")

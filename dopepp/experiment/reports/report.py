@@ -14,17 +14,27 @@ from jaxtyping import Float
 
 from dopepp.data.sample import Sample
 from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.pictures import DepthMap, Size
 from dopepp.drawing.sheet import Tile
 from dopepp.experiment.reports.evaluators import Cost, MeasuredPose, Method, image_id
 from dopepp.experiment.reports.tables import shown_rows
 from dopepp.experiment.runs.images import Fingerprint
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.metrics.localisation import BopScores, Localisation
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
+from dopepp.parts.part import Part
+from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
+from dopepp.virtual.scene import SceneObject
+from dopepp.virtual.surface import Surface, make_surface
 
 FULL_SIZE_COST: Final = "full_size_cost"
 """Key of the details that holds what a narrowed network costs at full width and size."""
+
+BOP: Final = "bop"
+"""Key of the details that holds BOP's scores."""
 
 _REFINED: Final = "refined"
 """Key of a record that holds that of the same poses refined."""
@@ -159,7 +169,8 @@ class Measured:
     """What came out of measuring methods: a report each, and pictures of the first images.
 
     ``poses`` is every pose of each method, ``metrics`` the accumulator of each; ``silent`` are the
-    numbers of the images with instances on which each found nothing.
+    numbers of the images with instances on which each found nothing, ``bop`` BOP's scores of each
+    where they were asked for and there are targets.
     """
 
     reports: list[Report]
@@ -167,12 +178,19 @@ class Measured:
     poses: dict[str, list[MeasuredPose]]
     metrics: dict[str, PoseMetrics]
     silent: dict[str, list[int]]
+    bop: dict[str, BopScores] = field(default_factory=dict)
 
 
 def measure(
-    methods: Mapping[str, Method], samples: Iterable[Sample], num_pictures: int = 12
+    methods: Mapping[str, Method],
+    samples: Iterable[Sample],
+    num_pictures: int = 12,
+    *,
+    bop: bool = False,
 ) -> Measured:
     """Run methods, the baseline first where there is one, over the same images at native size.
+
+    ``bop`` asks for BOP's scores as well.
 
     Returns a report per method, and pictures with the truth in green, the last method's predictions
     in yellow and those of the methods before it in blue (paper Fig. 14).
@@ -181,6 +199,8 @@ def measure(
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     poses_of: dict[str, list[MeasuredPose]] = {name: [] for name in methods}
     measured = Measured([], [], poses_of, metrics, {name: [] for name in methods})
+    draw = DepthDrawer().draw
+    localised = {name: Localisation(one.parts, draw) for name, one in methods.items() if bop}
     num_images = 0
     parts = {part.name: part for method in methods.values() for part in method.parts}
     seen = Fingerprint(list(parts.values()))
@@ -193,6 +213,8 @@ def measure(
             poses, taken = method.detect(sample, image)
             seconds[name] += [] if taken is None else [taken]
             metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            if bop:
+                localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
             if sample.instances and not poses:
                 measured.silent[name].append(index)
             measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
@@ -200,6 +222,8 @@ def measure(
             wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
         if len(measured.tiles) < num_pictures:
             measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
+    scores = {name: one.scores() for name, one in localised.items()}
+    measured.bop = {name: one for name, one in scores.items() if one is not None}
     measured.reports = [
         Report(
             name,
@@ -213,10 +237,29 @@ def measure(
             },
             diameters={part.name: float(part.diameter) for part in method.parts},
             test_set=seen.word(),
+            details={BOP: measured.bop[name].to_record()} if name in measured.bop else {},
         )
         for name, method in methods.items()
     ]
     return measured
+
+
+class DepthDrawer:
+    """Draws the depth of parts alone; each part's mesh is prepared once."""
+
+    def __init__(self) -> None:
+        self._surfaces: dict[str, Surface] = {}
+
+    def draw(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
+        """Return metres along z at pixel centres, 0 beside the part."""
+        assert part.mesh is not None
+        if part.name not in self._surfaces:
+            self._surfaces[part.name] = make_surface(part.mesh)
+        item = SceneObject(self._surfaces[part.name], T_cam_obj, part=part)
+        inverse, _ = draw_alone(item, project_object(item, K).hom, (0, 0, *size))
+        depth = np.zeros_like(inverse)
+        np.divide(1, inverse, out=depth, where=inverse > 0)
+        return depth
 
 
 def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:

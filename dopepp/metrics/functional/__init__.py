@@ -29,11 +29,13 @@ from dopepp.metrics.functional.rates import (
     pass_rate,
     wilson_interval,
 )
+from dopepp.metrics.functional.vsd import VSD_DELTA, vsd
 
 __all__ = [
     "BOP_MSPD_THRESHOLDS",
     "BOP_THRESHOLDS",
     "MATCH_DISTANCE",
+    "VSD_DELTA",
     "add",
     "add_s",
     "auc",
@@ -47,5 +49,6 @@ __all__ = [
     "reprojection_error",
     "rotation_error_deg",
     "translation_error",
+    "vsd",
     "wilson_interval",
 ]

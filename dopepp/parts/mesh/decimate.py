@@ -27,31 +27,32 @@ _WELL_USED: Final = 0.85
 def decimate(
     vertices: Vertices,
     faces: Faces,
-    uv: Float[np.ndarray, "vertices 2"] | None,
+    values: Float[np.ndarray, "vertices width"] | None,
     max_faces: int = MAX_FACES,
 ) -> tuple[
     Float[np.ndarray, "fewer 3"],
     Int[np.ndarray, "kept 3"],
-    Float[np.ndarray, "fewer 2"] | None,
+    Float[np.ndarray, "fewer width"] | None,
     float,
 ]:
     """Replace triangles by at most ``max_faces`` larger ones; return the farthest move, too.
 
-    All ``faces`` have an area. Vertices that share a position and a cell but no edge, such as those
-    on both sides of a seam, keep texture coordinates of their own. A ValueError: no grid leaves a
+    All ``faces`` have an area; ``values`` are the vertices' texture coordinates or colours.
+    Vertices that share a position and a cell but no edge, such as those on both sides of a seam,
+    keep values of their own. A ValueError: no grid leaves a
     triangle, because all of them are tiny and apart.
     """
     cells, kept = _cluster(vertices, faces, max_faces)
     placed = _place(vertices, faces, cells)
     moved = float(np.sqrt(np.square(placed[cells] - vertices).sum(axis=1).max()))
-    owners = cells if uv is None else _islands(faces, cells)
-    # One vertex per owner: its cell gives the position, the mean of its vertices the uv.
+    owners = cells if values is None else _islands(faces, cells)
+    # One vertex per owner: its cell gives the position, the mean of its vertices the values.
     used, index = np.unique(owners[faces[kept]], return_inverse=True)
     first = np.empty(int(owners.max()) + 1, np.int64)
     first[owners] = np.arange(len(owners))
-    if uv is not None:
-        uv = _means(uv, owners)[used]
-    return placed[cells[first[used]]], index.reshape(-1, 3), uv, moved
+    if values is not None:
+        values = _means(values, owners)[used]
+    return placed[cells[first[used]]], index.reshape(-1, 3), values, moved
 
 
 def _cluster(

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are used
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
 
 from dopepp.drawing.pictures import Picture
@@ -20,7 +20,8 @@ from dopepp.drawing.pictures import Picture
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
 Points = Float[np.ndarray, "points 3"]
-"""Positions of corners, triangles as indices of three of them, and positions of anything else."""
+Colours = UInt8[np.ndarray, "vertices 3"]
+"""Positions of corners, triangles as indices of three of them, positions of anything else, sRGB."""
 
 NUM_SURFACE_POINTS: Final = 2000
 """ADD points of a CAD part, a fixed number so that the results of two runs compare."""
@@ -45,13 +46,18 @@ _MANY_CAVITIES: Final = 1000
 
 
 class RawMesh(NamedTuple):
-    """What a format's reader returns: a file's triangles, in the unit that it states, if any."""
+    """What a format's reader returns: a file's triangles, in the unit that it states, if any.
+
+    Colours (sRGB) and normals are per vertex, as far as the file has them.
+    """
 
     vertices: Vertices
     faces: Faces
     uv: Float[np.ndarray, "vertices 2"] | None = None
     texture: Picture | None = None
     unit: str | None = None
+    colours: Colours | None = None
+    normals: Float[np.ndarray, "vertices 3"] | None = None
 
 
 def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:

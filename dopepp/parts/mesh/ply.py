@@ -10,6 +10,7 @@ triangles in another order, and a mesh's hash is what checkpoints and render cac
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -35,16 +36,22 @@ _MAX_HEADER_BYTES: Final = 100_000
 MAX_UNEVEN_ROWS: Final = 2_000_000
 """Rows with lists of different lengths are read one by one: seconds, and 0.5 GB, for so many."""
 
+COLOURS: Final = ("red", "green", "blue")
+NORMALS: Final = ("nx", "ny", "nz")
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-"""Names that programs give to a vertex's texture coordinates."""
+"""Names of a vertex's colour, of its normal and, several, of its texture coordinates."""
 
 
 class Column(NamedTuple):
-    """A property: its name, the type of its numbers and, of a list, that of its length."""
+    """A property: its name, the type of its numbers and, of a list, that of its length.
+
+    Numbers of a text are doubles, whatever type is ``declared``.
+    """
 
     name: str
     number: np.dtype[Any]
     length: np.dtype[Any] | None
+    declared: str
 
 
 class Element(NamedTuple):
@@ -60,11 +67,13 @@ Table = dict[str, NDArray[Any]]
 
 
 def read_ply(path: Path) -> RawMesh:
-    """Read a PLY file and the texture it names in a ``TextureFile`` comment.
+    """Read a PLY file with its vertices' colours and normals, and the texture that it names.
+
+    The texture stands in a ``TextureFile`` comment and takes the colours' place.
 
     A UserError: the texture is missing, damaged or outside of the folder. Other ValueErrors: the
-    file is damaged, has no vertices or faces, has a polygon that is not convex, or names several
-    textures, or one without texture coordinates per vertex.
+    file is damaged, has no vertices or faces, has a polygon that is not convex or a colour that is
+    none, or names several textures, or one without texture coordinates per vertex.
     """
     header, body = _split(path.read_bytes())
     lines = [line.split() for line in header.decode("utf-8", "surrogateescape").splitlines()]
@@ -85,13 +94,40 @@ def read_ply(path: Path) -> RawMesh:
         raise ValueError("a vertex index that is no integer")
     faces = corners[fans(vertices, corners, face[f"{list_name}#"].astype(np.int64))]
     names = [" ".join(words[2:]) for words in lines if words[:2] == ["comment", "TextureFile"]]
+    normals = _vectors(vertex, NORMALS)
     if not names:
-        return RawMesh(vertices, faces)
+        colours = _colours(vertex, elements)
+        return RawMesh(vertices, faces, colours=colours, normals=normals)
     pairs = [pair for pair in COORDINATES if {*pair} <= set(vertex)]
     if len(names) > 1 or not pairs:
         raise ValueError(f"{len(names)} textures, {'one set of' if pairs else 'no'} uv per vertex")
     uv = np.stack([vertex[axis] for axis in pairs[0]], axis=1).astype(np.float64)
-    return RawMesh(vertices, faces, uv, read_texture(companion_path(path, names[0], "TextureFile")))
+    texture = read_texture(companion_path(path, names[0], "TextureFile"))
+    return RawMesh(vertices, faces, uv, texture, normals=normals)
+
+
+def _vectors(vertex: Table, names: Sequence[str]) -> NDArray[np.float64] | None:
+    """Return a vertex property of several numbers, None where it is not there."""
+    if not {*names} <= set(vertex):
+        return None
+    return np.stack([vertex[name] for name in names], axis=1).astype(np.float64)
+
+
+def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | None:
+    """Return the vertices' colours, 0 – 255; None where there are none.
+
+    One grey everywhere counts as none: programs write it where nobody has chosen a colour.
+    """
+    values = _vectors(vertex, COLOURS)
+    if values is None or not len(values):
+        return None
+    columns = [column for one in elements if one.name == "vertex" for column in one.columns]
+    kinds = {column.declared for column in columns if column.name in COLOURS}
+    most = 1.0 if kinds <= {"float", "float32", "double", "float64"} else 255.0
+    if not ((values >= 0) & (values <= most)).all():
+        raise ValueError(f"a vertex colour that is not from 0 to {most:g}")
+    colours = np.rint(values * (255.0 / most)).astype(np.uint8)
+    return None if (colours == colours[0, 0]).all() else colours
 
 
 def _split(data: bytes) -> tuple[bytes, bytes]:
@@ -121,7 +157,7 @@ def _parse_header(lines: list[list[str]]) -> tuple[bool, list[Element]]:
             is_list = words[1] == "list"
             written = [order + TYPES[name] for name in words[2 if is_list else 1 : -1]]
             types = [np.dtype("<f8" if is_text else name) for name in written]
-            column = Column(words[-1], types[-1], types[0] if is_list else None)
+            column = Column(words[-1], types[-1], types[0] if is_list else None, words[-2])
             elements[-1].columns.append(column)
     for name, num_rows, columns in elements:
         names = [column.name for column in columns]
@@ -147,7 +183,7 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
     if start + num_rows * smallest > len(body):
         raise too_short
     fields: list[tuple[Any, ...]] = []
-    for name, number, length in columns:
+    for name, number, length, _ in columns:
         shape: tuple[int, ...] = ()
         if length is not None:
             place = start + np.dtype(fields).itemsize
@@ -166,7 +202,7 @@ def _read_table(body: bytes, start: int, element: Element) -> tuple[Table, int]:
     values: dict[str, list[bytes]] = {c.name: [] for c in columns}
     lengths: dict[str, list[int]] = {f"{c.name}#": [] for c in columns if c.length is not None}
     for _ in range(num_rows):
-        for name, number, length in columns:
+        for name, number, length, _ in columns:
             num_values = 1
             if length is not None:
                 num_values = _length(body, start, length)

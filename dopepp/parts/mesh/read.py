@@ -55,8 +55,8 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     ``unit`` is the file's: mm, cm, m or inch. None takes the one that a 3MF file states, metres for
     GLB, and millimetres for all others, which the log says. Duplicate STL vertices are merged, flat
     triangles dropped, triangles turned to face as their neighbours do. There are uv and texture
-    where an OBJ or PLY names a texture in its own folder or a GLB has one. Edges may be open, and
-    triangles may intersect each other.
+    where an OBJ or PLY names a texture in its own folder or a GLB has one, colours and normals
+    where a PLY has them. Edges may be open, and triangles may intersect each other.
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
@@ -146,7 +146,7 @@ def _read_points(path: Path) -> Points:
 
 def _checked(path: Path, raw: RawMesh) -> Mesh:
     """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
-    vertices, faces, uv, texture, _ = raw
+    vertices, faces, uv, texture, *_ = raw
     if not len(vertices) or not len(faces):
         raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
     for values in (vertices, uv):
@@ -169,6 +169,8 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
         faces=_outward(path, vertices, index.reshape(-1, 3)).astype(np.int32),
         uv=None if uv is None else np.asarray(uv, np.float64)[used],
         texture=texture,
+        colours=None if raw.colours is None else raw.colours[used],
+        normals=None if raw.normals is None else raw.normals[used],
     )
 
 

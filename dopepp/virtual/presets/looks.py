@@ -24,14 +24,14 @@ _GREY_CAST: Final = 0.05
 
 @dataclass(frozen=True)
 class Materials:
-    """Ranges of what surfaces are made of; a textured surface keeps its colours.
+    """Ranges of what surfaces are made of; a textured or coloured one keeps its colours.
 
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
         roughness: GGX roughness of dielectrics.
         specular: Their reflectance at normal incidence.
-        texture_gain: Factor on the colours of textured surfaces.
+        texture_gain: Factor on the colours of surfaces that have some.
         noise: Relative amplitude of the albedo's variation over an untextured surface.
         noise_pitch: Size of that variation over the object's radius.
         metal_albedo: Their reflectance at normal incidence.
@@ -81,7 +81,7 @@ class Materials:
     def draw(self, rng: Generator, surface: Surface) -> Material:
         """Draw what a surface is made of."""
         pitch = surface.radius * rng.uniform(*self.noise_pitch)
-        if len(surface.uv):
+        if surface.is_coloured:
             gain = rng.uniform(*self.texture_gain)
             roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
             return Material((gain, gain, gain), roughness, specular, noise_pitch=pitch)

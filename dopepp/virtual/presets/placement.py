@@ -12,7 +12,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.random import Generator
 
-from dopepp.core.checks import check_number
+from dopepp.core.checks import check_number, check_range
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, project
@@ -29,6 +29,9 @@ _FARTHEST: Final = 1000.0
 
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation that turns an object's +z face towards the camera, +x staying on the right."""
+
+
+_AXES: Final = ("x", "y", "z")
 
 
 class Turning(Protocol):
@@ -92,6 +95,51 @@ class FacingTurning:
         axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         turned = rotation_vector_to_matrix(np.array([0.0, 0.0, in_plane]))
         return np.asarray(turned @ rotation_vector_to_matrix(tilt * axis) @ FACING)
+
+
+@dataclass(frozen=True)
+class UprightTurning:
+    """The part stands, turned any way about the vertical, and a camera looks down at it.
+
+    ``R = R_z(roll) · R_(camera above the plane) · R_z(azimuth) · R_(up to z)``; elevation, roll and
+    azimuth are uniform.
+
+    Attributes:
+        up: The axis of the part's file that points upwards: x, y or z.
+        elevation_deg: Smallest and largest angle of the line of sight with the horizontal.
+        roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
+    """
+
+    up: str = "z"
+    elevation_deg: tuple[float, float] = (20.0, 85.0)
+    roll_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        if self.up not in _AXES:
+            raise UserError(f"up={self.up!r} of UprightTurning", ", ".join(_AXES), "name an axis")
+        check_range("elevation_deg", self.elevation_deg, -90.0, 90.0, "degrees", of=self)
+        check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
+
+    def draw(self, rng: Generator) -> RotationMatrix:
+        """Return a rotation from the object to the camera frame."""
+        elevation = np.radians(rng.uniform(*self.elevation_deg))
+        roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
+        azimuth = rng.uniform(0.0, 2 * np.pi)
+        rolled, turned = (
+            rotation_vector_to_matrix(np.array([0.0, 0.0, angle])) for angle in (roll, azimuth)
+        )
+        # Axes in a circle: a rotation that brings the one which points upwards to z.
+        standing = np.roll(np.eye(3), 2 - _AXES.index(self.up), axis=0)
+        return np.asarray(rolled @ looking_down(elevation) @ turned @ standing)
+
+
+def looking_down(elevation: float) -> RotationMatrix:
+    """Return the rotation from a frame whose z is up to a level camera that looks along its +y.
+
+    The elevation is the angle of the line of sight below the horizontal, radians.
+    """
+    sine, cosine = np.sin(elevation), np.cos(elevation)
+    return np.array([[1, 0, 0], [0, -sine, -cosine], [0, cosine, -sine]])
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from dopepp.virtual.presets.placement import (
     OffsetPlacement,
     Placement,
     Turning,
+    UprightTurning,
 )
 from dopepp.virtual.presets.table import Table
 from dopepp.virtual.sensor import Sensors
@@ -187,6 +188,13 @@ PRESETS: dict[str, Preset] = {
         Preset(
             "ycb", 640, 480, intrinsics_px=(1066.778, 1067.487, 312.9869, 241.3109),
             placement=DistancePlacement(), distractors=Distractors((0, 3)),
+        ),
+        # Objects that stand upright among others and hide each other, seen from above, as LM, LM-O,
+        # HB and a scanned part's own turntable show them.
+        Preset(
+            "upright", 640, 480, turning=UprightTurning(), placement=DistancePlacement(0.5, 1.5),
+            targets_per_image=(1, 4), min_visible_fraction=0.2,
+            distractors=Distractors((0, 4), image_share=(0.05, 0.3)),
         ),
         # Parts that lie on a table beside others, as a robot's wrist camera sees them.
         Preset(

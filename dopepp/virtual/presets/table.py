@@ -15,6 +15,7 @@ from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
+from dopepp.virtual.presets.placement import looking_down
 from dopepp.virtual.scene import Plane, triple
 
 
@@ -58,9 +59,8 @@ class Table:
         distance = rng.uniform(*self.distance)
         elevation = np.radians(rng.uniform(*self.elevation_deg))
         roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
-        sine, cosine = np.sin(elevation), np.cos(elevation)
-        level = np.array([[1, 0, 0], [0, -sine, -cosine], [0, cosine, -sine]])
-        rotation = rotation_vector_to_matrix(np.array([0.0, 0.0, roll])) @ level
+        rolled = rotation_vector_to_matrix(np.array([0.0, 0.0, roll]))
+        rotation = rolled @ looking_down(elevation)
         return make_transform(rotation, np.array([0.0, 0.0, distance]))
 
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -18,6 +18,7 @@ from dopepp.parts.mesh.measure import Faces, Points, Vertices
 from dopepp.parts.part import Mesh
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture
+from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
@@ -42,6 +43,7 @@ class Surface:
         normals: Unit normal of every face's corner, object frame, float32.
         patches: Number of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
+        colours: Linear albedo per vertex; shape (0, 3) without colours or with a texture.
         closed: Watertight with outward winding, so back faces can be dropped.
         hull: Extreme vertices that bound the mesh's image, object frame, metres.
         points: Points spread evenly over the surface, object frame, metres.
@@ -53,12 +55,18 @@ class Surface:
     normals: Float[np.ndarray, "faces 3 3"]
     patches: Int[np.ndarray, "faces"]
     uv: Float[np.ndarray, "uvs 2"]
+    colours: Float32[np.ndarray, "colours 3"]
     texture: Texture | None
     sky: OpenSky
     closed: bool
     hull: Float[np.ndarray, "hull 3"]
     points: Points
     spacing: float
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether it has colours of its own, from a texture or of its vertices."""
+        return self.texture is not None or len(self.colours) > 0
 
     @property
     def radius(self) -> float:
@@ -109,6 +117,8 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
     doubled = np.cross(edges[:, 0], edges[:, 1])
     length = np.linalg.norm(doubled, axis=1)
     normals = _corner_normals(merged, doubled, length, edges, crease_angle_deg)
+    if mesh.normals is not None:
+        _take_given(normals, mesh.normals[faces], doubled, length, crease_angle_deg)
     closed = _is_closed(merged, vertices[faces])
     uv, texture = np.zeros((0, 2), np.float32), None
     if mesh.uv is not None and mesh.texture is not None:
@@ -127,6 +137,9 @@ def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surf
         # Texture coordinates may differ where positions do not.
         patches=_smooth_patches(merged if texture is None else faces, normals, length > 0),
         uv=uv,
+        colours=np.zeros((0, 3), np.float32)
+        if mesh.colours is None or texture is not None
+        else SRGB_TO_LINEAR[mesh.colours],
         texture=texture,
         sky=bake_open_sky(vertices, faces, normals, closed),
         closed=closed,
@@ -208,6 +221,25 @@ def _corner_normals(
     cosine = float(np.cos(np.radians(crease_angle_deg)))
     _average_normals(face_normals, weights, offsets, corners, cosine, normals)
     return normals
+
+
+def _take_given(
+    normals: Float[np.ndarray, "faces 3 3"],
+    given: Float[np.ndarray, "faces 3 3"],
+    doubled: Float[np.ndarray, "faces 3"],
+    length: Float[np.ndarray, "faces"],
+    crease_angle_deg: float,
+) -> None:
+    """Put a file's normals at the corners where they can be the smooth surface's.
+
+    Files average them over sharp edges, too. There each of two faces that meet at more than the
+    crease angle is more than half of it away, and what was computed stays.
+    """
+    with np.errstate(all="ignore"):  # of what is zero, or not finite
+        unit = given / np.linalg.norm(given, axis=2, keepdims=True)
+        facing = np.einsum("fki,fi->fk", unit, doubled / np.maximum(length, 1e-300)[:, None])
+        near = facing >= math.cos(math.radians(crease_angle_deg / 2))
+    normals[near] = unit[near]
 
 
 @compiled()

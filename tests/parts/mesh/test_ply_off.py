@@ -243,3 +243,66 @@ def test_a_prism_of_hexagons_in_an_off_file(write, volume):
 )
 def test_a_damaged_off_file_is_named(refused, old, new, message):
     refused("a.off", off(QUADS).replace(old, new, 1), message)
+
+
+def coloured(form: str, kind: str, values: np.ndarray, normals: bool = False) -> bytes:
+    """A box whose vertices have colours of a kind, and normals."""
+    kinds = {"uchar": "B", "ushort": "H", "float": "f"}
+    names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    names += "".join(f"property float {name}\n" for name in ("nx", "ny", "nz")) if normals else ""
+    header = (
+        f"ply\nformat {form} 1.0\nelement vertex 8\nproperty float x\nproperty float y\n"
+        f"property float z\n{names}element face {len(TRIANGLES)}\n"
+        "property uchar red\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = []
+    for vertex, colour in zip(BOX.vertices, values, strict=True):
+        numbers = [*vertex, *colour, *(vertex if normals else ())]
+        rows.append((f"3f3{kinds[kind]}" + ("3f" if normals else ""), numbers))
+    rows += [("BB3i", [9, 3, *face]) for face in TRIANGLES]
+    if form == "ascii":
+        lines = (" ".join(f"{value:g}" for value in numbers) for _, numbers in rows)
+        return (header + "\n".join(lines) + "\n").encode()
+    whole = kind != "float"
+    packed = (
+        struct.pack(
+            FORMATS[form] + code,
+            *(int(v) if (whole and 3 <= i < 6) or code == "BB3i" else v for i, v in enumerate(row)),
+        )
+        for code, row in rows
+    )
+    return header.encode() + b"".join(packed)
+
+
+SHADES = np.arange(24).reshape(8, 3) * 10
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("float", 1 / 255)])
+def test_vertices_keep_colours_and_normals(form, kind, scale, tmp_path):
+    path = tmp_path / "box.ply"
+    path.write_bytes(coloured(form, kind, SHADES * scale, normals=True))
+    mesh = read_mesh(path, unit="mm")
+    np.testing.assert_array_equal(mesh.colours, SHADES)
+    np.testing.assert_allclose(mesh.normals, BOX.vertices)
+    assert mesh.texture is None
+
+
+def test_one_grey_everywhere_is_nobodys_choice_and_one_colour_is(tmp_path):
+    path = tmp_path / "box.ply"
+    for shade, expected in (((102, 102, 102), None), ((230, 175, 40), (230, 175, 40))):
+        path.write_bytes(coloured("ascii", "uchar", np.tile(shade, (8, 1))))
+        colours = read_mesh(path, unit="mm").colours
+        assert (None if colours is None else tuple(colours[3])) == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "shade", "most"), [("uchar", 256, "255"), ("float", 1.5, "1"), ("float", -0.1, "1")]
+)
+def test_what_is_no_colour_is_refused(kind, shade, most, tmp_path):
+    path = tmp_path / "box.ply"
+    values = np.zeros((8, 3))
+    values[5, 1] = shade
+    path.write_bytes(coloured("ascii", kind, values))
+    with pytest.raises(UserError, match=f"a vertex colour that is not from 0 to {most}"):
+        read_mesh(path, unit="mm")

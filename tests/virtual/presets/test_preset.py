@@ -10,13 +10,14 @@ from scipy.stats import kstest
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import project, resize_camera, transform
-from dopepp.geometry.rotation import random_rotation
+from dopepp.geometry.rotation import is_rotation, random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FillPlacement,
     OffsetPlacement,
+    UprightTurning,
     WorkingPlacement,
 )
 from dopepp.virtual.presets.preset import customised_preset
@@ -361,7 +362,7 @@ def test_wrong_changes_are_refused_in_one_line(changes, message):
 
 def test_unknown_presets_are_refused():
     with pytest.raises(
-        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, table, bin"
+        UserError, match="'shelf'; allowed: paper, quickstart, wide, ycb, upright, table, bin"
     ):
         customised_preset("shelf", {})
 
@@ -385,3 +386,26 @@ def test_any_plain_value_is_taken_or_refused(field, value):
     except UserError:
         return
     assert type(preset) is type(PRESETS["paper"])
+
+
+@pytest.mark.parametrize(("up", "axis"), [("x", 0), ("y", 1), ("z", 2)])
+def test_upright_parts_stand_and_the_camera_looks_down(up, axis):
+    turning = UprightTurning(up=up, elevation_deg=(20, 70), roll_deg=30)
+    rng = np.random.default_rng(1)
+    rotations = np.array([turning.draw(rng) for _ in range(2000)])
+    assert all(is_rotation(one, 1e-9) for one in rotations)
+    # Where the camera is, in the part's frame; its height above the horizon is the elevation.
+    towards = -rotations[:, 2]
+    height = np.degrees(np.arcsin(towards[:, axis]))
+    assert kstest(height, "uniform", (20, 50)).pvalue > 1e-3
+    around = np.arctan2(towards[:, axis - 1], towards[:, axis - 2])
+    assert kstest(around, "uniform", (-np.pi, 2 * np.pi)).pvalue > 1e-3
+    # The part's own vertical in the image, from straight up.
+    vertical = rotations[:, :, axis]
+    roll = np.degrees(np.arctan2(vertical[:, 0], -vertical[:, 1]))
+    assert kstest(roll, "uniform", (-30, 60)).pvalue > 1e-3
+
+
+def test_an_upright_part_needs_an_axis():
+    with pytest.raises(UserError, match="up='w' of UprightTurning; allowed: x, y, z"):
+        customised_preset("upright", {"turning": {"up": "w"}})

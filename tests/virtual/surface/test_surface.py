@@ -82,3 +82,19 @@ def test_faces_without_area_change_nothing(sheet):
         surface = make_surface(replace(mesh, faces=faces))
     assert np.isfinite(surface.normals).all()
     np.testing.assert_array_equal(surface.normals[:2], make_surface(mesh).normals)
+
+
+def test_a_files_normals_count_where_they_can_be_the_surfaces():
+    # Eight corners of a box: their normals, averaged over three sides, are nobody's.
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    mesh = Mesh(box.vertices, box.faces.astype(np.int32))
+    given = replace(mesh, normals=np.asarray(box.vertex_normals))
+    np.testing.assert_array_equal(make_surface(given).normals, make_surface(mesh).normals)
+    ball = trimesh.creation.icosphere(3, 0.05)
+    normals = ball.vertices * 1000.0  # of any length; one unknown, one zero
+    normals[0], normals[1] = np.nan, 0
+    surface = make_surface(Mesh(ball.vertices, ball.faces.astype(np.int32), normals=normals))
+    exact = ball.vertices[ball.faces] / 0.05
+    known = ball.faces > 1
+    np.testing.assert_allclose(surface.normals[known], exact[known], atol=1e-6)
+    np.testing.assert_allclose(surface.normals[~known], exact[~known], atol=0.03)

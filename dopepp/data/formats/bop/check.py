@@ -1,8 +1,9 @@
 """Check BOP's scenewise layout: a data set, one of its splits, or a single scene.
 
-What is optional in BOP (depth, masks, ``scene_gt_info.json``) must be there for every image of a
-scene as soon as it is there for one. A scene without ``scene_gt.json`` is noted: data sets keep the
-ground truth of their tests private.
+What is optional in BOP (depth, masks) must be there for every image of a scene as soon as it is
+there for one. Noted are a scene without ``scene_gt.json`` (data sets keep the ground truth of
+their tests private), images without ``scene_gt_info.json``, objects without a model and inexact
+rotations.
 """
 
 from __future__ import annotations
@@ -13,7 +14,13 @@ from typing import Final
 
 from dopepp.data.formats import STAGING, staged_items
 from dopepp.data.formats.bop import records as bop
-from dopepp.data.formats.bop.check_image import Models, ReadMask, check_image, load_models
+from dopepp.data.formats.bop.check_image import (
+    Models,
+    Oddities,
+    ReadMask,
+    check_image,
+    load_models,
+)
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
 from dopepp.data.formats.problems import CheckReport, Place, picture_shape
 from dopepp.drawing.pictures import Mask, Shape
@@ -52,6 +59,7 @@ class _Scene:
 
     def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
         self._report, self._folder, self._models = report, folder, models
+        self._oddities = Oddities()
         self._camera_path, self._truth_path, self._info_path = (
             folder / name for name in _SCENE_FILES
         )
@@ -71,6 +79,7 @@ class _Scene:
                     self._report.report(path, str(image), "missing")
             self._check_image(image)
             self._report.count_image()
+        self._oddities.note(self._report, self._folder)
         for name, found in (("depth", self._depths), (_SCENE_FILES[2], infos)):
             for image in sorted(found.keys() - set(images)):
                 self._report.report(self._folder / name, str(image), "no such image in the scene")
@@ -94,21 +103,24 @@ class _Scene:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
             one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)
         truths = records.truths.get(image, [])
+        infos = records.infos.get(image, [None] * len(truths))
+        self._oddities.without_info += bool(infos) and all(info is None for info in infos)
 
         def places(what: str, number: int) -> Place:
             place = Place(report, folder / f"scene_{what}.json")[f"{image}"]
             return place if what == "camera" else place[number]
 
-        check_image(
+        poses = check_image(
             places,
             records.cameras.get(image),
             truths,
-            records.infos.get(image, [None] * len(truths)),
+            infos,
             shape,
             bool(self._depths),
             self._models,
             self._read_mask(image, len(truths), shape),
         )
+        self._oddities.count(poses, self._models)
 
     def _read_mask(self, image: int, count: int, shape: Shape | None) -> ReadMask:
         """Read an image's masks one by one; those of objects that are not there are defects."""

@@ -7,8 +7,9 @@ several of them, or at pixels, can tell.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +18,17 @@ from jaxtyping import Float
 
 from dopepp.data.formats import tolerances
 from dopepp.data.formats.bop.models import INFO_FILE, info_path, parse_models
-from dopepp.data.formats.bop.records import MM, Places, Record, is_number, read_cameras, read_poses
+from dopepp.data.formats.bop.records import (
+    INEXACT,
+    MM,
+    BopPoses,
+    Places,
+    Record,
+    is_number,
+    objects_without_model,
+    read_cameras,
+    read_poses,
+)
 from dopepp.data.formats.problems import CheckReport, Place, mapping
 from dopepp.data.formats.tolerances import DIAMETERS_MM, Box
 from dopepp.drawing.pictures import Mask, Shape
@@ -46,6 +57,38 @@ class Model:
 
 
 Models = dict[int, Model]
+
+
+@dataclass
+class Oddities:
+    """What is no defect, because every reader copes with it, and worth a line: counts."""
+
+    inexact: int = 0
+    without_info: int = 0
+    without_model: Counter[int] = field(default_factory=Counter)
+
+    def count(self, poses: BopPoses, models: Models | None) -> None:
+        """Count what an image's annotation has of it."""
+        self.inexact += int(poses.inexact.sum())
+        self.without_model += objects_without_model(poses, models or ())
+
+    def note(self, report: CheckReport, where: Path | str) -> None:
+        """Say what there was, and how it is taken."""
+        if self.inexact:
+            report.note(
+                f"{where}: {self.inexact:,} rotations are orthogonal to {INEXACT:g} only; the "
+                "nearest rotation is taken"
+            )
+        if self.without_info:
+            report.note(
+                f"{where}: {self.without_info:,} images without scene_gt_info.json; how much of "
+                "their objects is visible is estimated"
+            )
+        for number, count in sorted(self.without_model.items()):
+            report.note(
+                f"{where}: object {number} is annotated {count:,} times and has no model; it is "
+                "left out"
+            )
 
 
 ReadMask = Callable[[str, int], Mask | None]
@@ -106,8 +149,8 @@ def check_image(
     has_depth: bool,
     models: Models | None,
     read_mask: ReadMask,
-) -> None:
-    """Check camera, poses, boxes, counts and masks.
+) -> BopPoses:
+    """Check camera, poses, boxes, counts and masks; return the poses.
 
     ``shape`` is the image's (height, width), None where it cannot be read; ``has_depth`` tells
     whether its depth must have a scale.
@@ -117,7 +160,7 @@ def check_image(
     for n, info in enumerate(infos):
         place, T_cam_obj, stated = places("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
         fraction = None if np.isnan(stated) else float(stated)
-        model = _find_model(place["obj_id"], int(poses.obj_ids[n]), models)
+        model = (models or {}).get(int(poses.obj_ids[n]), Model())
         problem = tolerances.translation_problem(T_cam_obj[:3, 3], model.diameter)
         if problem is not None:
             place["cam_t_m2c"][problem[0]].report(problem[1])
@@ -135,6 +178,7 @@ def check_image(
             apart = tolerances.box_problem(transform(T_cam_obj, model.corners), K, seen, fraction)
             if apart is not None:
                 place["box"].report(apart)
+    return poses
 
 
 def _check_camera(
@@ -151,17 +195,6 @@ def _check_camera(
         return K
     place["cam_K"].report(problem)
     return None
-
-
-def _find_model(place: Place, obj_id: int, models: Models | None) -> Model:
-    if models is None or obj_id < 0:  # which the reader has reported
-        return Model()
-    if obj_id in models:
-        return models[obj_id]
-    listed = sorted(models)
-    few = ", ".join(map(str, listed[:10])) + (", …" if len(listed) > 10 else "")
-    place.report(f"unknown object {obj_id}; {INFO_FILE} has {few}")
-    return Model()
 
 
 def _check_counts(

@@ -10,7 +10,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +36,12 @@ MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 
 INFO_FILE: Final = "models_info.json"
 
+SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
+
+Discrete = Float[np.ndarray, "symmetries 4 4"]
+Continuous = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
+"""Rigid transforms without the identity, and (axis, offset) pairs; metres."""
+
 _ALLOWED: Final = 'objects by number, each once: {"1": {"diameter": …}, …}'
 
 _DIAMETER_TOLERANCE: Final = 0.01
@@ -55,14 +61,14 @@ class ModelInfo:
     name: str
     path: Path
     diameter: float
-    symmetries_discrete: Float[np.ndarray, "symmetries 4 4"] | None
-    symmetries_continuous: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
+    symmetries_discrete: Discrete | None
+    symmetries_continuous: Continuous
 
 
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
     """Make parts from a BOP data set's models, with their symmetries.
 
-    ``objects`` are names in the order wanted; None takes all, by number.
+    ``objects`` are names in the order wanted; None takes all whose file is there, by number.
     """
     infos = read_models(Path(root))
     if not infos:
@@ -72,7 +78,11 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
             "check data.root, or unpack the data set's models into it",
         )
     by_name = {info.name: info for info in infos.values()}
-    wanted = list(by_name) if objects is None else objects
+    wanted = list(objects or by_name)
+    absent = [name for name in wanted if objects is None and not by_name[name].path.is_file()]
+    if 0 < len(absent) < len(wanted):
+        _log.warning("%s: left out models without a file: %s", root, ", ".join(absent))
+        wanted = [name for name in wanted if name not in absent]
     for name in wanted:
         if name not in by_name:
             raise UserError(
@@ -167,7 +177,22 @@ def _info(place: Place, model: Path, record: object) -> ModelInfo:
     )
 
 
-def _discrete(place: Place, value: object) -> Float[np.ndarray, "symmetries 4 4"] | None:
+def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Continuous]:
+    """Return the symmetries of an entry like ``models_info.json``'s, given for a part by name.
+
+    A UserError: there is no such entry, or one is no rigid transform or no axis.
+    """
+    place = Place(STRICT, f"data.symmetries.{name}")
+    if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
+        place.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as BOP has them")
+    entry = mapping(fields)
+    return (
+        _discrete(place[SYMMETRY_FIELDS[0]], entry.get(SYMMETRY_FIELDS[0])),
+        _continuous(place[SYMMETRY_FIELDS[1]], entry.get(SYMMETRY_FIELDS[1])),
+    )
+
+
+def _discrete(place: Place, value: object) -> Discrete | None:
     transforms = []
     for number, row in enumerate(_rows(place, value)):
         matrix = place[number].numbers(row, 4, 4)
@@ -183,9 +208,7 @@ def _discrete(place: Place, value: object) -> Float[np.ndarray, "symmetries 4 4"
     return np.array(transforms) if transforms else None
 
 
-def _continuous(
-    place: Place, value: object
-) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+def _continuous(place: Place, value: object) -> Continuous:
     pairs = []
     for number, row in enumerate(place.entries(_rows(place, value))):
         axis, offset = (
@@ -272,7 +295,12 @@ def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
     if textured:
         names += ["texture_u", "texture_v"]
         columns.append(np.asarray(mesh.uv))
-    vertices = np.hstack(columns).astype("<f4")
+    shade = 0 if mesh.colours is None else 3
+    values = np.hstack(columns).astype("<f4")
+    vertices = np.empty(len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", shade)])
+    vertices["numbers"] = values
+    if mesh.colours is not None:
+        vertices["colour"] = mesh.colours
     faces: NDArray[Any] = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
     header = [
@@ -281,6 +309,7 @@ def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
         *([f"comment TextureFile {texture_name}"] if textured else []),
         f"element vertex {len(vertices)}",
         *(f"property float {name}" for name in names),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")[:shade]),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Sequence
+from math import ceil, floor
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Int
@@ -19,31 +22,54 @@ from dopepp.core.json import read_json
 from dopepp.data.formats import share
 from dopepp.data.formats.bop import records as bop
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.formats.bop.models import parts_by_id
+from dopepp.data.formats.bop.models import parts_by_id, read_models
 from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.drawing.pictures import DepthMap, Mask, Shape, read_content
-from dopepp.geometry.camera import CameraMatrix, check_camera
+from dopepp.drawing.pictures import DepthMap, Mask, Shape, Size, read_content
+from dopepp.geometry.camera import CameraMatrix, check_camera, transform
+from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
 
 
-def read_targets(path: Path) -> set[tuple[int, int]]:
-    """Return (scene, image) of every target of a file like ``test_targets_bop19.json``."""
+Targets = dict[tuple[int, int], Counter[int] | None]
+"""By scene and image, how many instances of each object are to be found; None for all there are."""
+
+TARGETS_FILE: Final = "test_targets_bop19.json"
+"""BOP's own list."""
+
+AUTO: Final = "auto"
+"""Of targets: :data:`TARGETS_FILE` of a split like ``test_primesense`` where it is there."""
+
+
+def read_targets(path: Path) -> Targets:
+    """Return the targets of a file like ``test_targets_bop19.json``.
+
+    A UserError: it is no such list, or a target lacks one of ``scene_id``, ``im_id`` and, where it
+    has an ``obj_id``, ``inst_count``.
+    """
     records = read_json(path)
     if not isinstance(records, list) or not records:
         raise UserError(f"{path}", "a list of targets", "download the file again")
-    images = set()
+    targets: Targets = {}
     for number, record in enumerate(records):
         fields = record if isinstance(record, dict) else {}
-        pair = fields.get("scene_id"), fields.get("im_id")
-        if type(pair[0]) is not int or type(pair[1]) is not int:
+        names = ["scene_id", "im_id"] + ["obj_id", "inst_count"] * ("obj_id" in fields)
+        values: list[Any] = [fields.get(name) for name in names]
+        if not all(type(value) is int and 0 <= value < 10**9 for value in values):
             raise UserError(
-                f"{path}: target {number} with scene_id and im_id {pair}", "two whole numbers",
+                f"{path}: target {number} with {' and '.join(names)} {tuple(values)}",
+                "whole numbers from 0",
                 "download the file again",
-            )  # fmt: skip
-        images.add((pair[0], pair[1]))
-    return images
+            )
+        scene, image, *counted = values
+        if counted:
+            asked = targets.setdefault((scene, image), Counter())
+            if asked is not None:
+                asked[counted[0]] += counted[1]
+        else:
+            targets[scene, image] = None
+    return targets
 
 
 class BopSource:
@@ -58,7 +84,9 @@ class BopSource:
     Args:
         parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
         split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
-        targets: File in ``root`` that selects images, e.g. ``test_targets_bop19.json``.
+        targets: File in ``root`` that selects images and, in them, so many instances of an object,
+            the most visible ones, e.g. ``test_targets_bop19.json``; ``auto`` takes that one where
+            it is there.
         part_of: Consecutive share of the images to take, as (first, last) fractions: disjoint
             shares of one folder serve training, validation and test.
     """
@@ -81,8 +109,13 @@ class BopSource:
                 f"{self.root / split}, which has no scene", "folders 000000, 000001, …",
                 "unpack the data set's images into it",
             )  # fmt: skip
-        self._scenes = [bop.read_scene(folder, set(self._parts)) for folder in folders]
-        items = self._present(None if targets is None else read_targets(self.root / targets))
+        modelled = read_models(self.root)
+        self._scenes = [bop.read_scene(folder, set(self._parts), modelled) for folder in folders]
+        if targets == AUTO:
+            is_there = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
+            targets = TARGETS_FILE if is_there else None
+        self._targets = None if targets is None else read_targets(self.root / targets)
+        items = self._present(self._targets)
         self._items = items[share(len(items), part_of, self.name)]
         other = sum(scene.num_other for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
@@ -92,8 +125,25 @@ class BopSource:
                 "%s: left out %s objects that are none of the parts and %s behind the camera",
                 self.name, f"{other:,}", f"{behind:,}",
             )  # fmt: skip
+        self._tell_oddities()
 
-    def _present(self, targets: set[tuple[int, int]] | None) -> Int[np.ndarray, "items 2"]:
+    def _tell_oddities(self) -> None:
+        """Say once what of the annotation is not as it should be, and how it is taken."""
+        inexact = sum(int(scene.poses.inexact.sum()) for scene in self._scenes)
+        if inexact:
+            _log.warning(
+                "%s: %s rotations are orthogonal to %g only; the nearest are taken",
+                self.name, f"{inexact:,}", bop.INEXACT,
+            )  # fmt: skip
+        without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
+        if without:
+            listed = ", ".join(f"{number} ({count:,})" for number, count in sorted(without.items()))
+            _log.warning("%s: left out objects without a model: %s", self.name, listed)
+        fractions = np.concatenate([scene.poses.visible_fractions for scene in self._scenes])
+        if unknown := int(np.isnan(fractions).sum()):
+            _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
+
+    def _present(self, targets: Targets | None) -> Int[np.ndarray, "items 2"]:
         """Return (scene, row) of the images that are selected and on disk, in order."""
         listed = [
             (number, row)
@@ -128,9 +178,22 @@ class BopSource:
         where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
         K = check_camera(scene.K[row], (shape[1], shape[0]), where)
         instances = [self._instance(scene, k, path.stem, K, shape) for k in scene.objects(int(row))]
+        if self._targets is not None:
+            asked = self._targets[int(scene.folder.name), int(scene.image_ids[row])]
+            self._mark_wanted(instances, asked)
         depth = self._depth(scene, int(row), path.stem, shape) if self._read_depth else None
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
+
+    def _mark_wanted(self, instances: list[Instance], asked: Counter[int] | None) -> None:
+        """Mark the targets among an image's instances: of each object the most visible ones."""
+        if asked is None:
+            return
+        names = {part.name: number for number, part in self._parts.items()}
+        left = Counter(asked)
+        for one in sorted(instances, key=lambda one: -one.visible_fraction):
+            one.wanted = left[names[one.label]] > 0
+            left[names[one.label]] -= 1
 
     def _instance(
         self, scene: bop.SceneFolder, k: int, stem: str, K: CameraMatrix, shape: Shape
@@ -152,6 +215,22 @@ class BopSource:
         path = next((path for path in paths if path.exists()), paths[0])
         scale = float(scene.depth_scales[row])
         return decode_depth(read_content(path), str(path), scale, shape)
+
+    def view(self) -> tuple[Size, CameraMatrix, tuple[float, float]] | None:
+        """Return the first picture's (width, height) and K, pixels, and how far objects are.
+
+        That is the nearest and the farthest depth of a cuboid's centre over all pictures, metres,
+        rounded outwards to centimetres; None where no object is annotated.
+        """
+        depths = [
+            float(transform(T_cam_obj, self._parts[int(number)].cuboid[[CENTROID]])[0, 2])
+            for scene in self._scenes
+            for number, T_cam_obj in zip(scene.poses.obj_ids, scene.poses.T_cam_obj, strict=True)
+        ]
+        if not depths:
+            return None
+        first = self.sample(0)
+        return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
 
     def contains(self, label: str) -> bool:
         """Tell whether an image holds this object."""

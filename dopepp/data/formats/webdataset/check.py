@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.check_image import Models, check_image, load_models
+from dopepp.data.formats.bop.check_image import Models, Oddities, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
+from dopepp.data.formats.bop.records import BopPoses
 from dopepp.data.formats.problems import CheckReport, Place, picture_shape
 from dopepp.data.formats.webdataset import shards
 from dopepp.data.formats.webdataset.source import ShardRecords
@@ -38,15 +39,17 @@ def check_webdataset(report: CheckReport) -> None:
     models = load_models(report, (report.root, *report.root.resolve().parents[:1]))
     seen: dict[Path, dict[str, str]] = {}
     for path in shard_paths(report.root):
-        keys = seen.setdefault(path.parent, {})
+        keys, oddities = seen.setdefault(path.parent, {}), Oddities()
         for key, group in groupby(shards.members(path, report), key=lambda member: member.key):
             if key in keys:
                 same = keys[key] == path.name
                 got = "its members are not together" if same else f"also in {keys[key]}"
                 report.report(f"{path}/{key}", "key", got)
             keys[key] = path.name
-            _check_image(report, f"{path}/{key}", _content(report, path, group), models)
+            content = _content(report, path, group)
+            oddities.count(_check_image(report, f"{path}/{key}", content, models), models)
             report.count_image()
+        oddities.note(report, path)
         staged = len(list((path.parent / STAGING).glob("**/[0-9]*.tar")))
         if staged:
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
@@ -77,8 +80,10 @@ def _content(report: CheckReport, path: Path, group: Iterator[shards.TarMember])
     return content
 
 
-def _check_image(report: CheckReport, start: str, content: Content, models: Models | None) -> None:
-    """Check the members of one key."""
+def _check_image(
+    report: CheckReport, start: str, content: Content, models: Models | None
+) -> BopPoses:
+    """Check the members of one key; return its poses."""
     names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
     if "image" in names:
@@ -102,4 +107,4 @@ def _check_image(report: CheckReport, start: str, content: Content, models: Mode
         return records.mask(name, number, shape) if shape and name in known else None
 
     has_depth = "depth" in names
-    check_image(records.places, camera, truths, infos, shape, has_depth, models, read_mask)
+    return check_image(records.places, camera, truths, infos, shape, has_depth, models, read_mask)

@@ -7,6 +7,7 @@ Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.j
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -26,6 +27,8 @@ from dopepp.data.sample import Sample, SourceInfo
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import check_camera
 from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
 
 _MAX_NAMED: Final = 3
 
@@ -59,7 +62,7 @@ class WebdatasetSource:
         self.root = Path(root)
         self.name = f"webdataset/{shards if isinstance(shards, str) else shards[0]}"
         self._parts = parts_by_id(self.root, parts)
-        self._read_depth = read_depth
+        self._read_depth, self._told_inexact = read_depth, False
         folder = None if download_dir is None else Path(download_dir)
         paths = find_shards(self.root, shards, folder, allow_commands)
         self._shards = [index_shard(path) for path in paths]
@@ -83,6 +86,12 @@ class WebdatasetSource:
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
         poses = records.poses()
+        if poses.inexact.any() and not self._told_inexact:
+            self._told_inexact = True
+            _log.warning(
+                "%s: rotations orthogonal to %g only; the nearest are taken",
+                records.start, bop.INEXACT,
+            )  # fmt: skip
         instances = []
         for number in self._chosen(poses):
             mask = records.mask("mask_visib", number, shape) if has_masks else None

@@ -32,6 +32,7 @@ LAMP_SHARE: Final = 0.06
 """A lamp's radius over its distance: a bulb of 6 cm across at half a metre."""
 
 _MAX_ALBEDO: Final = 0.95
+_VERTEX_COLOUR: Final = "vertex_colour"
 """Nothing reflects all light; more would also keep paths alive without end."""
 
 _SKY_ROWS: Final = 64
@@ -109,6 +110,10 @@ def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
     parameters["vertex_texcoords"] = np.ravel(_corner_uv(surface)).astype(np.float32)
     parameters["faces"] = np.arange(len(corners), dtype=np.uint32)
     parameters.update()
+    if len(surface.colours):
+        albedo = surface.colours * np.asarray(item.material.colour, np.float32)
+        values = np.clip(albedo, 0.0, _MAX_ALBEDO)[surface.faces]
+        mesh.add_attribute(_VERTEX_COLOUR, 3, np.ravel(values).astype(np.float32))
     return mesh
 
 
@@ -151,12 +156,14 @@ def _roughness(material: Material) -> float:
 
 
 def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
-    """Return the albedo: constant, mottled or a texture, linear RGB."""
+    """Return the albedo: constant, mottled, of the vertices, or a texture, linear RGB."""
     material, texture = item.material, item.surface.texture
     colour = np.asarray(material.colour, np.float32)
     if texture is not None:
         codes = texture.image(_texture_level(item.surface, texture, item.T_cam_obj, K))
         return _bitmap(mi, SRGB_TO_LINEAR[codes] * colour, np.eye(4))
+    if len(item.surface.colours):
+        return {"type": "mesh_attribute", "name": _VERTEX_COLOUR}
     if material.noise == 0.0:
         return rgb(np.clip(colour, 0.0, _MAX_ALBEDO))
     # Random from cell to cell, always the same: only the look of a rough surface.

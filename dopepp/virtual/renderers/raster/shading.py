@@ -96,12 +96,15 @@ def shade_object(
 
 
 def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragments) -> Array:
-    """Return the fragments' albedo: the texture times the material's colour, and its noise."""
+    """Return the fragments' albedo: the surface's times the material's colour, and its noise."""
     surface, material = item.surface, item.material
     albedo = scratch("albedo", (3, len(fragments.pixel)), np.float32)
     colour = np.array(material.colour, np.float32)[:, None]
-    if surface.texture is None:
+    if surface.texture is None and not len(surface.colours):
         albedo[:] = colour
+    elif surface.texture is None:
+        _blend_colours(fragments.face, fragments.share, surface.faces, surface.colours, albedo)
+        albedo *= colour
     else:
         sample_texture(
             fragments.face, fragments.share, fragments.x, fragments.y, seen.hom, surface.faces,
@@ -126,6 +129,20 @@ def _cut_grooves(
         np.array([scene.K[0, 0], scene.K[1, 1]]), grooves.pitch, grooves.slope,
         grooves.irregularity, fragments.normal, alpha,
     )  # fmt: skip
+
+
+@compiled(fastmath=True)
+def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albedo: Array) -> None:
+    """Set the albedo to the vertices' colours, linear RGB, as far as each is away."""
+    for p in range(face.shape[0]):
+        # A triangle seen from behind is its number's bitwise complement.
+        corners = faces[face[p] if face[p] >= 0 else ~face[p]]
+        for c in range(3):
+            albedo[c, p] = (
+                share[0, p] * colours[corners[0], c]
+                + share[1, p] * colours[corners[1], c]
+                + share[2, p] * colours[corners[2], c]
+            )
 
 
 @compiled(fastmath=True)

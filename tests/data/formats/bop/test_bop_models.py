@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts, parts_by_id, read_models, write_models
 from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import Mesh, make_part
 
@@ -149,3 +150,34 @@ def test_an_identity_is_no_symmetry_and_a_wrong_diameter_is_told(tmp_path, caplo
     assert part.symmetries_discrete is None
     assert part.diameter == pytest.approx(servoholder().diameter, rel=1e-6)
     assert "states a diameter of 0.09 m" in caplog.text
+
+
+def test_vertex_colours_round_trip_and_survive_decimation(tmp_path, monkeypatch):
+    ball = trimesh.creation.icosphere(4, 0.03)
+    shades = np.clip(128 + 4000 * ball.vertices, 0, 255).astype(np.uint8)
+    mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32), colours=shades)
+    write_models(tmp_path, [make_part("ball", mesh)])
+    (read,) = bop_parts(tmp_path)
+    np.testing.assert_array_equal(read.mesh.colours, shades)
+    by_trimesh = trimesh.load(tmp_path / "models" / "obj_000001.ply", process=False)
+    np.testing.assert_array_equal(by_trimesh.visual.vertex_colors[:, :3], shades)
+    monkeypatch.setattr("dopepp.parts.part.MAX_FACES", 1000)
+    monkeypatch.setattr(
+        "dopepp.parts.part.decimate", lambda *given: decimate(*given, max_faces=1000)
+    )
+    light = make_part("ball", mesh).mesh
+    assert len(light.faces) <= 1000
+    expected = np.clip(128 + 4000 * light.vertices, 0, 255)
+    np.testing.assert_allclose(light.colours, expected, atol=8)
+
+
+def test_models_without_a_file_are_left_out_unless_they_are_asked_for(tmp_path, caplog):
+    write_models(tmp_path, [servoholder(), pivconnector()])
+    (tmp_path / "models" / "obj_000001.ply").unlink()
+    assert [part.name for part in bop_parts(tmp_path)] == ["pivconnector"]
+    assert "left out models without a file: servoholder" in caplog.text
+    with pytest.raises(UserError, match=r"obj_000001.ply, no such file"):
+        bop_parts(tmp_path, ["servoholder"])
+    (tmp_path / "models" / "obj_000002.ply").unlink()
+    with pytest.raises(UserError, match=r"obj_000001.ply, no such file"):
+        bop_parts(tmp_path)

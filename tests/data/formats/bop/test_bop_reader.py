@@ -11,11 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
+from dopepp.data.check import check_dataset
 from dopepp.data.formats import share
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb, encode_png
+from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
 
 K = [100.0, 0.0, 31.5, 0.0, 101.0, 23.5, 0.0, 0.0, 1.0]
@@ -191,6 +194,84 @@ def test_absent_images_and_objects_behind_the_camera_are_counted(scene, caplog, 
     assert "1 of 2 listed images are absent" in caplog.text
     assert "1 images have ground truth and no camera" in caplog.text
     assert "0 objects that are none of the parts and 1 behind the camera" in caplog.text
+
+
+def bent(by: float) -> dict[str, Any]:
+    """A pose whose matrix is off from a rotation, R·Rᵀ by about ``by``."""
+    shear = np.eye(3)
+    shear[0, 1] = by
+    return truth(2) | {"cam_R_m2c": (shear @ np.reshape(R, (3, 3))).ravel().tolist()}
+
+
+def test_inexact_rotations_are_the_nearest_ones_and_said_once(scene, block, caplog):
+    scene.json("scene_gt", {"3": [bent(5e-3), truth(2)], "11": [bent(9e-3), bent(9e-4)]})
+    scene.json("scene_gt_info", {})
+    source = BopSource(scene.root, [block(2)], "test")
+    source.sample(0)
+    lines = [line for line in caplog.messages if "orthogonal" in line]
+    assert lines == ["bop/test: 2 rotations are orthogonal to 0.01 only; the nearest are taken"]
+    got = source.sample(0).instances[0].T_cam_obj[:3, :3]
+    np.testing.assert_allclose(got @ got.T, np.eye(3), atol=1e-12)
+    stated = np.reshape(bent(5e-3)["cam_R_m2c"], (3, 3))
+    np.testing.assert_allclose(got, polar(stated)[0], atol=1e-12)
+    almost = source.sample(1).instances[1].T_cam_obj[:3, :3]
+    np.testing.assert_array_equal(almost.ravel(), bent(9e-4)["cam_R_m2c"])  # as it is
+    scene.json("scene_gt", {"3": [bent(1.2e-2)]})
+    with pytest.raises(UserError, match=r"cam_R_m2c: no rotation: .*0\.012 \(allowed 1e-02\)"):
+        BopSource(scene.root, [block(2)], "test")
+
+
+def test_missing_infos_and_models_are_coped_with_and_counted(scene, block, caplog):
+    caplog.set_level("INFO")
+    scene.json("scene_gt", {"3": [truth(9), truth(2)], "11": [truth(9), truth(2)]})
+    scene.json("scene_gt_info", {"3": [{"visib_fract": 0.25}, {"visib_fract": 0.75}]})
+    (scene.root / "models").mkdir()
+    (scene.root / "models" / "models_info.json").write_text('{"2": {"diameter": 46.0}}')
+    source = BopSource(scene.root, [block(2)], "test")
+    assert "left out objects without a model: 9 (2)" in caplog.text
+    assert "1 objects' visible fractions are estimated" in caplog.text
+    fractions = [source.sample(i).instances[0].visible_fraction for i in (0, 1)]
+    assert fractions == pytest.approx([0.75, 1.0])
+
+
+def test_a_list_of_targets_marks_the_most_visible_instances(scene, block):
+    fractions = [0.2, 0.9, 0.05, 0.5]
+    truths = [truth(2, (x, 0, 250)) for x in (-30.0, -10.0, 10.0, 30.0)]
+    scene.annotate({"3": truths, "11": [truth(2)]}, {"3": fractions, "11": [0.8]})
+    listed = [{"scene_id": 1, "im_id": 3, "obj_id": 2, "inst_count": 2}]
+    (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
+    source = BopSource(scene.root, [block(2)], "test", targets="auto")
+    assert len(source) == 1
+    assert [one.wanted for one in source.sample(0).instances] == [False, True, False, True]
+    every = BopSource(scene.root, [block(2)], "test")
+    assert [one.wanted for one in every.sample(0).instances] == [None] * 4
+    assert len(every) == 2
+    (scene.root / "test_targets_bop19.json").unlink()
+    assert len(BopSource(scene.root, [block(2)], "test", targets="auto")) == 2
+
+
+def test_the_view_is_the_pictures_camera_and_the_annotated_distances(scene, block):
+    scene.annotate({"3": [truth(2, (0, 0, 251.0)), truth(9)], "11": [truth(2, (0, 0, 309.0))]}, {})
+    size, camera, distances = BopSource(scene.root, [block(2)], "test").view()
+    assert (size, distances) == ((64, 48), (0.25, 0.31))
+    np.testing.assert_array_equal(camera, np.reshape(K, (3, 3)))
+
+
+def test_linemod_occlusion_as_it_is_published(shared_data, caplog):
+    root = shared_data / "lmo_bop"
+    if not root.is_dir():
+        pytest.skip(f"no {root}")
+    report = check_dataset(root)
+    assert report.ok, report.lines()
+    assert any("105 rotations are orthogonal" in note for note in report.notes)
+    parts = bop_parts(root)
+    source = BopSource(root, parts, "test")
+    rotations = np.array(
+        [one.T_cam_obj[:3, :3] for i in range(3) for one in source.sample(i).instances]
+    )
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    assert errors.max() <= 1e-3
+    assert all(part.mesh.colours is not None for part in parts)
 
 
 def test_matrices_may_be_nested_and_numbers_whole(tmp_path, block):

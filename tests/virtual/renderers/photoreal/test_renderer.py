@@ -8,11 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part
 from dopepp.virtual import PRESETS, Factory, Rendered, make_surface, render
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Plane, Scene, SceneObject
@@ -185,3 +186,21 @@ def test_the_missing_extra_is_named(monkeypatch, package):
         importlib.import_module("dopepp.virtual.renderers.photoreal.renderer")
     with pytest.raises(UserError, match=pattern):
         find_renderer("photoreal")
+
+
+def test_vertex_colours_are_the_rasterisers(photoreal, scene_of):
+    ball = trimesh.creation.icosphere(3, 0.06)
+    shades = np.clip(128 + 2000 * ball.vertices, 0, 255).astype(np.uint8)
+    mesh = Mesh(ball.vertices, ball.faces.astype(np.int32), colours=shades)
+    T = np.eye(4)
+    T[2, 3] = 0.4
+    item = SceneObject(make_surface(mesh), T, Material((0.8, 0.8, 0.8), 1.0, 0.0))
+    even = Ambient(above=(0.6,) * 3, below=(0.6,) * 3)
+    scene = scene_of(item, lights=(), ambient=even)
+    expected, found = render(scene), photoreal(scene)
+    covered = (expected.instances == 0) & (found.instances == 0)
+    apart = expected.image[covered].astype(int) - found.image[covered]
+    assert np.abs(np.median(apart, axis=0)).max() < 8
+    for channel in range(3):
+        one, other = (picture.image[covered][:, channel] for picture in (expected, found))
+        assert np.corrcoef(one, other)[0, 1] > 0.95

@@ -183,3 +183,18 @@ def test_unresolved_grooves_widen_the_highlight(scene_of, tilted):
         row = image[60, 20:140, 0]
         widths.append((row > (row.max() + row.min()) / 2).sum())
     assert widths[0] > 1.5 * widths[1]
+
+
+def test_vertex_colours_blend_in_light(scene_of, sheet):
+    # Left corners red, right corners blue; half of the light shows linear shares of either.
+    colours = np.array([(255, 0, 0), (0, 0, 200), (0, 0, 200), (255, 0, 0)], np.uint8)
+    mesh = replace(sheet(0.2), uv=None, colours=colours)
+    matt = Material((0.4, 0.4, 0.4), specular=0.0)
+    scene = scene_of(facing(make_surface(mesh), (0, 0, 0.3), matt), lights=(), ambient=even(1.0))
+    rendered = render(scene)
+    row = np.nonzero(rendered.instances[60] == 0)[0][3:-3]
+    x = (row - scene.K[0, 2]) / scene.K[0, 0] * 0.3 / 0.2 + 0.5
+    blue = 0.4 * linear(200) * x
+    np.testing.assert_allclose(linear(rendered.image[60, row, 0]), 0.4 * (1 - x), atol=0.006)
+    np.testing.assert_allclose(linear(rendered.image[60, row, 2]), blue, atol=0.006)
+    assert not rendered.image[60, row, 1].any()

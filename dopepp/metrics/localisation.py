@@ -1,0 +1,197 @@
+"""BOP's scores of 6D localisation: recall over the targets, over three errors and their thresholds.
+
+A target is so many instances of an object on an image, as a list of targets says
+(``test_targets_bop19.json``), else all that are visible to a tenth. As many of the best scored
+estimates are looked at. For each error and threshold they are matched anew, the best score first,
+each with the free target of the smallest error below the threshold. AR is the mean of AR_VSD,
+AR_MSSD and AR_MSPD (Hodan et al., "BOP Challenge 2020", 2020), as bop_toolkit computes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dopepp.drawing.pictures import DepthMap, Size
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.metrics.functional import (
+    BOP_MSPD_THRESHOLDS,
+    BOP_THRESHOLDS,
+    add,
+    add_s,
+    mspd,
+    mssd,
+    vsd,
+)
+from dopepp.metrics.pose import PredictedPose, TruePose, counted
+from dopepp.metrics.row import extreme_points, symmetries
+from dopepp.parts.part import Part
+
+Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
+"""Draws the depth of a part alone, metres, 0 beside it."""
+
+_STRICT: Final = 0.1
+"""Diameters below which ADD(-S) counts."""
+
+Errors = Float[np.ndarray, "estimates targets"]
+
+
+@dataclass(frozen=True)
+class BopScores:
+    """Scores over all targets of all objects, in [0, 1].
+
+    Attributes:
+        num_targets: Instances to be found.
+        ar_vsd: Average recall of VSD; None where an image has no depth or a part no mesh.
+        ar_mssd: Average recall of MSSD.
+        ar_mspd: Average recall of MSPD.
+        ar: Mean of the three; None where one does not exist.
+        add_or_s_01d: Recall of ADD, ADD-S for symmetric parts, below a tenth of the diameter.
+    """
+
+    num_targets: int
+    ar_vsd: float | None
+    ar_mssd: float
+    ar_mspd: float
+    ar: float | None
+    add_or_s_01d: float
+
+    def to_record(self) -> dict[str, int | float | None]:
+        """Return plain values."""
+        return asdict(self)
+
+    def in_words(self) -> str:
+        """Return a line for people."""
+
+        def percent(share: float | None) -> str:
+            return "n/a" if share is None else f"{share:.1%}"
+
+        return (
+            f"BOP, {self.num_targets:,} targets: AR {percent(self.ar)} (VSD {percent(self.ar_vsd)},"
+            f" MSSD {percent(self.ar_mssd)}, MSPD {percent(self.ar_mspd)}), "
+            f"ADD(-S)-0.1d {percent(self.add_or_s_01d)}"
+        )
+
+
+class Localisation:
+    """Accumulates the errors of one method's poses, image by image.
+
+    ``draw`` is what VSD needs; without it there is none.
+    """
+
+    def __init__(self, parts: Sequence[Part], draw: Draw | None = None) -> None:
+        self._parts = {part.name: part for part in parts}
+        self._draw = draw
+        self._groups: list[_Group] = []
+
+    def update(
+        self,
+        detections: Sequence[PredictedPose],
+        instances: Sequence[TruePose],
+        K: CameraMatrix,
+        size: Size,
+        depth: DepthMap | None = None,
+    ) -> None:
+        """Add one image; ``depth`` is what was measured on it, metres."""
+        for part in self._parts.values():
+            true = [one.T_cam_obj for one in instances if one.label == part.name and counted(one)]
+            own = sorted((d for d in detections if d.object == part.name), key=lambda d: -d.score)
+            estimated = [one.T_cam_obj for one in own[: len(true)]]
+            if not true:
+                continue
+            group = _errors(part, np.array(estimated).reshape(-1, 4, 4), np.array(true), K, size[0])
+            if self._draw is not None and depth is not None and part.mesh is not None:
+                drawn = [
+                    [self._draw(part, T, K, size) for T in poses] for poses in (estimated, true)
+                ]
+                rows = [[vsd(e, t, depth, K, part.diameter) for t in drawn[1]] for e in drawn[0]]
+                group.vsd = np.array(rows).reshape(len(estimated), len(true), len(BOP_THRESHOLDS))
+            self._groups.append(group)
+
+    def scores(self) -> BopScores | None:
+        """Sum up; None without targets."""
+        num_targets = sum(group.mssd.shape[1] for group in self._groups)
+        if not num_targets:
+            return None
+
+        def recall(errors: Sequence[Errors], threshold: float) -> float:
+            return float(sum(num_matched(each, threshold) for each in errors) / num_targets)
+
+        def average(errors: Sequence[Errors], thresholds: Sequence[float]) -> float:
+            return float(np.mean([recall(errors, threshold) for threshold in thresholds]))
+
+        ar_mssd = average([group.mssd for group in self._groups], BOP_THRESHOLDS)
+        ar_mspd = average([group.mspd for group in self._groups], BOP_MSPD_THRESHOLDS)
+        ar_vsd = None
+        of_vsd = [group.vsd for group in self._groups if group.vsd is not None]
+        if len(of_vsd) == len(self._groups):
+            each = [[one[..., k] for one in of_vsd] for k in range(len(BOP_THRESHOLDS))]
+            ar_vsd = float(np.mean([average(errors, BOP_THRESHOLDS) for errors in each]))
+        return BopScores(
+            num_targets=num_targets,
+            ar_vsd=ar_vsd,
+            ar_mssd=ar_mssd,
+            ar_mspd=ar_mspd,
+            ar=None if ar_vsd is None else (ar_vsd + ar_mssd + ar_mspd) / 3,
+            add_or_s_01d=recall([group.add_or_s for group in self._groups], _STRICT),
+        )
+
+
+def num_matched(errors: Errors, threshold: float) -> int:
+    """Count the targets that are found with an error below a threshold.
+
+    The estimates, the best one first, take the free target of the smallest error each.
+    """
+    free = np.ones(errors.shape[1], bool)
+    for row in errors:
+        left = np.where(free, row, np.inf)
+        nearest = int(left.argmin())
+        if left[nearest] < threshold:
+            free[nearest] = False
+    return int((~free).sum())
+
+
+@dataclass
+class _Group:
+    """Errors of the estimates of one object on one image to each of its targets.
+
+    ``mssd`` and ``add_or_s`` are in diameters, ``mspd`` in pixels of an image 640 wide.
+    """
+
+    mssd: Errors
+    mspd: Errors
+    add_or_s: Errors
+    vsd: Float[np.ndarray, "estimates targets tolerances"] | None = None
+
+
+def _errors(
+    part: Part,
+    estimated: Float[np.ndarray, "estimates 4 4"],
+    true: Float[np.ndarray, "targets 4 4"],
+    K: CameraMatrix,
+    width: int,
+) -> _Group:
+    """Compute them for all pairs of an estimate and a target."""
+    shape = len(estimated), len(true)
+    T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
+    T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))
+    poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
+    vertices, group = extreme_points(part), symmetries(part)
+    cameras = torch.from_numpy(np.asarray(K, np.float64)).expand(len(T_est), 3, 3)
+    points = torch.from_numpy(np.asarray(part.points, np.float64))
+    surface = add_s if len(group) > 1 else add
+
+    def table(errors: Tensor) -> Errors:
+        return np.asarray(errors.numpy().reshape(shape))
+
+    return _Group(
+        mssd=table(mssd(*poses, vertices, group)) / part.diameter,
+        mspd=table(mspd(*poses, vertices, cameras, group)) * (640 / width),
+        add_or_s=table(surface(*poses, points)) / part.diameter,
+    )
