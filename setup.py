@@ -7,7 +7,12 @@ setup(
     package_dir={"dopepp.conf": "conf"},
     include_package_data=False,  # only what stands here, whatever version control knows
     package_data={
-        "dopepp": ["py.typed", "pretrained/*", "robot/nodes/share/*"],
+        "dopepp": [
+            "py.typed",
+            "pretrained/*",
+            "robot/grasping/data/*",
+            "robot/nodes/share/*",
+        ],
         "dopepp.conf": ["**/*.yaml"],
     },
 )

@@ -80,17 +80,17 @@ class Workshop:
     def rows(self) -> Iterator[Row]:
         """Yield all lines; what is asked most comes first."""
         on_gpu = self.device.type == "cuda"
-        eager = [(one, "") for one in (DTYPES if on_gpu else ("fp32", "bf16"))]
-        ways = [*eager, ("tf32" if on_gpu else "fp32", "compiled"), ("bf16", "compiled")]
+        eager, compiled = ([*DTYPES], ["tf32", "bf16"]) if on_gpu else (["fp32", "bf16"], ["fp32"])
+        ways = [*((one, "eager") for one in eager), *((one, "compiled") for one in compiled)]
         cores = available_cores()
         for table, measure in (("inference", self.inference), ("training", self.training)):
             for precision, how in ways:
                 if table == "training" and precision == "fp16":
                     continue  # training takes bf16 where there is any
-                # Compiling takes minutes on a CPU.
-                for model in MODELS[-1:] if how and self.size == QUICK else MODELS:
-                    setting = {"network": model, "precision": precision, "how": how or "eager"}
-                    yield Row(table, setting, partial(measure, model, precision, bool(how)))
+                fast = how == "eager" or self.size != QUICK  # compiling takes minutes on a CPU
+                for model in MODELS if fast else MODELS[-1:]:
+                    setting = {"network": model, "precision": precision, "how": how}
+                    yield Row(table, setting, partial(measure, model, precision, how == "compiled"))
         for workers in sorted({1, cores}):
             yield Row("rendering", {"workers": str(workers)}, partial(self.rendering, workers))
         for model in MODELS:

@@ -213,7 +213,7 @@ def parse_problem(words: list[str]) -> str | None:
             OverridesParser.create().parse_overrides(overrides)
         elif words[0] == "dopepp" and program[1] in COMMANDS:
             command = COMMANDS[program[1]]
-            if hasattr(command, "commands"):
+            if arguments and arguments[0] in getattr(command, "commands", {}):
                 name, *arguments = arguments
                 command = command.commands[name]
             command.make_context(program[1], arguments)

@@ -21,6 +21,7 @@ from dopepp.cli import (
     download,
     entries,
     export,
+    grasp,
     node,
     predict,
     release,
@@ -93,3 +94,4 @@ for _command in COMMANDS:
     )(_command)
 
 app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(grasp.app, name="grasp")

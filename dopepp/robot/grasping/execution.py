@@ -1,0 +1,158 @@
+"""A plan's motion in the simulated world, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.robot.grasping.arm import Gripper, Joints
+from dopepp.robot.grasping.cell import JOINTS, STEP, Cell
+from dopepp.robot.grasping.planner import Path, Plan
+
+SPEED: Final = 1.5
+"""Fastest joint, rad/s, on average over a motion."""
+
+CLOSING_S: Final = 0.5
+"""Seconds over which the fingers' command ramps; it ends beyond zero width, so that they press."""
+
+CLOSED: Final = 255.0
+"""The command at which the fingers would meet: on a part of any width they press."""
+
+PAUSE_S: Final = 0.3
+
+SHAKE_S: Final = 1.2
+SHAKE_HZ: Final = 3.0
+SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
+"""The wrist's swings, radians: about 1 g at the part."""
+
+HELD_HEIGHT: Final = 0.05
+"""Metres above where it lay at which a part counts as held."""
+
+HIT_FORCE: Final = 5.0
+"""Newtons from which on a touch before the fingers close is a collision."""
+
+LAG_S: Final = 0.2
+"""Damping over stiffness of the arm's servos: what a command leads by at a joint's speed."""
+
+FRAME_S: Final = 0.04
+"""Seconds from frame to frame of a recording."""
+
+
+@dataclass
+class Outcome:
+    """What came of a motion.
+
+    Attributes:
+        held: Number of the thing that was held after lift and shake; None for none.
+        collided: Whether the robot hit something before its fingers closed.
+        times: Of the recorded states, seconds.
+        states: Positions of all joints, as the simulation has them.
+    """
+
+    held: int | None = None
+    collided: bool = False
+    times: list[float] = field(default_factory=list)
+    states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)
+
+
+class Execution:
+    """The arm at work.
+
+    Args:
+        zero: What the arm's joints are off, radians: it stands there when its controller believes
+            to be at 0.
+    """
+
+    def __init__(self, cell: Cell, state: Any, gripper: Gripper, zero: Joints) -> None:
+        self._cell, self._state, self._gripper, self._zero = cell, state, gripper, zero
+        self._command = float(state.ctrl[JOINTS])
+        self.outcome = Outcome()
+
+    def stand(self, joints: Joints) -> None:
+        """Set the arm to where its controller reads joints, at rest, with open fingers."""
+        state = self._state
+        state.qpos[:JOINTS] = state.ctrl[:JOINTS] = joints + self._zero
+        state.qvel[: JOINTS + 8] = 0.0
+        mujoco.mj_forward(self._cell.model, state)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        mujoco.mj_step(self._cell.model, self._state, nstep=round(seconds / STEP))
+
+    def run(self, plan: Plan) -> Outcome:
+        """Carry out a plan: come, close, lift, shake."""
+        before = self._heights()
+        self._command = self._gripper.command(plan.opening)
+        for path in (plan.approach, plan.descent):
+            for joints in _timed(path):
+                self._advance(*joints)
+                self.outcome.collided |= self._is_hit()
+        here = plan.descent[-1]
+        for share in np.linspace(0, 1, round(CLOSING_S / STEP)):
+            self._command = (1 - share) * self._gripper.command(plan.opening) + share * CLOSED
+            self._advance(here, np.zeros(JOINTS))
+        self._rest(here)
+        for joints in _timed(plan.lift):
+            self._advance(*joints)
+        for joints in _shaken(plan.lift[-1]):
+            self._advance(*joints)
+        self._rest(plan.lift[-1])
+        risen = self._heights() - before
+        if len(risen) and risen.max() > HELD_HEIGHT:
+            self.outcome.held = int(risen.argmax())
+        return self.outcome
+
+    def _heights(self) -> Float[np.ndarray, "things"]:
+        cell, state = self._cell, self._state
+        return np.array([cell.pose(state, number)[2, 3] for number in range(cell.count)])
+
+    def _rest(self, joints: Joints) -> None:
+        for _ in range(round(PAUSE_S / STEP)):
+            self._advance(joints, np.zeros(JOINTS))
+
+    def _advance(self, joints: Joints, speeds: Joints) -> None:
+        state = self._state
+        state.ctrl[:JOINTS] = joints + self._zero + LAG_S * speeds
+        state.ctrl[JOINTS] = self._command
+        mujoco.mj_step(self._cell.model, state)
+        times = self.outcome.times
+        if not times or state.time - times[-1] >= FRAME_S - STEP / 2:
+            times.append(float(state.time))
+            self.outcome.states.append(state.qpos.copy())
+
+    def _is_hit(self) -> bool:
+        """Tell whether the robot presses against something."""
+        state, force = self._state, np.zeros(6)
+        pairs = self._cell.groups[state.contact.geom]
+        for number in np.flatnonzero((pairs == 0).sum(axis=1) == 1):
+            mujoco.mj_contactForce(self._cell.model, state, int(number), force)
+            if np.linalg.norm(force[:3]) > HIT_FORCE:
+                return True
+        return False
+
+
+def _timed(path: Path) -> Iterator[tuple[Joints, Joints]]:
+    """Yield joints and their speeds at every step of the simulation, from rest to rest."""
+    lengths = np.abs(np.diff(path, axis=0)).max(axis=1)
+    places = np.concatenate([[0.0], np.cumsum(lengths)])
+    count = round(max(float(places[-1]) / SPEED, 0.4) / STEP)
+    share = np.linspace(0, 1, count + 1)[1:]
+    smooth = share**3 * (10 - 15 * share + 6 * share**2)  # least jerk
+    joints = np.stack(
+        [np.interp(smooth * places[-1], places, one) for one in path.T], axis=1
+    )  # fmt: skip
+    speeds = np.gradient(joints, STEP, axis=0)
+    yield from zip(joints, speeds, strict=True)
+
+
+def _shaken(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
+    times = np.arange(0, SHAKE_S, STEP)
+    fade = np.sin(np.pi * times / SHAKE_S) ** 0.5
+    swings = (fade * np.sin(2 * np.pi * SHAKE_HZ * times))[:, None] * SHAKE
+    speeds = np.gradient(swings, STEP, axis=0)
+    yield from zip(joints + swings, speeds, strict=True)

@@ -1,0 +1,210 @@
+"""From a part's pose to a motion of the arm that grips it: what a robot's controller can know.
+
+The planner is given estimated poses, calibrated matrices and the model of its own robot, never the
+simulation's truth. Joints' paths are checked for collisions in a cell of its own, in which parts
+stand where they are believed to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.rotation import Vector, rotation_vector_to_matrix
+from dopepp.robot.grasping.arm import PAD_HALF, Arm, Gripper, Joints
+from dopepp.robot.grasping.cell import JOINTS, Cell
+from dopepp.robot.grasping.grasps import Grasp
+from dopepp.virtual.body import Hull
+
+Path = Float[np.ndarray, "waypoints 6"]
+
+INSERTIONS: Final = (0.009, 0.003)
+"""How far the pads' ends go beyond a grasp's point, where there is room, metres: half a pad, or no
+deeper than what lies below may allow."""
+
+ABOVE_BENCH: Final = 0.001
+"""Metres that the pads' ends keep from the bench."""
+
+LOW: Final = 0.005
+"""How far the middle of a part that lies on the bench may seem to be off its height, metres."""
+
+STEEPEST: Final = np.radians(40.0)
+"""Largest angle between an approach and straight down."""
+
+RETREAT: Final = 0.06
+"""Metres from which the gripper comes straight."""
+
+LIFT: Final = 0.12
+"""Metres by which a part is lifted."""
+
+CHECKS: Final = 24
+"""Places of a path between two waypoints at which collisions are looked for."""
+
+PENETRATION: Final = 1e-4
+"""Metres from which on touching is a collision."""
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What calibrations have told the controller.
+
+    Attributes:
+        T_flange_cam: Where the camera is in the hand.
+        tip: Middle between the ends of the closed fingers, flange frame, metres.
+        T_base_bench: The bench; z is its normal.
+    """
+
+    T_flange_cam: Transform
+    tip: Vector
+    T_base_bench: Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A motion: joints, radians, from where the arm is.
+
+    Attributes:
+        approach: To above the part.
+        descent: Straight to it.
+        lift: Straight up.
+        opening: Of the fingers before they close, metres.
+        grasp: Which of the part's grasps it is.
+    """
+
+    approach: Path
+    descent: Path
+    lift: Path
+    opening: float
+    grasp: Grasp
+
+
+def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:
+    """Lay a part that seems to lie on the bench flat on it.
+
+    A picture from above tells a part's tilt and height least, the bench best. A part whose middle
+    is higher than :data:`LOW` allows leans on something and stays as it is.
+    """
+    up = T_base_bench[:3, 2]
+    normals = hull.rests[0] @ T_base_obj[:3, :3].T
+    down = normals[int(np.argmin(normals @ up))]
+    axis, cosine = np.cross(down, -up), float(-down @ up)
+    sine = float(np.linalg.norm(axis))
+    turn = rotation_vector_to_matrix(axis * (np.arctan2(sine, cosine) / sine if sine else 0.0))
+    centre = transform(T_base_obj, hull.centre)
+    flat = make_transform(
+        turn @ T_base_obj[:3, :3], centre + turn @ (T_base_obj[:3, 3] - centre)
+    )  # fmt: skip
+    lowest = float(((transform(flat, hull.vertices) - T_base_bench[:3, 3]) @ up).min())
+    if abs(lowest) > LOW:
+        return T_base_obj
+    flat[:3, 3] -= lowest * up
+    return flat
+
+
+class Planner:
+    """Plans grasps.
+
+    Args:
+        cell: A model with as many things as parts may be believed in.
+    """
+
+    def __init__(self, arm: Arm, gripper: Gripper, cell: Cell, knowledge: Knowledge) -> None:
+        self._arm, self._gripper, self._cell, self._known = arm, gripper, cell, knowledge
+        self._state = cell.data()
+        model = cell.model
+        self._hand = np.array(["gripper/" in model.body(b).name for b in model.geom_bodyid])
+
+    def plan(
+        self, poses: Sequence[Transform], grasps: Sequence[Grasp], start: Joints
+    ) -> Plan | None:
+        """Return a motion that grips the first of the parts at poses; None where there is none."""
+        for number in range(self._cell.count):
+            away = make_transform(np.eye(3), np.array([2.0, number, 0.5]))
+            self._cell.put(self._state, number, poses[number] if number < len(poses) else away)
+        for grasp in grasps:
+            for tool in self._tools(poses[0], grasp):
+                motion = self._motion(tool, grasp, start)
+                if motion is not None:
+                    return motion
+        return None
+
+    def _tools(self, T_base_obj: Transform, grasp: Grasp) -> Iterator[Transform]:
+        """Yield poses of the closed pads' ends, T_base_tool, in which they grip the part."""
+        up = self._known.T_base_bench[:3, 2]
+        ends = np.array(
+            [[x, y, 0.0] for x in (-1, 1) for y in (-PAD_HALF[1], PAD_HALF[1])]
+        ) * [grasp.width / 2 + 2 * PAD_HALF[0], 1, 1]  # fmt: skip
+        for turned in (False, True):
+            T = T_base_obj @ grasp.T_obj_tool(turned)
+            steep = -float(T[:3, 2] @ up)
+            if steep < np.cos(STEEPEST):
+                continue
+            points = ends @ T[:3, :3].T + T[:3, 3] - self._known.T_base_bench[:3, 3]
+            room = (float((points @ up).min()) - ABOVE_BENCH) / steep
+            if room >= 0:
+                for depth in sorted({min(room, one) for one in INSERTIONS}, reverse=True):
+                    yield make_transform(T[:3, :3], T[:3, 3] + depth * T[:3, 2])
+
+    def _motion(self, T_base_tool: Transform, grasp: Grasp, start: Joints) -> Plan | None:
+        """Return the motion to a pose of the pads' ends, if the arm gets there unhindered."""
+        tip = self._known.tip.copy()
+        tip[2] += self._gripper.reach(grasp.width) - self._gripper.reach(0.0)
+        T_base_flange = T_base_tool @ make_transform(np.eye(3), -tip)
+        before = T_base_flange.copy()
+        before[:3, 3] -= RETREAT * T_base_flange[:3, 2]
+        first = self._arm.joints(before, start)
+        if first is None:
+            return None
+        descent = self._line(first, before, T_base_flange)
+        if descent is None or not self._is_free(descent, grasp.opening):
+            return None
+        approach = np.stack([start, first])
+        if not self._is_free(approach, grasp.opening):
+            return None
+        above = T_base_flange.copy()
+        above[:3, 3] += LIFT * self._known.T_base_bench[:3, 2]
+        lift = self._line(descent[-1], T_base_flange, above)
+        return None if lift is None else Plan(approach, descent, lift, grasp.opening, grasp)
+
+    def _line(self, start: Joints, T_from: Transform, T_to: Transform) -> Path | None:
+        """Return joints along a straight line of the flange, which keeps its orientation."""
+        path = [start]
+        for share in np.linspace(0, 1, 7)[1:]:
+            between = T_to.copy()
+            between[:3, 3] = (1 - share) * T_from[:3, 3] + share * T_to[:3, 3]
+            joints = self._arm.joints(between, path[-1])
+            if joints is None:
+                return None
+            path.append(joints)
+        return np.stack(path)
+
+    def _is_free(self, path: Path, opening: float) -> bool:
+        """Tell whether the robot meets nothing along a path."""
+        for here, there in pairwise(path):
+            count = max(2, round(CHECKS * float(np.abs(there - here).max())))
+            for share in np.linspace(0, 1, count):
+                if self._collides((1 - share) * here + share * there, opening):
+                    return False
+        return True
+
+    def _collides(self, joints: Joints, opening: float) -> bool:
+        state, cell = self._state, self._cell
+        state.qpos[:JOINTS] = joints
+        state.qpos[cell.fingers] = self._gripper.fingers(opening)
+        mujoco.mj_kinematics(cell.model, state)
+        mujoco.mj_comPos(cell.model, state)
+        mujoco.mj_collision(cell.model, state)
+        return any(self._is_hit(contact) for contact in state.contact)
+
+    def _is_hit(self, contact: Any) -> bool:
+        first, second = contact.geom
+        if contact.dist > -PENETRATION or (self._hand[first] and self._hand[second]):
+            return False
+        return bool(0 in self._cell.groups[[first, second]])

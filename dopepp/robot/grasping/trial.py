@@ -1,0 +1,401 @@
+"""A trial: a picture of what lies on the bench, a pose, a motion, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import Transform, invert_transform, make_transform, transform
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.geometry.symmetry import symmetry_group
+from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.arm import Arm, Joints, measure_gripper
+from dopepp.robot.grasping.cell import HOME, TRAY, Cell
+from dopepp.robot.grasping.execution import Execution, Outcome
+from dopepp.robot.grasping.grasps import find_grasps
+from dopepp.robot.grasping.layouts import Layout, Lying
+from dopepp.robot.grasping.planner import Planner, rested
+from dopepp.robot.grasping.rehearsal import (
+    MOUNT,
+    Calibrated,
+    Robot,
+    calibrate,
+    draw_robot,
+    looking_at,
+)
+from dopepp.robot.grasping.view import MujocoView, RasterView, View
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
+    from dopepp.recovery.detection import Detection
+
+BLOCK: Final = 50
+"""Trials after which another robot is calibrated, as Table 9 counts them."""
+
+NO_NETWORK_DISTANCE: Final = (0.18, 0.22)
+"""From which the camera looks where no network says from where, metres."""
+
+TILT: Final = np.radians(17.0)
+"""Largest turn of the camera about its x and about its y from straight down, radians."""
+
+SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
+
+MOST_BELIEVED: Final = 8
+"""Parts of which a plan keeps clear."""
+
+RECOGNISED: Final = 0.1
+"""ADD over the diameter below which a part counts as recognised."""
+
+EXACT: Final = "exact poses"
+
+FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the poses come from that a part is gripped by: an arm of the experiment.
+
+    Attributes:
+        kind: ``network``; ``exact``, the simulation's truth; or ``random``, any that the layout
+            could have.
+        matrices: Whether the network's poses go through the calibrated matrices or the true ones.
+        error: By how much exact poses are off, in a random direction and about a random axis:
+            millimetres and degrees.
+    """
+
+    kind: str = "network"
+    matrices: str = "calibrated"
+    error: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def name(self) -> str:
+        """How reports call it."""
+        if any(self.error):
+            return f"{EXACT}, off by {self.error[0]:g} mm and {self.error[1]:g}°"
+        true = ", true matrices" if self.matrices == "true" else ""
+        return {"network": "network", "exact": EXACT, "random": "random poses"}[self.kind] + true
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is tried; plain values, to be sent to a process.
+
+    Attributes:
+        part: A built-in part or a mesh file, and
+        unit: the file's.
+        grasps: File of grasps; None takes the built-in part's.
+        network: Checkpoint; None where no source needs one.
+        refine: Whether its poses are refined.
+        layout: Of :data:`~dopepp.robot.grasping.layouts.LAYOUTS`.
+        renderer: Of the camera's pictures.
+        yaw_deg: How far parts are turned, and
+        rest: on which faces they lie; see :class:`~dopepp.robot.grasping.layouts.Layout`.
+    """
+
+    part: str = "pivconnector"
+    unit: str | None = None
+    grasps: Path | None = None
+    network: str | None = None
+    refine: bool = True
+    layout: str = "single"
+    renderer: str = "raster"
+    yaw_deg: float = 180.0
+    rest: str = "front"
+    seed: int = 0
+    sources: tuple[Source, ...] = (Source(),)
+
+
+@dataclass(frozen=True)
+class Record:
+    """What came of one trial with one source of poses.
+
+    Attributes:
+        number: The trial's, from 0; trials of one number are of one scene.
+        source: The source's name.
+        off: By how much the pose was put off on purpose, millimetres and degrees.
+        seen: Whether there was a pose.
+        recognised: Whether it was right: ADD below a tenth of the diameter.
+        add_mm: ADD of it, millimetres; NaN without one. Like the others in the arm's base frame,
+            so that the calibration's error is in it.
+        error_mm: How far the part's origin was off, before the part was laid flat, millimetres, and
+        error_deg: how it was turned, degrees.
+        caught: Whether the part was held after lift and shake.
+        failure: Which of :data:`FAILURES` it was; empty for none.
+        hand_eye_mm: How far the calibration was off at the part's distance, and
+        hand_eye_deg: by how much it was turned.
+    """
+
+    number: int
+    source: str
+    off: float
+    seen: bool
+    recognised: bool
+    add_mm: float
+    error_mm: float
+    error_deg: float
+    caught: bool
+    failure: str
+    hand_eye_mm: float
+    hand_eye_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A trial's scene before anybody moves.
+
+    Attributes:
+        lying: What is on the bench, the parts first.
+        start: State of the simulation.
+        poses: Of the things, T_base_obj, as they have come to lie.
+        joints: Where the arm's controller reads the joints while it looks, radians.
+        T_base_cam: Where the camera truly is.
+        picture: What it sees.
+    """
+
+    number: int
+    cell: Cell
+    lying: Sequence[Lying]
+    start: Any
+    poses: list[Transform]
+    robot: Robot
+    calibrated: Calibrated
+    joints: Joints
+    T_base_cam: Transform
+    picture: Picture
+
+    @property
+    def targets(self) -> list[Transform]:
+        """Where the parts are, the highest first."""
+        parts = [pose for one, pose in zip(self.lying, self.poses, strict=True) if one.body.part]
+        return sorted(parts, key=_height, reverse=True)
+
+
+@dataclass(eq=False)
+class Attempt:
+    """A record and what is shown of it.
+
+    Attributes:
+        believed: Where the arm looked for the part, T_base_obj; None where nothing was seen.
+    """
+
+    record: Record
+    outcome: Outcome = field(default_factory=Outcome)
+    believed: Transform | None = None
+
+
+class Trials:
+    """Makes trials of a task; trial i depends on the task's seed and i alone."""
+
+    def __init__(self, task: Task) -> None:
+        self.task, self.part = task, load_part(task.part, task.unit)
+        self.grasps = find_grasps(self.part, task.grasps)
+        self.layout = Layout(self.part, task.layout, task.yaw_deg, task.rest)
+        self.arm, self.gripper = Arm(), measure_gripper()
+        self.tip = np.array([0.0, 0.0, self.gripper.reach(0.0)])
+        self.distance = NO_NETWORK_DISTANCE
+        if task.network is not None:
+            self.distance = self._distances()
+        self.robot = cache(self._robot)
+        self._cells: dict[int, Cell] = {}
+        self._views: dict[int, MujocoView] = {}
+
+    @cached_property
+    def estimator(self) -> PoseEstimator:
+        """The network."""
+        from dopepp.inference.estimator import PoseEstimator
+
+        assert self.task.network is not None
+        refine = "region" if self.task.refine else None
+        return PoseEstimator.load(self.task.network, refine=refine)
+
+    def _distances(self) -> tuple[float, float]:
+        """Return from where the network has learned to look, not quite to the ends, metres."""
+        names = [part.name for part in self.estimator.parts]
+        if self.part.name not in names:
+            raise UserError(
+                f"--network {self.task.network}, which does not know {self.part.name}",
+                f"a network of this part, not of {', '.join(names)}", "pass another one",
+            )  # fmt: skip
+        seen = self.estimator.checkpoint.seen.get(self.part.name)
+        if seen is None:
+            return NO_NETWORK_DISTANCE
+        near, far = seen.nearest, seen.farthest
+        return near + 0.4 * (far - near), near + 0.75 * (far - near)
+
+    def _robot(self, block: int) -> tuple[Robot, Calibrated]:
+        rng = np.random.default_rng([self.task.seed, block, 1])
+        robot = draw_robot(rng, self.tip)
+        return robot, calibrate(robot, self.arm, rng, float(np.mean(self.distance)))
+
+    def scene(self, number: int) -> Scene:
+        """Lay out a trial and take its picture."""
+        rng = np.random.default_rng([self.task.seed, number])
+        robot, calibrated = self.robot(number // BLOCK)
+        lying = self.layout.draw(rng)
+        cell = self._cell(lying)
+        state = cell.data()
+        for index, one in enumerate(lying):
+            cell.put(state, index, one.T_base_obj)
+        joints, T_base_cam = self._look(robot, rng)
+        execution = Execution(cell, state, self.gripper, robot.zero)
+        execution.stand(joints)
+        execution.wait(SETTLE_S[self.task.layout])
+        poses = [cell.pose(state, index) for index in range(len(lying))]
+        bodies = [one.body for one in lying]
+        picture = self._view(lying).take(bodies, poses, T_base_cam, rng)
+        return Scene(
+            number, cell, lying, state, poses, robot, calibrated, joints, T_base_cam, picture
+        )
+
+    def attempt(self, scene: Scene, source: Source) -> Attempt:
+        """Grip a part of a scene by the poses of a source."""
+        found = self._poses(scene, source)
+        if not found:
+            return Attempt(self._record(scene, source, None, None))
+        bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
+        laid = [rested(one, hull, bench) for one in found][:MOST_BELIEVED]
+        planner, plan, chosen = self._planner(scene), None, 0
+        for number, first in enumerate(laid):
+            others = [*laid[:number], *laid[number + 1 :]]
+            plan = planner.plan([first, *others], self.grasps, scene.joints)
+            if plan is not None:
+                chosen = number
+                break
+        believed, outcome = found[chosen], None
+        if plan is not None:
+            state = copy(scene.start)
+            outcome = Execution(scene.cell, state, self.gripper, scene.robot.zero).run(plan)
+        record = self._record(scene, source, believed, outcome)
+        return Attempt(record, outcome or Outcome(), believed)
+
+    def _poses(self, scene: Scene, source: Source) -> list[Transform]:
+        """Return where the controller believes parts to be, T_base_obj, the highest first."""
+        rng = np.random.default_rng([self.task.seed, scene.number, 2])
+        if source.kind == "random":
+            return [self.layout.drop(rng)]
+        if source.kind == "exact":
+            return [_off(pose, source.error, rng) for pose in scene.targets]
+        if source.matrices == "true":
+            T_base_cam = scene.T_base_cam
+        else:
+            T_base_flange = self.arm.flange(scene.joints)
+            T_base_cam = T_base_flange @ scene.calibrated.knowledge.T_flange_cam
+        poses = [T_base_cam @ one.T_cam_obj for one in self._detected(scene)]
+        return sorted(poses, key=_height, reverse=True)
+
+    def _detected(self, scene: Scene) -> list[Detection]:
+        """Return the parts on the picture that are at least half as sure as the surest."""
+        lens = scene.calibrated.camera
+        found = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
+        own = [one for one in found if one.object == self.part.name]
+        return [one for one in own if one.score >= own[0].score / 2]
+
+    def _record(
+        self, scene: Scene, source: Source, believed: Transform | None, outcome: Outcome | None
+    ) -> Record:
+        matrices = (scene.calibrated.hand_eye_mm, scene.calibrated.hand_eye_deg)
+        told = (scene.number, source.name, source.error[0])
+        if believed is None:
+            nan = float("nan")
+            return Record(*told, False, False, nan, nan, nan, False, "not seen", *matrices)
+        errors = [self._add(believed, true) for true in scene.targets]
+        true = scene.targets[int(np.argmin(errors))]
+        add = min(errors)
+        shift = np.linalg.norm(believed[:3, 3] - true[:3, 3])
+        turn = rotation_angle(believed[:3, :3].T @ true[:3, :3])
+        recognised = add < RECOGNISED * self.part.diameter
+        parts = [index for index, one in enumerate(scene.lying) if one.body.part]
+        caught = outcome is not None and outcome.held in parts
+        failure = ""
+        if not caught:
+            failure = (
+                "wrong pose" if not recognised else "no plan" if outcome is None
+                else "collided" if outcome.collided else "slipped"
+            )  # fmt: skip
+        return Record(
+            *told, True, bool(recognised), 1000 * add, 1000 * float(shift),
+            float(np.degrees(turn)), caught, failure, *matrices,
+        )  # fmt: skip
+
+    def _add(self, believed: Transform, true: Transform) -> float:
+        """Return ADD, metres; of a symmetric part, to its nearest symmetric pose."""
+        points = transform(believed, self.part.points)
+        return min(
+            float(np.linalg.norm(points - transform(true @ one, self.part.points), axis=1).mean())
+            for one in self._symmetries
+        )
+
+    @cached_property
+    def _symmetries(self) -> np.ndarray:
+        return symmetry_group(self.part.symmetries_discrete, self.part.symmetries_continuous)
+
+    def _look(self, robot: Robot, rng: Generator) -> tuple[Joints, Transform]:
+        """Stand the arm where its camera sees the tray; return its joints and the camera."""
+        for _ in range(20):
+            wanted = looking_at(
+                TRAY + np.array([*rng.uniform(-0.01, 0.01, 2), 0.0]), rng.uniform(*self.distance),
+                rng.uniform(-TILT, TILT, 2), rng.uniform(-0.2, 0.2),
+            )  # fmt: skip
+            flange = wanted @ invert_transform(MOUNT)
+            joints = self.arm.joints(flange, HOME)
+            if joints is not None:
+                true = self.arm.flange(joints + robot.zero) @ robot.T_flange_cam
+                return joints, true
+        raise UserError(
+            f"--network {self.task.network}, which has learned to look from "
+            f"{self.distance[0]:.2f} to {self.distance[1]:.2f} m",
+            "distances at which this arm can hold its camera over the tray, up to about 0.6 m",
+            "train for nearer ones: working_distance=[0.2,0.4]",
+        )
+
+    def _cell(self, lying: Sequence[Lying]) -> Cell:
+        """Return a model of what lies there; those of parts alone are kept."""
+        things = [one.thing for one in lying]
+        if any(one.body.part is None for one in lying):
+            return Cell(things)
+        return self._kept(len(things))
+
+    def _kept(self, count: int) -> Cell:
+        if count not in self._cells:
+            self._cells[count] = Cell([self.layout.thing] * count)
+        return self._cells[count]
+
+    def _planner(self, scene: Scene) -> Planner:
+        count = 1 if self.task.layout == "single" else MOST_BELIEVED
+        return Planner(self.arm, self.gripper, self._kept(count), scene.calibrated.knowledge)
+
+    def _view(self, lying: Sequence[Lying]) -> View:
+        """Return what takes the picture: of MuJoCo's, one for parts alone is kept."""
+        if self.task.renderer != "mujoco":
+            return self._raster
+        things = [one.thing for one in lying]
+        if any(one.body.part is None for one in lying):
+            return MujocoView(things)
+        if len(things) not in self._views:
+            self._views[len(things)] = MujocoView(things)
+        return self._views[len(things)]
+
+    @cached_property
+    def _raster(self) -> RasterView:
+        return RasterView(self.task.renderer == "raster-shadows")
+
+
+def _height(T_base_obj: Transform) -> float:
+    return float(T_base_obj[2, 3])
+
+
+def _off(pose: Transform, error: tuple[float, float], rng: Generator) -> Transform:
+    """Return a pose that is off by millimetres and degrees."""
+    shift, axis = (one / np.linalg.norm(one) for one in rng.normal(size=(2, 3)))
+    turn = Rotation.from_rotvec(np.radians(error[1]) * axis).as_matrix()
+    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + 0.001 * error[0] * shift)

@@ -1,0 +1,38 @@
+"""An arm, its gripper and trials with exact poses, made once."""
+
+import numpy as np
+import pytest
+
+from dopepp.parts.catalogue import load_part
+from dopepp.robot.grasping.arm import Arm, measure_gripper
+from dopepp.robot.grasping.trial import Source, Task, Trials
+
+
+@pytest.fixture(scope="session")
+def arm():
+    return Arm()
+
+
+@pytest.fixture(scope="session")
+def gripper():
+    return measure_gripper()
+
+
+@pytest.fixture(scope="session")
+def part():
+    return load_part("pivconnector")
+
+
+@pytest.fixture(scope="session")
+def trials():
+    return Trials(Task(sources=(Source("exact"),)))
+
+
+@pytest.fixture(scope="session")
+def scene(trials):
+    return trials.scene(0)
+
+
+@pytest.fixture
+def straight_down():
+    return np.diag([1.0, -1.0, -1.0, 1.0])

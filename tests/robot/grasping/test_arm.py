@@ -1,0 +1,63 @@
+"""Kinematics beside Denavit and Hartenberg's, and the gripper beside its data sheet."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import rotation_angle
+from dopepp.robot.grasping.cell import HOME, TRAY
+
+# a, d and α of a UR5e as Menagerie's model has it, metres and radians.
+DH = (
+    (0.0, 0.163, np.pi / 2), (-0.425, 0.0, 0.0), (-0.392, 0.0, 0.0),
+    (0.0, 0.134, np.pi / 2), (0.0, 0.1, -np.pi / 2), (0.0, 0.1, 0.0),
+)  # fmt: skip
+
+angles = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6)
+
+
+def denavit_hartenberg(joints):
+    T = np.eye(4)
+    for q, (a, d, alpha) in zip(joints, DH, strict=True):
+        c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+        T = T @ np.array(
+            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+        )
+    return T
+
+
+@settings(max_examples=30, deadline=None)
+@given(angles)
+def test_the_flange_is_where_the_closed_form_has_it(arm, joints):
+    ours, theirs = arm.flange(np.array(joints)), denavit_hartenberg(joints)
+    np.testing.assert_allclose(ours[:3, 3], theirs[:3, 3], atol=2e-4)
+    np.testing.assert_allclose(ours[:3, 2], theirs[:3, 2], atol=1e-3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.18, 0.4), st.floats(-1.5, 1.5)))
+def test_joints_take_the_flange_to_a_pose_over_the_tray(arm, place):
+    x, y, z, yaw = place
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    goal = make_transform(turn @ np.diag([1.0, -1.0, -1.0]), TRAY + np.array([x, y, z]))
+    joints = arm.joints(goal, HOME)
+    assert joints is not None
+    reached = arm.flange(joints)
+    assert np.linalg.norm(reached[:3, 3] - goal[:3, 3]) < 2e-4
+    assert rotation_angle(reached[:3, :3].T @ goal[:3, :3]) < 2e-3
+
+
+@pytest.mark.parametrize("place", [[1.5, 0.0, 0.3], [0.0, 0.0, 3.0]])
+def test_a_pose_out_of_reach_has_no_joints(arm, straight_down, place):
+    straight_down[:3, 3] = place
+    assert arm.joints(straight_down) is None
+
+
+def test_the_gripper_opens_as_its_data_sheet_says(gripper):
+    assert gripper.widest == pytest.approx(0.085, abs=0.001)
+    assert abs(gripper.widths[-1]) < 0.001
+    assert (np.diff(gripper.widths) < 0).all()
+    assert gripper.command(gripper.widths[7]) == pytest.approx(255 * 7 / 17)
+    assert gripper.reach(0.04) > gripper.reach(0.085)

@@ -1,0 +1,57 @@
+"""The report counts as Table 9 does."""
+
+import csv
+import json
+
+import pytest
+
+from dopepp.robot.grasping.report import counted, markdown, write_report
+from dopepp.robot.grasping.trial import Record
+
+
+def record(number, *, recognised=True, caught=True, failure="", source="network", off=0.0):
+    seen = failure != "not seen"
+    add = 1.0 if seen else float("nan")
+    return Record(
+        number, source, off, seen, recognised, add, add, add, caught, failure, 0.2, 0.02
+    )  # fmt: skip
+
+
+@pytest.fixture
+def records():
+    """As many as the paper's first 50 and a few more, out of order."""
+    made = [record(k) for k in range(47)]
+    made += [record(k, caught=False, failure="slipped") for k in (47, 48)]
+    made.append(record(49, recognised=False, caught=False, failure="not seen"))
+    made += [record(k, caught=k != 52, failure="no plan" if k == 52 else "") for k in range(50, 54)]
+    made += [record(k, source="exact poses") for k in range(54)]
+    made += [record(k, source="exact poses, off", off=3.0, caught=k < 27) for k in range(54)]
+    return made[::-1]
+
+
+def test_recognised_and_caught_are_counted_per_50(records):
+    text = markdown([one for one in records if one.source == "network"], {"seed": 0})
+    assert "| 1–50 | 49 (98 %) | 47 (94 %) | 49 (98 %) | 47 (94 %) |" in text
+    assert "| 51–54 | 4 (100 %) | 3 (75 %) | – | – |" in text
+    # Wilson's interval of 181 of 200, by its formula.
+    assert "90.5 % (85.6 – 93.8)" in text
+
+
+def test_failures_are_counted_by_kind(records):
+    text = markdown(records, {})
+    row = next(line for line in text.splitlines() if line.startswith("| network |"))
+    assert row.split("|")[-6:-1] == [" 1 ", " 0 ", " 1 ", " 0 ", " 2 "]
+    assert counted(records).trials == 3 * 54
+
+
+def test_all_formats_hold_every_trial(records, tmp_path):
+    write_report(tmp_path, records, {"seed": 0})
+    with (tmp_path / "grasps.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    content = json.loads((tmp_path / "grasps.json").read_text())
+    assert len(rows) == len(content["trials"]) == len(records)
+    assert content["sources"]["network"]["caught"] == 50
+    unseen = [one for one in content["trials"] if not one["seen"]]
+    assert [(one["number"], one["add_mm"]) for one in unseen] == [(49, None)]
+    assert (tmp_path / "curve.png").is_file()
+    assert (tmp_path / "grasps.md").read_text().count("\n") > 10

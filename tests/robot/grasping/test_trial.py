@@ -1,0 +1,114 @@
+"""Trials: plans keep clear of what is believed, physics decides, and seeds repeat them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dopepp.geometry.camera import make_transform
+from dopepp.robot.grasping.cell import HOME, TRAY
+from dopepp.robot.grasping.grasps import Grasp
+from dopepp.robot.grasping.planner import rested
+from dopepp.robot.grasping.trial import Source, Trials
+
+
+@pytest.fixture
+def planner(trials, scene):
+    return trials._planner(scene)
+
+
+def test_a_part_at_a_known_pose_is_caught(trials, scene):
+    attempt = trials.attempt(scene, Source("exact"))
+    assert attempt.record.caught
+    assert attempt.record.recognised
+    assert attempt.record.failure == ""
+    assert attempt.record.add_mm == 0
+    # It hangs in the air at the end, and lay on the bench before.
+    states = attempt.outcome.states
+    assert states[-1][-5] > states[0][-5] + 0.1
+
+
+def test_a_part_that_is_elsewhere_is_not_caught(trials, scene, monkeypatch):
+    aside = [one @ make_transform(np.eye(3), [0.0, 0.05, 0.0]) for one in scene.targets]
+    monkeypatch.setattr(trials, "_poses", lambda *_: aside)
+    record = trials.attempt(scene, Source("exact")).record
+    assert not record.caught
+    assert not record.recognised
+    assert record.failure == "wrong pose"
+    assert record.error_mm == pytest.approx(50)
+
+
+def test_nothing_seen_is_a_failure_of_its_own(trials, scene, monkeypatch):
+    monkeypatch.setattr(trials, "_poses", lambda *_: [])
+    record = trials.attempt(scene, Source("exact")).record
+    assert (record.seen, record.caught, record.failure) == (False, False, "not seen")
+
+
+def test_one_seed_makes_one_trial(trials, scene):
+    trials.scene(1)  # what came between does not matter
+    again = trials.scene(0)
+    np.testing.assert_array_equal(again.picture, scene.picture)
+    np.testing.assert_array_equal(again.T_base_cam, scene.T_base_cam)
+    first, second = (trials.attempt(one, Source("exact")).outcome for one in (scene, again))
+    np.testing.assert_array_equal(first.states[-1], second.states[-1])
+
+
+def test_the_planner_comes_from_above_and_lifts(trials, scene, planner):
+    plan = planner.plan(scene.targets, trials.grasps, scene.joints)
+    assert plan is not None
+    flanges = [trials.arm.flange(one) for one in (*plan.descent, plan.lift[-1])]
+    heights = [one[2, 3] for one in flanges]
+    assert heights[0] - heights[-2] == pytest.approx(0.06, abs=0.001)
+    assert heights[-1] - heights[-2] == pytest.approx(0.12, abs=0.001)
+    ends = heights[-2] - trials.gripper.reach(plan.grasp.width)
+    assert 0 < ends < 0.003  # the pads' ends, above the bench
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn"),
+    [((1.2, 0, 0), np.eye(3)), ((0, 0, -0.02), np.eye(3)), ((0, 0, 0), np.diag([1.0, -1, -1]))],
+    ids=["out of reach", "inside the bench", "from below only"],
+)
+def test_there_is_no_plan(trials, scene, planner, shift, turn):
+    pose = make_transform(turn, TRAY + np.array([0, 0, 0.0035]) + np.array(shift))
+    front = [one for one in trials.grasps if one.approach[2] < -0.9]
+    assert planner.plan([pose], front, scene.joints) is None
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "rise", "is_laid"),
+    [
+        (0, 0, True),
+        (3, 0.002, True),
+        (6, -0.003, True),
+        (30, 0, True),
+        (30, 0.02, False),
+        (1, 0.02, False),
+    ],
+)
+def test_a_part_that_seems_to_lie_on_the_bench_is_laid_on_it(trials, tilt_deg, rise, is_laid):
+    bench = make_transform(np.eye(3), np.array([0.3, 0.1, 0.02]))
+    flat = make_transform(np.eye(3), np.array([0.0, 0.5, 0.0235]))
+    tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
+    seen = make_transform(tilt, flat[:3, 3] + np.array([0.0, 0.0, rise]))
+    laid = rested(seen, trials.layout.body.hull, bench)
+    if is_laid:
+        np.testing.assert_allclose(laid[:3, 2], [0, 0, 1], atol=1e-9)
+        assert laid[2, 3] == pytest.approx(0.0235, abs=1e-9)
+        assert np.linalg.norm(laid[:2, 3] - flat[:2, 3]) < 0.001
+    else:
+        np.testing.assert_array_equal(laid, seen)
+
+
+def test_a_plan_keeps_clear_of_another_part(trials, part):
+    knowledge = trials.robot(0)[1].knowledge
+    scene = SimpleNamespace(calibrated=SimpleNamespace(knowledge=knowledge))
+    crowded = Trials(replace(trials.task, layout="heap"))
+    planner = crowded._planner(scene)
+    lower = make_transform(np.eye(3), TRAY + np.array([0, 0, 0.0035]))
+    over = make_transform(np.eye(3), TRAY + np.array([0, 0.02, 0.012]))
+    across = [Grasp(np.zeros(3), np.array([0, 1.0, 0]), np.array([0, 0, -1.0]), 0.052)]
+    assert planner.plan([lower], across, HOME) is not None
+    assert planner.plan([lower, over], across, HOME) is None
