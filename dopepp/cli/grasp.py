@@ -62,7 +62,7 @@ def grasp(
     with report_errors():
         _require()
         from dopepp.robot.grasping.experiment import check_task, make_experiment
-        from dopepp.robot.grasping.trial import Task
+        from dopepp.robot.grasping.task import Task
 
         known = NETWORKS.get(part)
         if network is None and known is not None:

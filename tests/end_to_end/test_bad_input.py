@@ -35,7 +35,7 @@ def train(call, tiny, tmp_path):
         (["modl=dope"], "override 'modl', which names no option"),
         (["model=dopeppp"], "model=dopeppp; allowed: dope dopepp"),
         (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),
-        (["data=ycb"], "data=ycb; allowed: bop bop_renders hybrid ndds virtual webdataset ycb_video"),
+        (["data=ycb"], "data=ycb; allowed: bop bop_renders hybrid ndds virtual webdataset"),
         (["trainer.max_epochs"], "trainer.max_epochs"),
         (["trainer.max_epochs=1,2"], "Ambiguous value"),
         (["trainer.max_epochs=many"], "trainer.max_epochs='many'; allowed: an integer from 1"),

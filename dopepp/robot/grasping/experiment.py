@@ -28,7 +28,8 @@ from dopepp.robot.grasping.layouts import LAYOUTS
 from dopepp.robot.grasping.rehearsal import SIZE
 from dopepp.robot.grasping.report import markdown, write_report
 from dopepp.robot.grasping.solid import convex_pieces
-from dopepp.robot.grasping.trial import BLOCK, Record, Source, Task, Trials
+from dopepp.robot.grasping.task import BLOCK, Record, Source, Task
+from dopepp.robot.grasping.trial import Trials
 from dopepp.robot.grasping.view import RENDERERS, open_gl
 
 MAX_TRIALS: Final = 100_000

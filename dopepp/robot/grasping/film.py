@@ -20,7 +20,8 @@ from dopepp.geometry.camera import invert_transform, project_keypoints
 from dopepp.robot.grasping.cell import TRAY, Cell
 from dopepp.robot.grasping.execution import FRAME_S
 from dopepp.robot.grasping.rehearsal import MOUNT, TRUE_K
-from dopepp.robot.grasping.trial import Attempt, Record, Scene, Task, Trials
+from dopepp.robot.grasping.task import Record, Task
+from dopepp.robot.grasping.trial import Attempt, Scene, Trials
 from dopepp.robot.grasping.view import has_gl, open_gl
 
 VIDEO_SIZE: Final = (640, 480)

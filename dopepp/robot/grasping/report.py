@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.files import write_csv, write_picture, write_whole
-from dopepp.robot.grasping.trial import BLOCK, EXACT, FAILURES, Record
+from dopepp.robot.grasping.task import BLOCK, EXACT, FAILURES, Record
 
 PAPER: Final = ((49, 47), (46, 46), (47, 43), (46, 45))
 """Table 9: recognised and caught of every 50 grasps, with a real arm."""

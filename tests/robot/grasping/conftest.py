@@ -5,7 +5,8 @@ import pytest
 
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.arm import Arm, measure_gripper
-from dopepp.robot.grasping.trial import Source, Task, Trials
+from dopepp.robot.grasping.task import Source, Task
+from dopepp.robot.grasping.trial import Trials
 
 
 @pytest.fixture(scope="session")

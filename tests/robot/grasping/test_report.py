@@ -6,7 +6,7 @@ import json
 import pytest
 
 from dopepp.robot.grasping.report import counted, markdown, write_report
-from dopepp.robot.grasping.trial import Record
+from dopepp.robot.grasping.task import Record
 
 
 def record(number, *, recognised=True, caught=True, failure="", source="network", off=0.0):

@@ -11,7 +11,8 @@ from dopepp.geometry.camera import make_transform
 from dopepp.robot.grasping.cell import HOME, TRAY
 from dopepp.robot.grasping.grasps import Grasp
 from dopepp.robot.grasping.planner import rested
-from dopepp.robot.grasping.trial import Source, Trials
+from dopepp.robot.grasping.task import Source
+from dopepp.robot.grasping.trial import Trials
 
 
 @pytest.fixture
