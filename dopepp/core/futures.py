@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -28,6 +29,19 @@ THREAD_LIMITS: Final = (
     "NUMBA_NUM_THREADS",
 )
 """Environment variables that limit the threads of libraries loaded after they are set."""
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Let processes that are started here have one thread per library."""
+    kept = {name: os.environ[name] for name in THREAD_LIMITS if name in os.environ}
+    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
+    try:
+        yield
+    finally:
+        for name in THREAD_LIMITS:
+            del os.environ[name]
+        os.environ.update(kept)
 
 
 def available_cores() -> int:

@@ -24,7 +24,7 @@ from queue import SimpleQueue
 from threading import Timer
 from typing import Any, Final
 
-from dopepp.core.futures import THREAD_LIMITS, completed, connect, spread
+from dopepp.core.futures import completed, connect, one_thread_each, spread
 from dopepp.core.interrupts import StoppedError
 from dopepp.data.jobs.work import Outcome, Task, Worker
 from dopepp.virtual.renderers.photoreal.variant import THREADS_SETTING
@@ -172,20 +172,16 @@ def _serve(connection: Connection) -> None:
 def _sheltered() -> Iterator[None]:
     """Let children inherit one thread per library, and signals blocked from their first moment."""
     # Ctrl-C reaches every process of the terminal, but only this one decides what to do.
-    kept = {name: os.environ[name] for name in THREAD_LIMITS if name in os.environ}
-    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     can_block = hasattr(signal, "pthread_sigmask")
     if can_block:
         resource_tracker.ensure_running()  # it starts with the first process, and unblocks signals
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS) if can_block else set()
     try:
-        yield
+        with one_thread_each():
+            yield
     finally:
         if can_block:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name in THREAD_LIMITS:
-            del os.environ[name]
-        os.environ.update(kept)
 
 
 class ClusterPool(Pool):

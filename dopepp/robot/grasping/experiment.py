@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from multiprocessing import get_context
@@ -19,7 +17,7 @@ import numpy as np
 from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import check_target
-from dopepp.core.futures import THREAD_LIMITS, available_cores
+from dopepp.core.futures import available_cores, one_thread_each
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.cell import Cell
 from dopepp.robot.grasping.film import show
@@ -195,16 +193,3 @@ def _gathered(pipes: list[Connection]) -> Iterator[Record]:
                 open_pipes.remove(pipe)
             else:
                 yield message
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Let processes that are started here have one thread per library."""
-    kept = {name: os.environ[name] for name in THREAD_LIMITS if name in os.environ}
-    os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
-    try:
-        yield
-    finally:
-        for name in THREAD_LIMITS:
-            del os.environ[name]
-        os.environ.update(kept)
