@@ -8,13 +8,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import cache
-from importlib import import_module
 from typing import Any, Final
 
 from dopepp.core.errors import UserError
 from dopepp.inference.sources.message import info_topic
-from dopepp.robot.nodes.messages import DIAGNOSTICS, Fields, Message, Triangles
+from dopepp.robot.nodes.messages import DIAGNOSTICS, Message
+from dopepp.robot.nodes.native import native, type_of
 from dopepp.robot.nodes.pump import Pump
 from dopepp.robot.nodes.worker import Worker
 
@@ -65,9 +64,9 @@ class _Node:
                 rospy.set_param(f"~{parameter}", value)
         self.tick()
         compressed = topic.endswith("/compressed")
-        kind = _type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
+        kind = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
         own = {"queue_size": 1, "buff_size": LARGEST, "tcp_nodelay": True}
-        info = _type_of("sensor_msgs/CameraInfo")
+        info = type_of("sensor_msgs/CameraInfo")
         rospy.Subscriber(info_topic(topic), info, self._pump.take_info, **own)
         rospy.Subscriber(topic, kind, self._pump.take_picture, **own)
 
@@ -99,7 +98,7 @@ class _Node:
             return
         own = topic if topic.startswith("/") else f"~{topic}"
         try:
-            message = _type_of(kind)
+            message = type_of(kind)
         except ImportError:
             logger.warning("without %s: %s is not published", kind.partition("/")[0], own)
             return
@@ -112,39 +111,3 @@ class _Node:
     def _is_heard(self, topic: str) -> bool:
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_num_connections() > 0
-
-
-def native(kind: str, fields: Fields) -> Any:
-    """Return ROS 1's message of plain values; what they leave out is 0 or empty."""
-    return _fill(_type_of(kind)(), fields)
-
-
-def _fill(message: Any, fields: Fields) -> Any:
-    kinds = dict(zip(message.__slots__, message._slot_types, strict=True))
-    for name, value in fields.items():
-        setattr(message, name, _value(getattr(message, name), kinds[name], value))
-    return message
-
-
-def _value(default: Any, kind: str, value: Any) -> Any:
-    """Return a field's value; ``kind`` is how ROS writes its type."""
-    if kind == "time":
-        return type(default)(value["sec"], value["nanosec"])
-    if isinstance(value, dict):
-        return _fill(default, value)
-    if isinstance(value, Triangles):
-        return _points(value)
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return [native(kind.removesuffix("[]"), one) for one in value]
-    return value
-
-
-@cache
-def _points(triangles: Triangles) -> list[Any]:
-    return [native("geometry_msgs/Point", one) for one in triangles.points]
-
-
-@cache
-def _type_of(kind: str) -> Any:
-    package, _, name = kind.partition("/")
-    return getattr(import_module(f"{package}.msg"), name)

@@ -7,19 +7,17 @@ What has no messages installed (``vision_msgs``, ``tf2_msgs``) is left out, whic
 
 from __future__ import annotations
 
-import array
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError
 from dopepp.inference.sources.message import info_topic
-from dopepp.robot.nodes.messages import DIAGNOSTICS, Fields, Message, Triangles
+from dopepp.robot.nodes.messages import DIAGNOSTICS, Message
+from dopepp.robot.nodes.native import native, type_of
 from dopepp.robot.nodes.pump import Pump
 from dopepp.robot.nodes.worker import Worker
 
@@ -117,7 +115,7 @@ class _Node:
 
     def _advertise(self, topic: str, kind: str) -> None:
         try:
-            message = _type_of(kind)
+            message = type_of(kind)
         except ImportError:
             package = kind.partition("/")[0]
             logger.warning("without %s: %s is not published", package, self._own(topic))
@@ -130,8 +128,8 @@ class _Node:
 
         policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
         compressed = self._topic.endswith("/compressed")
-        kind = _type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
-        info, beside = _type_of("sensor_msgs/CameraInfo"), info_topic(self._topic)
+        kind = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
+        info, beside = type_of("sensor_msgs/CameraInfo"), info_topic(self._topic)
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
         for old in self._picture or ():
             self.handle.destroy_subscription(old)
@@ -175,45 +173,6 @@ class _Node:
 
     def _own(self, topic: str) -> str:
         return topic if topic.startswith("/") else f"~/{topic}"
-
-
-def native(kind: str, fields: Fields) -> Any:
-    """Return ROS 2's message of plain values; what they leave out is 0 or empty."""
-    return _fill(_type_of(kind)(), fields)
-
-
-def _fill(message: Any, fields: Fields) -> Any:
-    kinds = message.get_fields_and_field_types()
-    for name, value in fields.items():
-        setattr(message, name, _value(getattr(message, name), kinds[name], value))
-    return message
-
-
-def _value(default: Any, kind: str, value: Any) -> Any:
-    """Return a field's value; ``kind`` is how ROS writes its type."""
-    if isinstance(value, dict):
-        return _fill(default, value)
-    if isinstance(value, Triangles):
-        return _points(value)
-    if isinstance(value, bytes):
-        return array.array("B", value)  # anything else is checked byte by byte
-    if kind == "octet":
-        return bytes([value])
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        inner = kind.removeprefix("sequence<").removesuffix(">")
-        return [native(inner, one) for one in value]
-    return value
-
-
-@cache
-def _points(triangles: Triangles) -> list[Any]:
-    return [native("geometry_msgs/Point", one) for one in triangles.points]
-
-
-@cache
-def _type_of(kind: str) -> Any:
-    package, _, name = kind.partition("/")
-    return getattr(import_module(f"{package}.msg"), name)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ pytest.importorskip("genpy", reason="needs ROS 1's genpy and messages")
 pytest.importorskip("geometry_msgs.msg")
 
 from dopepp.robot.nodes.messages import Speaker, diagnosis
-from dopepp.robot.nodes.ros1 import native
+from dopepp.robot.nodes.native import native
 from dopepp.robot.nodes.worker import Stamp
 
 

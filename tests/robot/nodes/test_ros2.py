@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 def test_messages_are_filled_by_their_own_types():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
     from dopepp.robot.nodes.messages import diagnosis, picture
-    from dopepp.robot.nodes.ros2 import native
+    from dopepp.robot.nodes.native import native
     from dopepp.robot.nodes.worker import Stamp
 
     message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
@@ -57,7 +57,8 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
     from rclpy.qos import qos_profile_sensor_data
 
     from dopepp.robot.nodes.messages import picture
-    from dopepp.robot.nodes.ros2 import _Node, native
+    from dopepp.robot.nodes.native import native
+    from dopepp.robot.nodes.ros2 import _Node
     from dopepp.robot.nodes.worker import Worker
 
     rclpy.init()
