@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from dopepp.cli.errors import report_errors
+from dopepp.cli.options import Device
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def benchmark(
     ] = None,
     refine: Annotated[str | None, typer.Option(help="region: on the picture")] = None,
     frames: Annotated[int, typer.Option("-n", min=1, max=100_000, help="frames to time")] = 50,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    device: Device = "cpu",
 ) -> None:
     """Print what a frame takes, from picture to poses, with the parts of it, in milliseconds."""
     with report_errors():

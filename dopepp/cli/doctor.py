@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from dopepp.cli.errors import report_errors
+from dopepp.cli.options import CameraFile, Crop, Device, KSize, Meshes, Unit
 
 
 def doctor(
@@ -17,18 +18,9 @@ def doctor(
         tuple[float, float, float, float] | None,
         typer.Option("--K", help="fx fy cx cy, pixels; or --camera"),
     ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(help="camera file: ROS, OpenCV, BOP, COLMAP, or text with 3×3 numbers"),
-    ] = None,
-    K_size: Annotated[
-        tuple[int, int] | None,
-        typer.Option("--K-size", help="width height that K is of, if the picture was resized"),
-    ] = None,
-    crop: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option(help="x y width height, if the picture was cut out of the calibrated one"),
-    ] = None,
+    camera: CameraFile = None,
+    K_size: KSize = None,
+    crop: Crop = None,
     distance: Annotated[
         tuple[float, float] | None,
         typer.Option(help="nearest and farthest part, metres; else those of training"),
@@ -36,14 +28,9 @@ def doctor(
     refine: Annotated[
         str | None, typer.Option(help="region: judge the poses that --refine region makes")
     ] = None,
-    parts: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--part", help="mesh in place of the checkpoint's: built-in part, file, or NAME=FILE"
-        ),
-    ] = None,
-    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    parts: Meshes = None,
+    unit: Unit = None,
+    device: Device = "cpu",
 ) -> None:
     """Say what is wrong with a picture, its camera or its part, and what to do, a line each.
 

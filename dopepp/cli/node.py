@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from dopepp.cli.errors import resumable
+from dopepp.cli.options import Device
 from dopepp.core.errors import UserError, require
 
 if TYPE_CHECKING:
-    from dopepp.geometry.camera_file import Camera
     from dopepp.robot.nodes.worker import Worker
 
 LINES: Final = ("--json", "--udp")
@@ -67,7 +67,7 @@ def node(
     overlay: Annotated[
         bool, typer.Option("--overlay", help="publish pictures with the poses drawn on them")
     ] = False,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    device: Device = "cpu",
 ) -> None:
     """Say the poses on every picture of a camera, until Ctrl-C.
 
@@ -79,10 +79,13 @@ def node(
         way = _way([one for one, given in ways.items() if given], words, out, params)
         if refine not in (None, "region"):
             raise UserError(f"--refine {refine}", "region, or none", "leave it out")
-        known = _camera(intrinsics, camera)
+
+        from dopepp.geometry.camera import camera_matrix
+        from dopepp.inference.lens import given_camera, one_camera
+
+        known = given_camera(None if intrinsics is None else camera_matrix(*intrinsics), camera)
 
         from dopepp.inference.estimator import PoseEstimator
-        from dopepp.inference.lens import one_camera
         from dopepp.inference.sources import open_sources
         from dopepp.robot.nodes.worker import Settings, Worker
 
@@ -136,20 +139,6 @@ def _way(given: Sequence[str], words: Sequence[str], out: Path | None, params: P
     if way in PACKAGES:
         require(PACKAGES[way][0], way, PACKAGES[way][1])
     return way
-
-
-def _camera(
-    intrinsics: tuple[float, float, float, float] | None, file: Path | None
-) -> Camera | None:
-    """Return the camera of all pictures, None where each comes with its own."""
-    from dopepp.geometry.camera import camera_matrix
-    from dopepp.geometry.camera_file import Camera, read_camera
-
-    if intrinsics is not None and file is not None:
-        raise UserError("--K and --camera", "one of the two", "leave one of them out")
-    if intrinsics is not None:
-        return Camera(None, camera_matrix(*intrinsics), (), "--K")
-    return None if file is None else read_camera(file)
 
 
 def _answer(worker: Worker, bag: Path, out: Path, topic: str | None, name: str) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dopepp.cli.errors import resumable
+from dopepp.cli.options import CameraFile, Crop, Device, KSize, Meshes, Unit
 from dopepp.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -40,18 +41,9 @@ def predict(
         tuple[float, float, float, float] | None,
         typer.Option("--K", help="fx fy cx cy, pixels; or --camera; a bag may have its own"),
     ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(help="camera file: ROS, OpenCV, BOP, COLMAP, or text with 3×3 numbers"),
-    ] = None,
-    K_size: Annotated[
-        tuple[int, int] | None,
-        typer.Option("--K-size", help="width height that K is of, if the picture was resized"),
-    ] = None,
-    crop: Annotated[
-        tuple[int, int, int, int] | None,
-        typer.Option(help="x y width height, if the picture was cut out of the calibrated one"),
-    ] = None,
+    camera: CameraFile = None,
+    K_size: KSize = None,
+    crop: Crop = None,
     topic: Annotated[
         str | None, typer.Option(help="of a ROS bag's pictures, where it has several")
     ] = None,
@@ -81,14 +73,9 @@ def predict(
     verify: Annotated[
         bool, typer.Option("--verify", help="print how well picture and drawn part agree, 0 to 1")
     ] = False,
-    parts: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--part", help="mesh in place of the checkpoint's: built-in part, file, or NAME=FILE"
-        ),
-    ] = None,
-    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    parts: Meshes = None,
+    unit: Unit = None,
+    device: Device = "cpu",
     save: Annotated[
         Path | None, typer.Option(help="folder for pictures and videos with the poses drawn")
     ] = None,

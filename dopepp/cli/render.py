@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperCommand
 
 from dopepp.cli.errors import resumable
+from dopepp.cli.options import Unit
 
 
 class RenderCommand(TyperCommand):
@@ -32,7 +33,7 @@ def render(
     ],
     out: Annotated[Path, typer.Option(help="folder of the data set; with --preview also a .png")],
     num: Annotated[int | None, typer.Option("-n", help="number of images")] = None,
-    unit: Annotated[str | None, typer.Option(help="of the mesh files: mm, cm, m, inch")] = None,
+    unit: Unit = None,
     layout: Annotated[str, typer.Option("--format", help="bop, ndds or webdataset")] = "bop",
     preset: Annotated[str, typer.Option(help="what the scenes are like")] = "paper",
     size: Annotated[

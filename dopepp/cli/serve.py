@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from dopepp.cli.errors import report_errors
+from dopepp.cli.options import Device
 
 
 def serve(
@@ -21,7 +22,7 @@ def serve(
         int | None, typer.Option(min=1, max=65535, help="else the first free one from 7860")
     ] = None,
     refine: Annotated[str | None, typer.Option(help="region: on the picture")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    device: Device = "cpu",
 ) -> None:
     """Show a page for this machine's browser: drop a picture, see its poses, download them.
 

@@ -45,12 +45,10 @@ class Lens:
         return metres if lens is None else undistorted_depth(metres, K, lens)
 
 
-def one_camera(
-    K: CameraMatrix | None, camera: Camera | Path | str | None, source: Source
-) -> Camera:
-    """Return the camera that one of two arguments gives, or else the source's own.
+def given_camera(K: CameraMatrix | None, camera: Camera | Path | str | None) -> Camera | None:
+    """Return the camera that one of two arguments gives; None where neither does.
 
-    A :class:`UserError`: both are given, or there is none at all; or as from :func:`read_camera`.
+    A :class:`UserError`: both are given; or as from :func:`read_camera`.
     """
     if K is not None and camera is not None:
         raise UserError("--K and --camera", "one of the two", "leave one of them out")
@@ -58,7 +56,17 @@ def one_camera(
         return Camera(None, K, (), "--K")
     if isinstance(camera, Path | str):
         return read_camera(camera)
-    known = camera or source.camera
+    return camera
+
+
+def one_camera(
+    K: CameraMatrix | None, camera: Camera | Path | str | None, source: Source
+) -> Camera:
+    """Return the camera that one of two arguments gives, or else the source's own.
+
+    A :class:`UserError`: as from :func:`given_camera`, or there is none at all.
+    """
+    known = given_camera(K, camera) or source.camera
     if known is None:
         raise UserError(
             f"neither --K nor --camera for {source.name}", "one of the two",
