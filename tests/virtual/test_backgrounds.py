@@ -11,7 +11,15 @@ from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_picture
-from dopepp.virtual.backgrounds import PhotoBackgrounds, ProceduralBackgrounds, find_backgrounds
+from dopepp.parts.catalogue import pivconnector
+from dopepp.virtual import Factory, Preset, customised_preset
+from dopepp.virtual.backgrounds import (
+    PhotoBackgrounds,
+    ProceduralBackgrounds,
+    cluttered,
+    find_backgrounds,
+)
+from dopepp.virtual.backgrounds.cluttered import ClutteredBackgrounds
 
 
 def write_photos(folder: Path, count: int, side: int = 40) -> None:
@@ -206,3 +214,64 @@ def test_procedural_pictures_have_detail_at_every_size():
         assert np.median([image.std() for image in images]) > 15
         means = np.array([image.mean(axis=(0, 1)) for image in images])
         assert means.std(axis=0).min() > 20
+
+
+class Grey:
+    def draw(self, rng, width, height):
+        return np.full((height, width, 3), 77, np.uint8)
+
+    def identity(self):
+        return ["grey"]
+
+
+def covered(number: int, seed: int, size=(96, 64)) -> float:
+    clutter = ClutteredBackgrounds(Grey(), (number, number))
+    image = clutter.draw(np.random.default_rng(seed), *size)
+    assert image.shape == (size[1], size[0], 3)
+    assert image.dtype == np.uint8
+    return float((image != 77).any(axis=2).mean())
+
+
+def test_clutter_covers_more_the_more_there_is_and_never_all():
+    few, many = ([covered(number, seed) for seed in range(40)] for number in (5, 40))
+    assert 0.02 < np.mean(few) < np.mean(many) < 0.9
+    assert covered(0, 1) == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (200, 3), (640, 480)])
+def test_clutter_depends_on_the_generator_only_and_leaves_what_is_behind(size):
+    behind = ProceduralBackgrounds()
+    clutter = ClutteredBackgrounds(behind, (30, 30))
+    for seed in range(4):
+        image, again = (clutter.draw(np.random.default_rng(seed), *size) for _ in range(2))
+        np.testing.assert_array_equal(image, again)
+        plain = behind.draw(np.random.default_rng(seed), *size)
+        assert min(size) < 4 or 0.05 < (image == plain).all(axis=2).mean() < 0.98
+
+
+def test_clutter_has_edges_between_the_pixels(monkeypatch):
+    monkeypatch.setattr(cluttered, "_PLAIN_SHARE", 1.0)
+    monkeypatch.setattr(
+        cluttered, "_plain", lambda rng, width, height: np.full((height, width, 3), 255, np.uint8)
+    )
+    clutter = ClutteredBackgrounds(Grey(), (5, 5))
+    for seed in range(10):
+        image = clutter.draw(np.random.default_rng(seed), 128, 128)[..., 0]
+        inside, between = image == 255, (image > 77) & (image < 255)
+        assert inside.any()
+        # Fewer than two pixels wide, all along the outlines.
+        rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3))) - inside
+        assert 0.3 * rim.sum() < between.sum() < 3 * rim.sum()
+
+
+def test_a_preset_without_clutter_draws_as_if_there_were_none():
+    def render(clutter):
+        preset = customised_preset("quickstart", {"clutter": clutter})
+        return Factory([pivconnector()], preset, 3).render(0, 0)
+
+    plain, some = render([0, 0]), render([20, 20])
+    reference = Factory([pivconnector()], customised_preset("quickstart", {}), 3).render(0, 0)
+    np.testing.assert_array_equal(plain.image, reference.image)
+    assert (some.image != plain.image).any(axis=2).mean() > 0.1
+    with pytest.raises(UserError, match="clutter"):
+        Preset("bad", 64, 64, clutter=(-1, 3))

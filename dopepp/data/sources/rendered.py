@@ -85,9 +85,9 @@ class RenderedSource:
         # What was rendered before there were these keeps its identity.
         if self.scale != 1:
             identity["scale"] = self.scale
-        for name in ("window", "depths"):
+        for name in ("window", "depths", "clutter"):
             value = getattr(self.factory.preset, name)
-            if value is not None:
+            if value is not None and any(value):
                 identity[name] = list(value)
         return [SourceInfo(self.name, self._num_items, identity)]
 

@@ -26,6 +26,7 @@ from dopepp.geometry.rotation import Vector, random_rotation
 from dopepp.virtual.arrange.composition import Composition
 from dopepp.virtual.arrange.tabletop import arrange_on_table
 from dopepp.virtual.backgrounds import Backgrounds
+from dopepp.virtual.backgrounds.cluttered import ClutteredBackgrounds
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.presets.table import plane_of
@@ -51,6 +52,8 @@ def random_scene(
     has it: it decides from where the scene is seen, nothing else. A UserError: the part is too
     large or too small for the preset to show it, or the scale takes the camera below the table.
     """
+    if any(preset.clutter):
+        backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter)
     order = rng.permutation(len(targets))
     low, high = preset.targets_per_image
     count = int(rng.integers(low, high + 1))
