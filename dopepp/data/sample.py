@@ -152,6 +152,7 @@ class Purpose(IntEnum):
     AUGMENT = 104
     BACKGROUND = 105
     SHADING = 106
+    WINDOW = 107
 
 
 def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:

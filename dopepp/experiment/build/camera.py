@@ -52,11 +52,17 @@ def fitted_to_camera(config: RunConfig, parts: Parts) -> RunConfig:
 def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     """Return a config with the camera, and the distances, of the test's BOP pictures.
 
-    Only where renders alone are learned, those pictures are the test, and no camera is given.
+    Only where renders are learned, those pictures are the test, and no camera is given; nor, where
+    some of what is learned is real, an input size.
     """
     data, virtual = config.data, config.data.virtual
-    rendered = data.real_fraction == 0 and data.format == "bop"
-    if not rendered or virtual.camera is not None or data.is_rendered("test"):
+    rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
+    if (
+        not rendered
+        or data.format != "bop"
+        or virtual.camera is not None
+        or data.is_rendered("test")
+    ):
         return config
     source = labelled_images(data, parts, data.eval_seed, "test")
     view = source.view() if isinstance(source, BopSource) else None

@@ -26,6 +26,7 @@ from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
+from dopepp.data.sources.windowed import WindowedSource
 from dopepp.drawing.pictures import Size
 from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
 from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
@@ -169,9 +170,7 @@ def _train_source(
     """Mix real frames, their synthetic companions and renders."""
     real, synthetic = None, None
     if data.root is not None and data.real_fraction > 0:
-        real = kept(
-            labelled_images(data, parts, seed, "train"), data, data.cache, data.network_input
-        )
+        real = _real_frames(data, parts, seed)
     elif data.real_fraction > 0:
         if data.real_fraction == 1:
             raise UserError(
@@ -197,6 +196,17 @@ def _train_source(
         data.synthetic_fraction,
         name=data.name,
     )
+
+
+def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
+    """Open the labelled images as the network sees them: in a camera of its own, windows."""
+    frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
+    if view is None:
+        return kept(frames, data, data.cache, data.network_input)
+    box = Letterbox.scaled(view.size, data.virtual.camera_scale or 1.0)
+    picture = box.width, box.height
+    whole = kept(frames, data, data.cache, picture)
+    return WindowedSource(whole, picture, data.network_input, seed)
 
 
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:

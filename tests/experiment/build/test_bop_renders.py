@@ -15,6 +15,7 @@ from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sources.rendered import RenderedSource
 from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.sources import build_datamodule, build_parts, held_out_source
+from dopepp.geometry.camera import project_keypoints
 from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets.preset import customised_preset
@@ -73,6 +74,27 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     assert module.test_source.sample(0).K[0, 0] == 210.0
     said = config("virtual.working_distance=[0.4,0.7]")
     assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
+
+
+def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
+    given = config(
+        "virtual.preset=upright", "data.real_fraction=0.5", "data.image_sets.train=test",
+        "virtual.camera_scale=0.9",
+    )  # fmt: skip
+    parts = build_parts(given.data)
+    data = fitted_to_camera(given, parts).data
+    width, height = data.network_input
+    module = build_datamodule(data, parts, 0)
+    samples = [module.train_item(0, index) for index in range(8)]
+    by_source = {one.source: one for one in samples}
+    assert set(by_source) == {"bop/test", "virtual"}
+    cuboids = {part.name: part.cuboid for part in parts}
+    for sample in samples:
+        assert sample.size == (width, height)
+        assert sample.K[0, 0] == pytest.approx(0.9 * 210, rel=0.02)
+        for one in sample.instances:
+            shown = project_keypoints(cuboids[one.label], one.T_cam_obj, sample.K)
+            np.testing.assert_allclose(one.keypoints, shown, atol=1e-6)
 
 
 def test_labelled_training_images_must_be_there_where_a_share_of_them_is_asked_for(config):
