@@ -18,7 +18,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape, Size
-from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform
+from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, crop_camera
 
 
 @dataclass
@@ -216,6 +216,40 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
     ]
     depth = None if sample.depth is None else pad(sample.depth)
     return replace(sample, image=pad(sample.image), depth=depth, instances=instances)
+
+
+def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
+    """Cut (width, height) pixels out of an image, from (left, top) on.
+
+    Of the objects, visible fractions become smaller by what lies outside: of the mask's pixels, or,
+    where there is no mask, of the area of the cuboid's outline.
+    """
+    width, height = size
+
+    def cut(pixels: NDArray[Any]) -> NDArray[Any]:
+        return pixels[top : top + height, left : left + width]
+
+    def kept(one: Instance) -> Instance:
+        """Return an object as the crop shows it."""
+        keypoints = one.keypoints - (left, top)
+        if one.mask is None:
+            mask = None
+            inside, _ = hull_areas(keypoints, (height, width))
+            before, _ = hull_areas(one.keypoints, sample.image.shape)
+        else:
+            mask = cut(one.mask)
+            inside, before = float(mask.sum()), float(one.mask.sum())
+        share = min(inside / before, 1.0) if before else 0.0
+        visible = one.visible_fraction * share
+        return replace(one, keypoints=keypoints, mask=mask, visible_fraction=visible)
+
+    return replace(
+        sample,
+        image=cut(sample.image),
+        K=crop_camera(sample.K, left, top),
+        depth=None if sample.depth is None else cut(sample.depth),
+        instances=[kept(one) for one in sample.instances],
+    )
 
 
 def letterbox_sample(sample: Sample, input_size: Size) -> Sample:

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dopepp.data.sample import (
     DescribedSource,
-    Instance,
     Purpose,
     Sample,
     SourceInfo,
-    hull_areas,
+    crop_sample,
     item_rng,
     pad_sample,
     resize_sample,
 )
 from dopepp.drawing.pictures import Size
-from dopepp.geometry.camera import crop_camera
 from dopepp.geometry.cuboid import CENTROID
 
 
@@ -58,7 +54,7 @@ class WindowedSource:
         first = np.maximum(np.ceil(middle - size + 0.5), 0)
         last = np.minimum(np.floor(middle + 0.5), np.array(sample.size) - size)
         left, top = np.floor(first + rng.uniform(0, 1, 2) * (last - first + 1)).astype(int).tolist()
-        window = cropped(sample, left, top, (int(size[0]), int(size[1])))
+        window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
         return pad_sample(window, self._window)
 
     def contains(self, label: str) -> bool:
@@ -71,35 +67,3 @@ class WindowedSource:
         return [
             replace(info, identity={**info.identity, **sizes}) for info in self._source.describe()
         ]
-
-
-def cropped(sample: Sample, left: int, top: int, size: Size) -> Sample:
-    """Cut (width, height) pixels out of an image, from (left, top) on.
-
-    Of the objects, visible fractions become smaller by what lies outside: of the mask's pixels, or,
-    where there is no mask, of the area of the cuboid's outline.
-    """
-    width, height = size
-
-    def cut(pixels: NDArray[Any]) -> NDArray[Any]:
-        return pixels[top : top + height, left : left + width]
-
-    def in_window(one: Instance) -> Instance:
-        keypoints = one.keypoints - (left, top)
-        mask = None if one.mask is None else cut(one.mask)
-        if one.mask is not None and mask is not None:
-            inside, before = float(mask.sum()), float(one.mask.sum())
-        else:
-            inside = hull_areas(keypoints, (height, width))[0]
-            before = hull_areas(one.keypoints, sample.image.shape)[0]
-        share = min(inside / before, 1.0) if before else 0.0
-        visible = one.visible_fraction * share
-        return replace(one, keypoints=keypoints, mask=mask, visible_fraction=visible)
-
-    return replace(
-        sample,
-        image=cut(sample.image),
-        K=crop_camera(sample.K, left, top),
-        depth=None if sample.depth is None else cut(sample.depth),
-        instances=[in_window(one) for one in sample.instances],
-    )

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dopepp.data.sample import Sample, letterbox_sample
+from dopepp.data.sample import Sample, crop_sample, letterbox_sample
 from dopepp.data.sources.rendered import RenderedSource
-from dopepp.data.sources.windowed import WindowedSource, cropped
+from dopepp.data.sources.windowed import WindowedSource
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector
@@ -82,10 +82,11 @@ def test_what_a_window_cuts_off_is_not_visible(has_mask):
     columns = np.flatnonzero(WHOLE.sample(0).instances[0].mask.any(axis=0))
     middle = int(columns.mean())
     halves = [
-        cropped(sample, 0, 0, (middle, 240)), cropped(sample, middle, 0, (320 - middle, 240)),
-    ]  # fmt: skip
+        crop_sample(sample, 0, 0, (middle, 240)),
+        crop_sample(sample, middle, 0, (320 - middle, 240)),
+    ]
     fractions = [half.instances[0].visible_fraction for half in halves]
     assert sum(fractions) == pytest.approx(one.visible_fraction, abs=1e-3)
     assert min(fractions) > 0.1
-    aside = cropped(sample, 0, 0, (2, 2)).instances[0]
+    aside = crop_sample(sample, 0, 0, (2, 2)).instances[0]
     assert aside.visible_fraction == 0
