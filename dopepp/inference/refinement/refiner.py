@@ -8,6 +8,7 @@ where part and background are of one colour.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
@@ -149,6 +150,10 @@ def _by_depth(measured: DepthEvidence) -> Refinement:
     """Refine with depth alone; an :class:`UndecidedError` where it does not decide."""
     end = measured.descend()
     measured.check(end.T_cam_obj)
+    return _of_depth(end)
+
+
+def _of_depth(end: Solution) -> Refinement:
     return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 
 
@@ -159,22 +164,25 @@ def _by_both(
     alone: Refinement,
     measured: DepthEvidence,
 ) -> Refinement:
-    """Refine on picture and depth, from where the picture alone has led.
+    """Refine on picture and depth, from where the picture alone has led, or else from depth's end.
 
-    Where that has not decided, depth leads, and its own end is what both may still improve.
+    Where the picture does not decide, depth's own end is what remains.
 
     Raises:
-        UndecidedError: Depth does not decide.
+        UndecidedError: Depth does not decide, or contradicts what the picture has decided.
     """
     if alone.covariance is not None:
         start = Solution(alone.T_cam_obj, np.linalg.inv(alone.covariance))
-        return _together(region, image, K, start, measured)
+        with contextlib.suppress(UndecidedError):  # too far from the surface that depth shows
+            return _together(region, image, K, start, measured)
     start = measured.descend()
     try:
         return _together(region, image, K, start, measured)
     except UndecidedError:
+        if alone.covariance is not None:
+            raise
         measured.check(start.T_cam_obj)
-        return Refinement(start.T_cam_obj, np.linalg.inv(start.information))
+        return _of_depth(start)
 
 
 def _together(

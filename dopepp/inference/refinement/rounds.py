@@ -192,7 +192,7 @@ class Round:
         """
         contour = self._outline(end.T_cam_obj)
         agreement = self._agreement(contour, reach)
-        if self._gain(end, known) < LEAST_GAIN:
+        if self._gain(end, prior, known) < LEAST_GAIN:
             raise UndecidedError("colours inside and around the part are too alike")
         if agreement.share < LEAST_AGREEING:
             raise UndecidedError(
@@ -206,7 +206,9 @@ class Round:
             )
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
         near = self._followed and np.mean((rows @ offset) ** 2) < 1.0
-        if not near:  # of a followed part within a pixel, single pixels would decide
+        # Of a followed part within a pixel, single pixels would decide; what pulls besides may
+        # well move a pose to where the picture alone fits less.
+        if not near and not self._more:
             after = self.log_likelihood(end.T_cam_obj, prior)
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the picture fits the given pose no worse")
@@ -226,13 +228,13 @@ class Round:
         share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
         return Agreement(share, float((agrees & (weights > TOLD)).mean()))
 
-    def _gain(self, end: Solution, known: Float[np.ndarray, "6 6"]) -> float:
-        """Return by how much the outline makes the covariance's volume smaller, its logarithm.
+    def _gain(self, end: Solution, prior: Prior, known: Float[np.ndarray, "6 6"]) -> float:
+        """Return by how much the outline makes the prior's volume smaller, its logarithm.
 
         What it says of a followed part, whose pose was known well, is measured against one that
         was known less.
         """
-        said = end.information - known
+        said, known = end.information - known, prior.information
         if self._followed:
             turn, shift = FIRM
             firm = np.repeat([turn, shift * float(end.T_cam_obj[2, 3])], 3) ** 2

@@ -143,6 +143,21 @@ def test_picture_and_depth_refine_in_one_and_each_without_the_other(picture, mea
         assert add(part, refined.T_cam_obj, TRUE) < better
 
 
+def test_depth_is_followed_where_the_outline_is_too_large():
+    """A print or a focal length that is off by 4 % makes the picture put the part too near."""
+    part = pivconnector()
+    nearer = TRUE.copy()
+    nearer[:3, 3] *= 0.96
+    image, depth = seen(part, nearer)[0], seen(part, TRUE)[1]
+    picture, both = (PartRefiner(part, terms) for terms in (["region"], ["region", "depth"]))
+    for seed in range(3):
+        start = started(TRUE, np.random.default_rng(seed))
+        assert picture.refine(image, K, start).T_cam_obj[2, 3] < 0.98 * TRUE[2, 3]
+        refined = both.refine(image, K, start, depth=depth)
+        assert refined.reason == ""
+        assert add(part, refined.T_cam_obj, TRUE) < 1e-3
+
+
 def test_planes_pull_by_what_is_measured_on_the_part(box):
     """Of a face that lies 4 mm too far, the step is that, whatever hides it."""
     off = FACING.copy()
