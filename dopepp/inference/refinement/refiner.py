@@ -29,7 +29,7 @@ from dopepp.recovery.detection import Detection
 
 TERMS: Final = ("region", "depth")
 
-LOOSER: Final = 4.0
+LOOSER: Final = 3.0
 """Factor on the deviations of a network's pose: its covariance was learned on pictures like those
 of its training, and it is farther off on others."""
 
