@@ -1,9 +1,9 @@
 """Poses made precise: one solver, and the evidence that ``refine=`` names as its terms.
 
 ``region`` is the outline on the picture, ``depth`` a depth image. Where both are asked for, the
-picture alone leads to a start, or depth where the picture does not decide; from there both pull at
-once. What does not decide is left out: without depth the picture refines alone, and depth alone
-where part and background are of one colour.
+picture alone leads to a start, or depth where the picture does not decide or leads too far from the
+measured surface; from there both pull at once. What does not decide is left out: without depth the
+picture refines alone, and depth alone where part and background are of one colour.
 """
 
 from __future__ import annotations

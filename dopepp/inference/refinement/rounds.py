@@ -234,12 +234,12 @@ class Round:
         What it says of a followed part, whose pose was known well, is measured against one that
         was known less.
         """
-        said, known = end.information - known, prior.information
+        said, before = end.information - known, prior.information
         if self._followed:
             turn, shift = FIRM
             firm = np.repeat([turn, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
-            known = np.linalg.inv(np.linalg.inv(known) + np.diag(firm))
-        return float(np.linalg.slogdet(known + said)[1] - np.linalg.slogdet(known)[1])
+            before = np.linalg.inv(np.linalg.inv(before) + np.diag(firm))
+        return float(np.linalg.slogdet(before + said)[1] - np.linalg.slogdet(before)[1])
 
     @property
     def _followed(self) -> bool:
