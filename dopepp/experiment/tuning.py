@@ -26,7 +26,7 @@ from dopepp.experiment.config.parse import Share
 from dopepp.experiment.memory import Memory
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.metrics.functional import add, add_s, expected_calibration_error
+from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
 from dopepp.metrics.pose import assign, counted
 from dopepp.metrics.row import symmetries
 from dopepp.models.checkpoint.schema import Checkpoint
@@ -161,11 +161,12 @@ def fit_factors(
     distance = calibration.fit_distance_factor(estimated, true)
     surprises = []
     for one, equivalents in pairs:
-        T = one.T_cam_obj.copy()
-        T[:3, 3] *= distance
-        surprises.append(
-            min(calibration.squared_distance(T, one.covariance, other) for other in equivalents)
-        )
+        stated = np.broadcast_to(one.covariance, (len(equivalents), 6, 6)).copy()
+        T_est = np.broadcast_to(one.T_cam_obj, equivalents.shape).copy()
+        T_est[:, :3, 3] *= distance
+        poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
+        away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
+        surprises.append(float(away.min()) ** 2)
     covariance = calibration.fit_covariance_factor(np.array(surprises))
     return {"distance_factor": distance, "covariance_factor": covariance}
 

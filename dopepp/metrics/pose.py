@@ -47,11 +47,12 @@ CurveMeasure = Literal["add", "add_s", "mssd"]
 InstanceError = Literal["add", "add_s", "mssd", "rotation_deg", "rotation_s_deg", "translation"]
 """An error that every instance has; angles are in degrees, the others in metres."""
 
-_WIDTH: Final = 45
+_WIDTH: Final = 81
 _T_EST, _T_GT, _CAMERA = slice(1, 17), slice(17, 33), slice(33, 43)
-_VISIBLE, _SCORE = 43, 44
+_VISIBLE, _SCORE, _COVARIANCE = 43, 44, slice(45, 81)
 """One instance in the state: object index, T_est (NaN for a miss), T_gt, K and image width (NaN
-where unknown), visible fraction, score (NaN for a miss)."""
+where unknown), visible fraction, score (NaN for a miss), covariance (NaN for a miss, and where
+unknown)."""
 
 
 class PredictedPose(Protocol):
@@ -68,6 +69,10 @@ class PredictedPose(Protocol):
     @property
     def T_cam_obj(self) -> Transform:  # noqa: N802
         """Estimated pose, metres."""
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"] | None:
+        """As of :class:`~dopepp.recovery.detection.Detection`; None where nothing states it."""
 
 
 class TruePose(Protocol):
@@ -186,6 +191,8 @@ class PoseMetrics(Metric):
                 if number >= 0:
                     table[number, _T_EST] = np.ravel(detection.T_cam_obj)
                     table[number, _SCORE] = detection.score
+                    if detection.covariance is not None:
+                        table[number, _COVARIANCE] = np.ravel(detection.covariance)
             self._keep(self.poses, table[[counted(instance) for instance in true]])
             strays = [(index, own[k].score) for k in np.flatnonzero(found < 0)]
             self._keep(self.false_positives, np.array(strays, np.float64))
@@ -264,7 +271,7 @@ class Gathered:
     def __init__(
         self,
         part: Part,
-        table: Float[Tensor, "n 45"],
+        table: Float[Tensor, "n 81"],
         false_positives: Float[Tensor, "false_positives"],
     ) -> None:
         self.part, self.false_positives = part, false_positives
@@ -272,7 +279,8 @@ class Gathered:
         self.visible_fractions, self.scores = table[:, _VISIBLE], table[:, _SCORE]
         camera = table[:, _CAMERA]
         self.K = camera[:, :9].reshape(-1, 3, 3)
-        self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9])
+        covariance = table[:, _COVARIANCE].reshape(-1, 6, 6)
+        self.errors = PoseErrors.of(part, T_est, self.T_gt, self.K, camera[:, 9], covariance)
 
     def row(self, method: str) -> PoseRow:
         """Sum up; only the false positives of an object without ground truth mean anything."""
@@ -286,6 +294,8 @@ class Gathered:
         matched = int(errors.add.isfinite().sum())
         row.median_translation = finite_median(errors.translation)
         row.p90_translation = finite_p90(errors.translation)
+        if errors.deviations is not None:
+            row.median_deviations = finite_median(errors.deviations)
         near = (errors.translation < 0.05) & (errors.rotation_s_deg < 5)
         row.pass_5cm_5deg = float(near.double().mean())
         row.miss_rate = 1 - matched / len(errors.add)

@@ -24,6 +24,7 @@ from dopepp.metrics.functional import (
     add_s,
     auc,
     average_recall,
+    mahalanobis,
     mspd,
     mssd,
     pass_rate,
@@ -36,6 +37,9 @@ from dopepp.parts.part import Part
 NOT_AVAILABLE: Final = "n/a"
 
 Poses = Float[Tensor, "n 4 4"]
+
+_USUAL_MAHALANOBIS: Final = 2.3126
+"""Median of the Mahalanobis distance of six Gaussian numbers: the root of chi-squared's."""
 
 
 @dataclass
@@ -51,6 +55,8 @@ class PoseErrors:
         rotation_deg: Angle between the orientations, degrees.
         rotation_s_deg: The least such angle over the part's symmetries, degrees.
         translation: Distance between the object frame's origins, metres.
+        deviations: Mahalanobis distance by the estimate's own covariance, over the median that
+            right covariances give; infinite, too, where none is known. None of guesses.
     """
 
     add: Errors
@@ -60,14 +66,22 @@ class PoseErrors:
     rotation_deg: Errors
     rotation_s_deg: Errors
     translation: Errors
+    deviations: Errors | None = None
 
     @classmethod
     def of(
-        cls, part: Part, T_est: Poses, T_gt: Poses, K: Float[Tensor, "n 3 3"], width: Errors
+        cls,
+        part: Part,
+        T_est: Poses,
+        T_gt: Poses,
+        K: Float[Tensor, "n 3 3"],
+        width: Errors,
+        covariance: Float[Tensor, "n 6 6"],
     ) -> PoseErrors:
         """Compute them, of estimated poses (NaN for a miss) and true ones, metres.
 
-        Camera matrices and the images' widths are pixels, NaN where unknown.
+        Camera matrices and the images' widths are pixels, NaN where unknown; covariances are those
+        of :class:`~dopepp.recovery.detection.Detection`, NaN where an estimate has none.
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
@@ -81,6 +95,7 @@ class PoseErrors:
             rotation_deg=rotation_error_deg(poses[0], poses[2]),
             rotation_s_deg=rotation_error_deg(poses[0], poses[2], group),
             translation=translation_error(poses[1], poses[3]),
+            deviations=mahalanobis(*poses, covariance, group) / _USUAL_MAHALANOBIS,
         )
 
 
@@ -125,6 +140,9 @@ class PoseRow:
         median_translation: Over matched instances, metres.
         p90_rotation_deg: Nine of ten matched instances are below, degrees.
         p90_translation: Nine of ten matched instances are below, metres.
+        median_deviations: By how many times the true errors of matched instances exceed the
+            standard deviations that the estimates state, in the median: 1 is honest; None without
+            covariances.
         miss_rate: Share of instances without a matched prediction.
         precision: TP / (TP + FP); 0 without predictions.
         false_positives: Predictions matched with no instance.
@@ -151,6 +169,7 @@ class PoseRow:
     median_translation: float | None = None
     p90_rotation_deg: float | None = None
     p90_translation: float | None = None
+    median_deviations: float | None = None
     miss_rate: float | None = None
     precision: float | None = None
     false_positives: int | None = None
@@ -221,6 +240,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     Column("median_translation", "translation mm", 1000, 1, "median"),
     Column("p90_rotation_deg", "rotation 90 % °", 1, 1, "median"),
     Column("p90_translation", "translation 90 % mm", 1000, 1, "median"),
+    Column("median_deviations", "error / stated", 1, 1, "median"),
     Column("miss_rate", "missed %", 100, 1, "detection"),
     Column("average_precision", "AP[ADD-0.1d] %", 100, 1, "detection"),
     Column("precision", "precision %", 100, 1, "detection"),

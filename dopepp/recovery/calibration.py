@@ -28,10 +28,8 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import (
     CameraMatrix,
-    Transform,
     project,
     project_keypoints,
-    step_between,
     transform,
 )
 from dopepp.geometry.cuboid import NUM_CORNERS, Cuboid
@@ -219,17 +217,6 @@ def fit_distance_factor(
         return 1.0
     distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
     return float(np.clip(np.median(distances[0] / distances[1]), *DISTANCE_FACTORS))
-
-
-def squared_distance(
-    T_cam_obj: Transform, covariance: Float[np.ndarray, "6 6"], true: Transform
-) -> float:
-    """Return the squared Mahalanobis distance of a true pose from an estimated one.
-
-    The covariance is that of :class:`~dopepp.recovery.detection.Detection`.
-    """
-    away = step_between(T_cam_obj, true)
-    return float(away @ np.linalg.solve(covariance, away))
 
 
 def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:

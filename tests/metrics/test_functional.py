@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import KDTree
+from scipy.spatial import distance as scipy_distance
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from dopepp.geometry.symmetry import symmetry_group
 from dopepp.metrics.functional import (
     add,
     add_s,
+    mahalanobis,
     mspd,
     mssd,
     reprojection_error,
@@ -199,6 +201,41 @@ def test_a_point_behind_the_camera_is_a_miss_in_pixels_alone():
     for error in IN_PIXELS.values():
         assert error(R, behind, R, t, cloud(5)).tolist() == [0, math.inf]
     assert mssd(R, behind, R, t, cloud(5)).isfinite().all()
+
+
+def test_mahalanobis_distance_equals_scipy():
+    R_est, t_est, R_gt, t_gt = poses(6, 4)
+    root = torch.from_numpy(np.random.default_rng(4).normal(size=(6, 6, 6)))
+    covariance = root @ root.mT + 0.01 * torch.eye(6)
+    turns = Rotation.from_matrix(R_gt.numpy()) * Rotation.from_matrix(R_est.numpy()).inv()
+    steps = np.column_stack([turns.as_rotvec(), (t_gt - t_est).numpy()])
+    expected = [
+        scipy_distance.mahalanobis(step, np.zeros(6), np.linalg.inv(one.numpy()))
+        for step, one in zip(steps, covariance, strict=True)
+    ]
+    assert_allclose(mahalanobis(R_est, t_est, R_gt, t_gt, covariance), expected, rtol=1e-6)
+
+
+def test_mahalanobis_distance_takes_the_nearest_symmetry():
+    R, t, _, _ = poses(5, 5)
+    group = torch.from_numpy(np.stack([np.eye(4), HALF_TURN]))
+    turned = R @ group[1, :3, :3], t + R @ group[1, :3, 3]
+    stated = torch.eye(6).expand(5, 6, 6)
+    assert_allclose(mahalanobis(R, t, *turned, stated, group), 0, atol=1e-7)
+    assert (mahalanobis(R, t, *turned, stated) > 3).all()  # half a turn is π
+
+
+def test_mahalanobis_distance_without_a_covariance_is_infinite():
+    R, t, _, _ = poses(4, 6)
+    covariance = torch.eye(6).tile(4, 1, 1)
+    covariance[1] = math.nan
+    covariance[2] = 0.0
+    assert mahalanobis(R, t, R, t, covariance).tolist() == [0, math.inf, math.inf, 0]
+    t[3, 0] = math.nan
+    assert mahalanobis(R, t, R, t, covariance)[3] == math.inf
+    with pytest.raises(ValueError, match=r"covariance must be \(N, 6, 6\)"):
+        mahalanobis(R, t, R, t, covariance[:2])
+    assert mahalanobis(R[:0], t[:0], R[:0], t[:0], covariance[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])

@@ -21,7 +21,7 @@ from dopepp.metrics.pose import PoseMetrics
 from dopepp.parts.part import Part
 
 NUM_IMAGES = 13
-Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj", "covariance"], defaults=[None])
 
 
 def metric() -> PoseMetrics:

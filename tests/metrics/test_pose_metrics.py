@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance
-from dopepp.geometry.camera import make_transform
+from dopepp.geometry.camera import make_transform, moved
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.metrics.functional import add, add_s, auc, mspd, mssd, pass_rate, rotation_error_deg
 from dopepp.metrics.pose import MEAN, PoseMetrics
@@ -26,7 +26,7 @@ from dopepp.parts.part import Mesh, Part
 
 Array = NDArray[np.float64]
 
-Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj", "covariance"], defaults=[None])
 
 
 def part(name: str, seed: int = 0) -> Part:
@@ -43,6 +43,25 @@ def truth(name: str, T: Array, visible: float = 1.0) -> Instance:
 
 
 K = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+
+
+def test_errors_are_compared_with_what_estimates_state_of_themselves():
+    rng = np.random.default_rng(1)
+    deviation = np.array([0.02, 0.01, 0.01, 0.002, 0.002, 0.005])
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    metric = PoseMetrics([replace(part("box"), symmetries_discrete=flip[None])])
+    for number in range(1500):
+        T = pose(0, tuple(rng.normal(size=3)))
+        found = moved(T, 3 * deviation * rng.normal(size=6))
+        found = found @ flip if number % 2 else found
+        metric.update([Detection("box", 1, found, np.diag(deviation**2))], [truth("box", T)])
+    assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
+    assert metric.compute()[MEAN].median_deviations == pytest.approx(3, rel=0.05)
+    metric.update([], [truth("box", pose())])  # a miss states nothing
+    assert metric.compute()["box"].median_deviations == pytest.approx(3, rel=0.05)
+    file = PoseMetrics([part("box")])
+    file.update([Detection("box", 1, pose(0.01))], [truth("box", pose())])
+    assert file.compute()["box"].median_deviations is None
 
 
 def test_rows_agree_with_the_functions():

@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from scipy.spatial.distance import mahalanobis
-from scipy.spatial.transform import Rotation
 from scipy.special import expit
 from scipy.stats import chi2
 
@@ -27,7 +25,6 @@ from dopepp.recovery.calibration import (
     fit_weights,
     rescored,
     score,
-    squared_distance,
 )
 from dopepp.recovery.detection import Detection
 
@@ -106,16 +103,6 @@ def test_the_covariance_factor_is_that_of_chi_squared():
     drawn[:500] = 1e9  # wrong detections
     assert 3.0 < fit_covariance_factor(drawn) < 3.5
     assert fit_covariance_factor(drawn[:0]) == 1.0
-
-
-def test_the_distance_of_a_pose_is_that_of_its_turn_and_shift():
-    step = np.array([0.02, -0.01, 0.03, 0.001, 0.002, -0.004])
-    turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    moved = make_transform(turn @ T[:3, :3], T[:3, 3] + step[3:])
-    covariance = np.diag([1e-4, 4e-4, 1e-4, 1e-6, 1e-6, 9e-6])
-    covariance[0, 1] = covariance[1, 0] = 1e-4
-    expected = mahalanobis(step, np.zeros(6), np.linalg.inv(covariance)) ** 2
-    assert squared_distance(T, covariance, moved) == pytest.approx(expected)
 
 
 def test_refined_poses_keep_the_networks_score_until_another_is_fitted():

@@ -134,6 +134,7 @@ class FilePose:
     score: float
     T_cam_obj: Transform
     keypoints: Float[np.ndarray, "9 2"]
+    covariance: None = None
 
 
 class FileMethod:

@@ -11,6 +11,7 @@ against an independent implementation.
 from dopepp.metrics.functional.distances import (
     add,
     add_s,
+    mahalanobis,
     mspd,
     mssd,
     reprojection_error,
@@ -42,6 +43,7 @@ __all__ = [
     "average_precision",
     "average_recall",
     "expected_calibration_error",
+    "mahalanobis",
     "match",
     "mspd",
     "mssd",

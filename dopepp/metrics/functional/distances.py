@@ -7,6 +7,7 @@ from typing import Final
 
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dopepp.metrics.functional.search import least_farthest, mean_nearest
@@ -26,7 +27,8 @@ def add(
     R_est: Rotations, t_est: Positions, R_gt: Rotations, t_gt: Positions, points: Points
 ) -> Errors:
     """Average distance between corresponding points at both poses (ADD, paper Eq. 1), metres."""
-    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    points = _check_points(points)
     # R_est·x + t_est − R_gt·x − t_gt needs one product instead of two.
     rotation, translation = R_est - R_gt, t_est - t_gt
     errors = t_est.new_empty(len(t_est))
@@ -44,7 +46,8 @@ def add_s(
 
     Exact, for symmetric objects; one tree over the object's points serves all poses.
     """
-    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    points = _check_points(points)
     everything = torch.cat([R_est.flatten(1), t_est, R_gt.flatten(1), t_gt], dim=1)
     valid = everything.isfinite().all(dim=1).nonzero()[:, 0]
     errors = torch.full_like(t_est[:, 0], torch.inf)
@@ -69,7 +72,8 @@ def mssd(
     The transforms S are taken as they are: put the identity among them, as
     :func:`dopepp.geometry.symmetry.symmetry_group` does. (S, 3, 3) are rotations.
     """
-    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    points = _check_points(points)
     group = _check_symmetries(symmetries, t_est)
     return least_farthest((R_est, t_est), (R_gt, t_gt), points, group, perspective=False)
 
@@ -87,7 +91,8 @@ def reprojection_error(
     One K serves all poses, or each has its own. A point at or behind the camera in either pose
     makes the error infinite.
     """
-    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    points = _check_points(points)
     K = _check_cameras(K, len(R_est))
     errors = t_est.new_empty(len(t_est))
     for chunk in _chunks(len(t_est), len(points)):
@@ -112,7 +117,8 @@ def mspd(
     it infinite. K is one camera matrix, or one for every pose, pixels; symmetries are as of
     :func:`dopepp.metrics.functional.mssd`.
     """
-    R_est, t_est, R_gt, t_gt, points = _check_poses(R_est, t_est, R_gt, t_gt, points)
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    points = _check_points(points)
     K = _check_cameras(K, len(R_est))
     group = _check_symmetries(symmetries, t_est)
     # Pixels are the first two of K·x over x's depth, whatever the last row of K holds.
@@ -167,26 +173,70 @@ def translation_error(t_est: Positions, t_gt: Positions) -> Errors:
     return nan_is_miss((to_float64(t_est) - to_float64(t_gt)).norm(dim=1))
 
 
+def mahalanobis(
+    R_est: Rotations,
+    t_est: Positions,
+    R_gt: Rotations,
+    t_gt: Positions,
+    covariance: Float[Tensor, "n 6 6"],
+    symmetries: Symmetries | None = None,
+) -> Errors:
+    """How many of an estimate's own standard deviations the true pose is away, √(δᵀ Σ⁻¹ δ).
+
+    The step δ leads from the estimated to the true pose: a turn about the object's origin (rotation
+    vector) and a shift, camera axes, radians and metres; Σ is its covariance. It is infinite, too,
+    where a covariance is not finite or is singular. Of symmetries, which are as of
+    :func:`dopepp.metrics.functional.mssd`, the nearest counts.
+    """
+    R_est, t_est, R_gt, t_gt = _check_poses(R_est, t_est, R_gt, t_gt)
+    covariance = to_float64(covariance)
+    if covariance.shape != (len(t_est), 6, 6):
+        raise ValueError(f"covariance must be (N, 6, 6), got {tuple(covariance.shape)}")
+    errors = torch.full_like(t_est[:, 0], torch.inf)
+    everything = torch.cat([one.flatten(1) for one in (R_est, t_est, R_gt, t_gt, covariance)], 1)
+    known = everything.isfinite().all(dim=1).nonzero()[:, 0]
+    if not len(known):
+        return errors
+    R_est, t_est, R_gt, t_gt, covariance = (
+        one[known] for one in (R_est, t_est, R_gt, t_gt, covariance)
+    )
+    for turn, shift in zip(*_check_symmetries(symmetries, t_est), strict=True):
+        turns = Rotation.from_matrix((R_gt @ turn @ R_est.mT).cpu().numpy()).as_rotvec()
+        shifts = t_gt + R_gt @ shift - t_est
+        step = torch.cat([torch.from_numpy(turns).to(shifts), shifts], dim=1)
+        solved, _ = torch.linalg.solve_ex(covariance, step)
+        squared = (step * solved).sum(dim=1)
+        away = torch.where(squared >= 0, squared.sqrt(), torch.inf)
+        errors[known] = torch.fmin(errors[known], away)
+    return nan_is_miss(errors)
+
+
 def to_float64(array: Tensor) -> Tensor:
     """Return any array as a float64 tensor on its own device."""
     return torch.as_tensor(array, dtype=torch.float64)
 
 
 def _check_poses(
-    R_est: Tensor, t_est: Tensor, R_gt: Tensor, t_gt: Tensor, points: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    R_est: Tensor, t_est: Tensor, R_gt: Tensor, t_gt: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cast to float64 and insist on the shapes that broadcasting would otherwise hide.
 
-    A wrong shape, or no points, are a ``ValueError``.
+    A wrong shape is a ``ValueError``.
     """
-    R_est, t_est, R_gt, t_gt, points = map(to_float64, (R_est, t_est, R_gt, t_gt, points))
+    R_est, t_est, R_gt, t_gt = map(to_float64, (R_est, t_est, R_gt, t_gt))
     n = len(t_est)
     shapes = [tuple(tensor.shape) for tensor in (R_est, t_est, R_gt, t_gt)]
     if shapes != [(n, 3, 3), (n, 3), (n, 3, 3), (n, 3)]:
         raise ValueError(f"poses must be (N, 3, 3), (N, 3), (N, 3, 3), (N, 3), got {shapes}")
+    return R_est, t_est, R_gt, t_gt
+
+
+def _check_points(points: Tensor) -> Points:
+    """Cast to float64; a wrong shape, or no points, are a ``ValueError``."""
+    points = to_float64(points)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"points must be (V, 3) with V >= 1, got {tuple(points.shape)}")
-    return R_est, t_est, R_gt, t_gt, points
+    return points
 
 
 def _check_cameras(K: Tensor, num_poses: int) -> Rotations:

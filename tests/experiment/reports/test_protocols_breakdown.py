@@ -33,7 +33,7 @@ K = camera_matrix(600, 610, 320, 240)
 RATES = (ADD_5CM, ADD_01D)
 Array = NDArray[np.float64]
 
-Detection = namedtuple("Detection", ["object", "score", "T_cam_obj"])
+Detection = namedtuple("Detection", ["object", "score", "T_cam_obj", "covariance"], defaults=[None])
 
 
 def part(name: str, scale: float = 1.0) -> Part:
