@@ -264,6 +264,18 @@ def test_clutter_has_edges_between_the_pixels(monkeypatch):
         assert 0.3 * rim.sum() < between.sum() < 3 * rim.sum()
 
 
+def test_a_backgrounds_contrast_is_changed_about_its_mean():
+    behind = ProceduralBackgrounds()
+    for seed in range(6):
+        plain = behind.draw(np.random.default_rng(seed), 96, 64).astype(float)
+        for factor in (0.0, 0.5, 3.0):
+            changed = ClutteredBackgrounds(behind, (0, 0), (factor, factor))
+            image = changed.draw(np.random.default_rng(seed), 96, 64)
+            expected = np.clip(plain.mean() + factor * (plain - plain.mean()), 0, 255)
+            assert image.dtype == np.uint8
+            np.testing.assert_allclose(image, expected, atol=0.51)
+
+
 def test_a_preset_without_clutter_draws_as_if_there_were_none():
     def render(clutter):
         preset = customised_preset("quickstart", {"clutter": clutter})

@@ -52,8 +52,8 @@ def random_scene(
     has it: it decides from where the scene is seen, nothing else. A UserError: the part is too
     large or too small for the preset to show it, or the scale takes the camera below the table.
     """
-    if any(preset.clutter):
-        backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter)
+    if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):
+        backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter, preset.background_contrast)
     order = rng.permutation(len(targets))
     low, high = preset.targets_per_image
     count = int(rng.integers(low, high + 1))

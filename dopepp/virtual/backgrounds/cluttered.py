@@ -35,21 +35,31 @@ class ClutteredBackgrounds:
     Args:
         behind: What lies behind, and what half of the pieces are cut out of; the others are plain.
         number: Smallest and largest number of pieces.
+        contrast: Smallest and largest factor on the whole picture's contrast, about its mean.
     """
 
-    def __init__(self, behind: Backgrounds, number: tuple[int, int]) -> None:
-        self.behind, self.number = behind, number
+    def __init__(
+        self,
+        behind: Backgrounds,
+        number: tuple[int, int],
+        contrast: tuple[float, float] = (1.0, 1.0),
+    ) -> None:
+        self.behind, self.number, self.contrast = behind, number, contrast
 
     def identity(self) -> list[str]:
-        """Return what lies behind, and the number of pieces."""
-        return [*self.behind.identity(), "cluttered", *map(str, self.number)]
+        """Return what lies behind, the number of pieces and the contrast."""
+        return [*self.behind.identity(), "cluttered", *map(str, (*self.number, *self.contrast))]
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return a background with pieces on it."""
         image = self.behind.draw(rng, width, height).copy()
         for _ in range(int(rng.integers(self.number[0], self.number[1] + 1))):
             self._add_piece(rng, image)
-        return image
+        if self.contrast == (1.0, 1.0):
+            return image
+        factor = rng.uniform(*self.contrast)
+        image = image * np.float32(factor) + np.float32((1 - factor) * image.mean())
+        return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
     def _add_piece(self, rng: Generator, image: Picture) -> None:
         """Lay a piece on a picture; what of it is beyond the border is cut off."""

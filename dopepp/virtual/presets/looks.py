@@ -32,6 +32,8 @@ class Materials:
         roughness: GGX roughness of dielectrics.
         specular: Their reflectance at normal incidence.
         texture_gain: Factor on the colours of surfaces that have some.
+        texture_tint: Largest relative deviation of one colour channel from that factor: a scan's
+            colours are another camera's.
         noise: Relative amplitude of the albedo's variation over an untextured surface.
         noise_pitch: Size of that variation over the object's radius.
         metal_albedo: Their reflectance at normal incidence.
@@ -50,6 +52,7 @@ class Materials:
     roughness: tuple[float, float] = (0.25, 0.9)
     specular: tuple[float, float] = (0.02, 0.07)
     texture_gain: tuple[float, float] = (0.7, 1.2)
+    texture_tint: float = 0.0
     noise: tuple[float, float] = (0.0, 0.12)
     noise_pitch: tuple[float, float] = (0.02, 0.2)
     metal_share: float = 0.15
@@ -64,6 +67,7 @@ class Materials:
     alike_share: float = 0.5
 
     def __post_init__(self) -> None:
+        check_number("texture_tint", self.texture_tint, 0.0, 1.0, "share", of=self)
         for kind in ("coloured", "metal", "brushed", "print", "alike"):
             name = f"{kind}_share"
             check_number(name, getattr(self, name), 0.0, 1.0, "share", of=self)
@@ -82,9 +86,11 @@ class Materials:
         """Draw what a surface is made of."""
         pitch = surface.radius * rng.uniform(*self.noise_pitch)
         if surface.is_coloured:
-            gain = rng.uniform(*self.texture_gain)
+            gain = np.full(3, rng.uniform(*self.texture_gain))
+            if self.texture_tint:
+                gain *= 1 + rng.uniform(-self.texture_tint, self.texture_tint, 3)
             roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
-            return Material((gain, gain, gain), roughness, specular, noise_pitch=pitch)
+            return Material(triple(gain), roughness, specular, noise_pitch=pitch)
         noise = rng.uniform(*self.noise)
         if rng.random() < self.metal_share:
             return self._metal(rng, noise, pitch)

@@ -68,6 +68,7 @@ class Preset:
         depths: Smallest and largest depth of the targets' cuboids' centres, metres; None for any.
         clutter: Smallest and largest number of flat pieces of other pictures that the background
             is littered with.
+        background_contrast: Smallest and largest factor on the background's contrast.
     """
 
     name: str
@@ -85,14 +86,16 @@ class Preset:
     materials: Materials = field(default_factory=Materials)
     distractors: Distractors = field(default_factory=Distractors)
     sensors: Sensors = field(default_factory=Sensors)
-    # Without these three, what describes a preset is as it was before there were any.
+    # Without these, what describes a preset is as it was before there were any.
     window: tuple[int, int] | None = field(default=None, repr=False)
     depths: tuple[float, float] | None = field(default=None, repr=False)
     clutter: tuple[int, int] = field(default=(0, 0), repr=False)
+    background_contrast: tuple[float, float] = field(default=(1.0, 1.0), repr=False)
 
     def __post_init__(self) -> None:
         check_range("targets_per_image", self.targets_per_image, 0, 100, "a count", of=self)
         check_range("clutter", self.clutter, 0, 1000, "a count", of=self)
+        check_range("background_contrast", self.background_contrast, 0.0, 10.0, "factor", of=self)
         for name in ("width", "height"):
             check_number(name, getattr(self, name), 8, 16384, "pixels", of=self)
         for side in self.window or ():

@@ -5,7 +5,7 @@ import pytest
 from dopepp.data.sources.rendered import FIRST_INDEX, MAX_ITEMS, RenderedSource
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets.preset import PRESETS, customised_preset
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,19 @@ def test_bounds_description_and_objects(factory):
     assert info.identity["parts"] == {servoholder().name: servoholder().mesh_hash}
     (other,) = RenderedSource(Factory(factory.parts, factory.preset, 4), 3).describe()
     assert other.identity != info.identity
+
+
+def test_what_litters_the_background_belongs_to_the_identity():
+    def identity(**changes):
+        factory = Factory([pivconnector()], customised_preset("quickstart", changes), 3)
+        (info,) = RenderedSource(factory, 4, "val").describe()
+        return info.identity
+
+    plain, clutter = identity(), identity(clutter=[0, 5])
+    assert not {"clutter", "background_contrast", "window", "depths"} & set(plain)
+    assert clutter == {**plain, "clutter": [0, 5]}
+    contrast = identity(background_contrast=[0.5, 2.0])
+    assert contrast == {**plain, "background_contrast": [0.5, 2.0]}
 
 
 def test_another_scale_is_the_same_test_set_from_elsewhere(factory):

@@ -105,10 +105,21 @@ def test_textured_surfaces_keep_their_colours(sheet):
         assert material.grooves is None
 
 
+def test_a_tint_changes_every_channel_of_a_texture_by_a_share_of_its_own(sheet):
+    surface = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
+    rng = np.random.default_rng(0)
+    materials = Materials(texture_gain=(1.0, 1.0), texture_tint=0.2)
+    colours = np.array([materials.draw(rng, surface).colour for _ in range(2000)])
+    assert np.abs(colours - 1).max() <= 0.2
+    assert colours.std(axis=0) == pytest.approx(0.2 / np.sqrt(3), rel=0.1)
+    assert np.abs(np.corrcoef(colours.T) - np.eye(3)).max() < 0.1
+
+
 @pytest.mark.parametrize(
     "make",
     [
         lambda: Materials(metal_share=1.5),
+        lambda: Materials(texture_tint=1.5),
         lambda: Materials(layer_pitch=(float("nan"), 1e-4)),
         lambda: Materials(roughness=(0.0, 0.5)),
         lambda: Materials(albedo=(0.1,)),

@@ -1,0 +1,137 @@
+"""What a network of renders loses on real frames: the part's looks, or what surrounds the part.
+
+Windows of labelled real frames with an unhidden part, and the same windows with the part rendered
+at its true pose, before the real surroundings or before those of the training. The loss of the
+training on each (lower is better) says what is still to be learned. Where a true pose is off by a
+pixel or two, a seam of the real part shows around the rendered one, which counts as surroundings.
+
+python benchmarks/real_gap.py outputs/dopepp_fast_bop_renders/RUN
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import yaml
+
+from dopepp.data.batch import collate
+from dopepp.data.sample import Sample, crop_sample, resize_sample
+from dopepp.drawing.pictures import Picture
+from dopepp.experiment.build.camera import fitted_to_camera
+from dopepp.experiment.build.sources import build_parts, labelled_images, seen_preset
+from dopepp.experiment.build.system import build_system
+from dopepp.experiment.config.run import RunConfig
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.parts.part import Parts
+from dopepp.training.system import PoseSystem
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.backgrounds.cluttered import ClutteredBackgrounds
+from dopepp.virtual.body import make_body
+from dopepp.virtual.renderers import find_renderer
+from dopepp.virtual.scene import Scene, SceneObject
+
+UNHIDDEN = 0.98
+"""Visible share from which a part counts; nothing may stand before what is put in its place."""
+
+RING_PX = 12.0
+"""What is nearer to the part than this are its immediate surroundings, pixels of the network's."""
+
+
+def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[tuple[Sample, int]]:
+    """Cut windows around unhidden parts out of the test's frames, with the number of each part."""
+    source = labelled_images(config.data, parts, config.seed, "test")
+    scale, size = config.data.virtual.camera_scale or 1.0, np.array(config.data.network_input)
+    names, found = [part.name for part in parts], []
+    for index in range(len(source)):
+        sample = source.sample(index)
+        width, height = (round(scale * side) for side in sample.size)
+        sample = resize_sample(sample, (width, height))
+        for one in sample.instances:
+            if one.label not in names or one.visible_fraction < UNHIDDEN:
+                continue
+            corner = one.keypoints[CENTROID] - size / 2 + rng.uniform(-0.15, 0.15, 2) * size
+            left, top = np.clip(corner, 0, np.array(sample.size) - size).astype(int)
+            window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
+            alone = [near for near in window.instances if near.label == one.label]
+            if len(alone) == 1 and alone[0].visible_fraction > 0.9 * one.visible_fraction:
+                found.append((replace(window, instances=alone), names.index(one.label)))
+    return found
+
+
+def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[str, list[Sample]]:
+    """Return every window as it is, rendered, and half and half."""
+    preset = seen_preset(config.data)
+    photos = find_backgrounds(config.data.virtual.backgrounds)
+    behind = ClutteredBackgrounds(photos, preset.clutter, preset.background_contrast)
+    bodies, render = [make_body(part, is_target=True) for part in parts], find_renderer("raster")
+    made: dict[str, list[Sample]] = {}
+    for window, number in windows(config, parts, rng):
+        (one,), body, real = window.instances, bodies[number], np.ascontiguousarray(window.image)
+        learned = behind.draw(rng, *window.size)
+        lights, ambient = preset.lighting.draw(rng, one.T_cam_obj[:3, 3])
+        material = preset.materials.draw(rng, body.surface)
+        item = SceneObject(body.surface, one.T_cam_obj, material, body.part)
+        sensor = preset.sensors.draw(rng)
+        drawn = render(Scene(window.K, learned, (item,), lights, ambient, None, sensor))
+        part = drawn.instances == drawn.scene.targets[0]
+        opaque = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 0.6)[..., None]
+        near = cv2.distanceTransform((~part).astype(np.uint8), cv2.DIST_L2, 5) < RING_PX
+
+        def put(part: Picture, behind: Picture, opaque: np.ndarray = opaque) -> Picture:
+            return np.asarray(np.rint(opaque * part + (1 - opaque) * behind), np.uint8)
+
+        mixed = np.where(near[..., None], real, learned), np.where(near[..., None], learned, real)
+        for name, image in {
+            "all rendered": drawn.image,
+            "rendered part, real surroundings": put(drawn.image, real),
+            f"… real to {RING_PX:g} pixels from it": put(drawn.image, mixed[0]),
+            f"… real beyond {RING_PX:g} pixels": put(drawn.image, mixed[1]),
+            "real part, learned surroundings": put(real, learned),
+            "all real": real,
+        }.items():
+            made.setdefault(name, []).append(replace(window, image=image))
+    return made
+
+
+@torch.inference_mode()
+def losses(system: PoseSystem, samples: Sequence[Sample]) -> np.ndarray:
+    """Return the training's loss on each window."""
+    numbers = {part.name: number for number, part in enumerate(system.parts)}
+    found = []
+    for first in range(0, len(samples), 32):
+        batch = collate(samples[first : first + 32], numbers)
+        stages = system(batch.images)
+        found.append(system.loss.per_image(stages, *system.targets(batch, stages)).numpy())
+    return np.concatenate(found)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="+", help="their folders; the first's windows")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    made: dict[str, list[Sample]] = {}
+    for run in options.runs:
+        config = RunConfig.of(yaml.safe_load((run / "config.yaml").read_text()))
+        parts = build_parts(config.data)
+        config = fitted_to_camera(config, parts)
+        made = made or variants(config, parts, np.random.default_rng(options.seed))
+        trained = replace(config, init_from=str(run / "checkpoints" / "best.ckpt"))
+        system = build_system(trained, parts, "").eval()
+        print(f"{run.name}: {len(made['all real'])} windows, loss of the training")
+        for name, samples in made.items():
+            values = losses(system, samples)
+            error = values.std() / np.sqrt(len(values))
+            median = np.median(values)
+            print(f"  {name:40s} {values.mean():6.2f} ± {error:.2f}, median {median:.2f}")
+
+
+if __name__ == "__main__":
+    main()
