@@ -195,7 +195,7 @@ def choose_precision(asked: str, accelerator: str) -> tuple[str, str]:
     fast = _BF16_FLAGS & set(cpu_fact("flags", "Features").split())
     if fast:
         return "bf16-mixed", f"this CPU has bf16 arithmetic ({', '.join(sorted(fast))})"
-    return "32-true", "this CPU has no bf16 arithmetic: training takes about twice as long"
+    return "32-true", "this CPU has no bf16 arithmetic: training takes two to four times as long"
 
 
 def keep_freed_memory() -> None:
