@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from dopepp.core.files import write_png
 from dopepp.core.json import read_json
@@ -28,8 +29,8 @@ from dopepp.drawing.sheet import Tile, contact_sheet
 from dopepp.geometry.camera import make_transform, moved, project_keypoints, transform
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.inference.refinement.region import RegionRefiner
+from dopepp.metrics.functional import mahalanobis
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import squared_distance
 
 TURN, SHIFT = math.radians(5.0), 0.010
 LEAST_VISIBLE = 0.5
@@ -89,16 +90,17 @@ def main() -> None:
         step[:3] *= TURN / np.linalg.norm(step[:3])
         step[3:] *= SHIFT / np.linalg.norm(step[3:])
         start = moved(true, step)
-        equivalents = true @ symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
+        equivalents = true @ group
         began = time.process_time()
         end = refiners[number].refine(picture, K, start, COVARIANCE)
         took = 1e3 * (time.process_time() - began)
         before, after = (add_mm(part, T, equivalents) for T in (start, end.T_cam_obj))
         surprise = math.nan
         if end.covariance is not None:
-            surprise = min(
-                squared_distance(end.T_cam_obj, end.covariance, other) for other in equivalents
-            ) / 6  # fmt: skip
+            both = (one for T in (end.T_cam_obj, true) for one in (T[:3, :3], T[:3, 3]))
+            batch = (torch.from_numpy(one)[None] for one in (*both, end.covariance))
+            surprise = float(mahalanobis(*batch, torch.from_numpy(group))) ** 2 / 6
         rows.setdefault(part.name, []).append(
             (before, after, after > before + 1e3 * WORSE, bool(end.reason), surprise, took)
         )
