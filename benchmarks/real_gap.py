@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-import yaml
 
+from dopepp.core.yaml import read_yaml
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import Picture
@@ -27,6 +27,7 @@ from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.sources import build_parts, labelled_images, seen_preset
 from dopepp.experiment.build.system import build_system
 from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.runs.record import CONFIG_FILE
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Parts
 from dopepp.training.system import PoseSystem
@@ -58,9 +59,10 @@ def windows(config: RunConfig, parts: Parts, rng: np.random.Generator) -> list[t
             corner = one.keypoints[CENTROID] - size / 2 + rng.uniform(-0.15, 0.15, 2) * size
             left, top = np.clip(corner, 0, np.array(sample.size) - size).astype(int)
             window = crop_sample(sample, left, top, (int(size[0]), int(size[1])))
-            alone = [near for near in window.instances if near.label == one.label]
-            if len(alone) == 1 and alone[0].visible_fraction > 0.9 * one.visible_fraction:
-                found.append((replace(window, instances=alone), names.index(one.label)))
+            # Another part in the window would be one of its surroundings and to be found as well.
+            there = [near for near in window.instances if near.visible_fraction > 0]
+            if len(there) == 1 and there[0].visible_fraction > 0.9 * one.visible_fraction:
+                found.append((replace(window, instances=there), names.index(one.label)))
     return found
 
 
@@ -77,26 +79,26 @@ def variants(config: RunConfig, parts: Parts, rng: np.random.Generator) -> dict[
         lights, ambient = preset.lighting.draw(rng, one.T_cam_obj[:3, 3])
         material = preset.materials.draw(rng, body.surface)
         item = SceneObject(body.surface, one.T_cam_obj, material, body.part)
-        sensor = preset.sensors.draw(rng)
-        drawn = render(Scene(window.K, learned, (item,), lights, ambient, None, sensor))
+        drawn = render(Scene(window.K, learned, (item,), lights, ambient))
         part = drawn.instances == drawn.scene.targets[0]
         opaque = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 0.6)[..., None]
         near = cv2.distanceTransform((~part).astype(np.uint8), cv2.DIST_L2, 5) < RING_PX
-
-        def put(part: Picture, behind: Picture, opaque: np.ndarray = opaque) -> Picture:
-            return np.asarray(np.rint(opaque * part + (1 - opaque) * behind), np.uint8)
-
         mixed = np.where(near[..., None], real, learned), np.where(near[..., None], learned, real)
         for name, image in {
             "all rendered": drawn.image,
-            "rendered part, real surroundings": put(drawn.image, real),
-            f"… real to {RING_PX:g} pixels from it": put(drawn.image, mixed[0]),
-            f"… real beyond {RING_PX:g} pixels": put(drawn.image, mixed[1]),
-            "real part, learned surroundings": put(real, learned),
+            "rendered part, real surroundings": laid(drawn.image, opaque, real),
+            f"… real to {RING_PX:g} pixels from it": laid(drawn.image, opaque, mixed[0]),
+            f"… real beyond {RING_PX:g} pixels": laid(drawn.image, opaque, mixed[1]),
+            "real part, learned surroundings": laid(real, opaque, learned),
             "all real": real,
         }.items():
             made.setdefault(name, []).append(replace(window, image=image))
     return made
+
+
+def laid(part: Picture, opaque: np.ndarray, behind: Picture) -> Picture:
+    """Lay a part over what is to be behind it."""
+    return np.asarray(np.rint(opaque * part + (1 - opaque) * behind), np.uint8)
 
 
 @torch.inference_mode()
@@ -119,7 +121,7 @@ def main() -> None:
     options = parser.parse_args()
     made: dict[str, list[Sample]] = {}
     for run in options.runs:
-        config = RunConfig.of(yaml.safe_load((run / "config.yaml").read_text()))
+        config = RunConfig.of(read_yaml(run / CONFIG_FILE))
         parts = build_parts(config.data)
         config = fitted_to_camera(config, parts)
         made = made or variants(config, parts, np.random.default_rng(options.seed))
