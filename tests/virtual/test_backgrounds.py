@@ -164,7 +164,7 @@ def test_pickling_leaves_the_decoded_photos_behind(tmp_path):
 
 def test_memory_for_photos_is_bounded(tmp_path, monkeypatch):
     write_photos(tmp_path, 9, 100)
-    monkeypatch.setattr("dopepp.virtual.backgrounds._KEPT_BYTES", 3 * 100 * 120 * 3)
+    monkeypatch.setattr("dopepp.virtual.backgrounds._KEPT_BYTES", 3 * (100 * 120 + 50 * 60) * 3)
     backgrounds = PhotoBackgrounds(tmp_path)
     for seed in range(50):
         draw(backgrounds, seed)
@@ -232,6 +232,32 @@ def covered(number: int, seed: int, size=(96, 64)) -> float:
     return float((image != 77).any(axis=2).mean())
 
 
+def test_a_small_piece_of_a_large_photo_is_that_photo_reduced(tmp_path, monkeypatch):
+    x, y = np.meshgrid(np.linspace(0, 9, 800), np.linspace(0, 6, 500))
+    waves = 127 + 60 * np.stack([np.sin(x), np.cos(x + y), np.sin(y)], axis=2)
+    assert cv2.imwrite(str(tmp_path / "waves.png"), waves)
+    reductions, resize = [], cv2.resize
+
+    def reduce(image, size, **options):
+        reductions.append(image.shape[1] / size[0])
+        return resize(image, size, **options)
+
+    for width in (16, 32, 64, 200, 400):
+        backgrounds, whole = PhotoBackgrounds(tmp_path), PhotoBackgrounds(tmp_path)
+        backgrounds.draw(np.random.default_rng(0), width, width)  # reads and halves the photo
+        whole._photos.update((path, sizes[:1]) for path, sizes in backgrounds._photos.items())
+        with monkeypatch.context() as patched:
+            patched.setattr(cv2, "resize", reduce)
+            for seed in range(5):
+                image, slow = (
+                    each.draw(np.random.default_rng(seed), width, width).astype(float)
+                    for each in (backgrounds, whole)
+                )
+                assert np.abs(image - slow).mean() < 3  # the crops begin within some pixels
+    fast, slow = reductions[::2], reductions[1::2]
+    assert max(fast) < 4 < max(slow)
+
+
 def test_clutter_covers_more_the_more_there_is_and_never_all():
     few, many = ([covered(number, seed) for seed in range(40)] for number in (5, 40))
     assert 0.02 < np.mean(few) < np.mean(many) < 0.9
@@ -262,6 +288,19 @@ def test_clutter_has_edges_between_the_pixels(monkeypatch):
         # Fewer than two pixels wide, all along the outlines.
         rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3))) - inside
         assert 0.3 * rim.sum() < between.sum() < 3 * rim.sum()
+
+
+def test_printed_pieces_have_cells_of_a_dark_and_a_light_colour():
+    spreads, upright = [], 0
+    for seed in range(60):
+        image = cluttered._printed(np.random.default_rng(seed), 64, 48)[..., 0].astype(int)
+        low, high = image.min(), image.max()
+        spreads.append(high - low)
+        # All but the pixels between two cells, of at most 8 by 8.
+        assert (np.minimum(image - low, high - image) <= 3).mean() > 0.6
+        upright += (np.diff(image, axis=0) == 0).all() or (np.diff(image, axis=1) == 0).all()
+    assert np.mean(np.array(spreads) > 45) > 0.85  # but for a single cell, and few of one colour
+    assert upright < 10
 
 
 def test_a_backgrounds_contrast_is_changed_about_its_mean():

@@ -11,7 +11,7 @@ import importlib.util
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -39,8 +39,14 @@ _LONGEST_PHOTO_PX: Final = 1000
 """Photos are kept reduced to this side: a 640×480 crop of them is still sharp. JPEG decodes at a
 half, a quarter or an eighth, so that a camera's 4000 pixels take 20 ms less than with 1024 here."""
 
+_LEAST_REDUCTION: Final = 2.0
+"""A crop is cut out of the smallest halving of a photo that it still reduces so many times, as a
+small piece of a large photo would cost as much as all of that photo."""
+
+_SMALLEST_HALF_PX: Final = 30
+
 _KEPT_BYTES: Final = 200_000_000
-"""Decoded photos a process keeps: about 350 of VOC2007."""
+"""Decoded photos and their halvings a process keeps: about 260 of VOC2007."""
 
 
 class Backgrounds(Protocol):
@@ -90,7 +96,7 @@ class PhotoBackgrounds:
                 "correct the path, or leave it out to use procedural backgrounds",
             )
         self.bad: dict[Path, str] = {}
-        self._photos: OrderedDict[Path, Picture] = OrderedDict()
+        self._photos: OrderedDict[Path, list[Picture]] = OrderedDict()
         self._kept_bytes = 0
 
     def __getstate__(self) -> dict[str, Any]:
@@ -107,11 +113,15 @@ class PhotoBackgrounds:
 
     def draw(self, rng: Generator, width: int, height: int) -> Picture:
         """Return a crop of the image's aspect ratio that covers 40 % to 100 % of a photo's side."""
-        photo = None
-        while photo is None:
-            photo = self._photo(self.paths[int(rng.integers(len(self.paths)))])
+        sizes = None
+        while sizes is None:
+            sizes = self._photo(self.paths[int(rng.integers(len(self.paths)))])
+        rows, columns = sizes[0].shape[:2]
+        share = rng.uniform(0.4, 1.0)
+        reduction = share * min(columns / width, rows / height)
+        photo = sizes[int(np.clip(np.log2(reduction / _LEAST_REDUCTION), 0, len(sizes) - 1))]
         rows, columns = photo.shape[:2]
-        scale = min(columns / width, rows / height) * rng.uniform(0.4, 1.0)
+        scale = share * min(columns / width, rows / height)
         crop_width, crop_height = max(int(width * scale), 1), max(int(height * scale), 1)
         left = int(rng.integers(columns - crop_width + 1))
         top = int(rng.integers(rows - crop_height + 1))
@@ -122,8 +132,11 @@ class PhotoBackgrounds:
             image = cv2.flip(image, 1)
         return np.asarray(cv2.convertScaleAbs(image, alpha=float(rng.uniform(0.5, 1.1))), np.uint8)
 
-    def _photo(self, path: Path) -> Picture | None:
-        """Return a photo, reduced, or None for a damaged one; the most recent ones are kept."""
+    def _photo(self, path: Path) -> list[Picture] | None:
+        """Return a photo, reduced, and its halvings; the most recent ones are kept.
+
+        None for a damaged one.
+        """
         if path in self._photos:
             self._photos.move_to_end(path)
             return self._photos[path]
@@ -134,11 +147,19 @@ class PhotoBackgrounds:
         except ValueError as error:
             self._quarantine(path, str(error))
             return None
-        self._photos[path] = photo
-        self._kept_bytes += photo.nbytes
+        sizes = [photo]
+        while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_HALF_PX:
+            sizes.append(
+                np.asarray(
+                    cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
+                    np.uint8,
+                )
+            )
+        self._photos[path] = sizes
+        self._kept_bytes += _bytes(sizes)
         while self._kept_bytes > _KEPT_BYTES and len(self._photos) > 1:
-            self._kept_bytes -= self._photos.popitem(last=False)[1].nbytes
-        return photo
+            self._kept_bytes -= _bytes(self._photos.popitem(last=False)[1])
+        return sizes
 
     def _quarantine(self, path: Path, damage: str) -> None:
         """Remember a damaged photo, and refuse too many of them."""
@@ -170,6 +191,10 @@ def bundled_photos() -> PhotoBackgrounds:
             "pip install scikit-image, or give a folder of photos",
         )
     return PhotoBackgrounds(folder, names)
+
+
+def _bytes(pictures: Iterable[Picture]) -> int:
+    return sum(picture.nbytes for picture in pictures)
 
 
 def _photo_names(folder: Path) -> Iterator[str]:

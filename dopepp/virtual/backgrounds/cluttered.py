@@ -19,8 +19,12 @@ from dopepp.drawing.pictures import Picture
 if TYPE_CHECKING:
     from dopepp.virtual.backgrounds import Backgrounds
 
-_PLAIN_SHARE: Final = 0.5
+_PLAIN_SHARE: Final = 0.4
 """Share of the pieces that have one colour, lighter towards one side, as weakly textured things."""
+
+_PRINTED_SHARE: Final = 0.2
+"""Share of those that have cells of a dark and a light colour, as markers and keyboards; the others
+are cut out of backgrounds."""
 
 _WIDTHS: Final = (0.04, 0.4)
 """Of a piece, over the picture's width; logarithmically uniform: most things are small."""
@@ -33,7 +37,7 @@ class ClutteredBackgrounds:
     """Backgrounds with pieces of others on them: polygons, turned boxes, ellipses and rings.
 
     Args:
-        behind: What lies behind, and what half of the pieces are cut out of; the others are plain.
+        behind: What lies behind, and what some of the pieces are cut out of.
         number: Smallest and largest number of pieces.
         contrast: Smallest and largest factor on the whole picture's contrast, about its mean.
     """
@@ -75,7 +79,9 @@ class ClutteredBackgrounds:
         mask = np.zeros((high, wide), np.uint8)
         points = np.round((outline + corner + size / 2 - first) * 2**_FINE_BITS).astype(np.int32)
         cv2.fillPoly(mask, [*points], 255, cv2.LINE_AA, _FINE_BITS)
-        draw = _plain if rng.random() < _PLAIN_SHARE else self.behind.draw
+        kind = rng.random()
+        others = _printed if kind < _PLAIN_SHARE + _PRINTED_SHARE else self.behind.draw
+        draw = _plain if kind < _PLAIN_SHARE else others
         piece = draw(rng, wide, high).astype(np.float32)
         there = image[first[1] : last[1], first[0] : last[0]]
         opacity = np.repeat(mask[..., None], 3, axis=2).astype(np.float32) / 255
@@ -105,3 +111,15 @@ def _plain(rng: Generator, width: int, height: int) -> Picture:
     x, y = np.linspace(-1, 1, width)[None, :, None], np.linspace(-1, 1, height)[:, None, None]
     light = 1 + direction[0] * x + direction[1] * y
     return np.asarray(np.clip(colour * light, 0, 255), np.uint8)
+
+
+def _printed(rng: Generator, width: int, height: int) -> Picture:
+    """Return cells of one dark and one light colour, turned."""
+    columns, rows = rng.integers(1, 9, 2)
+    dark, light = rng.uniform((0, 140), (90, 255))
+    cells = np.where(rng.random((rows, columns, 1)) < 0.5, dark, light) * rng.uniform(0.8, 1.2, 3)
+    codes = np.asarray(np.clip(cells, 0, 255), np.uint8)
+    upright = cv2.resize(codes, (width, height), interpolation=cv2.INTER_NEAREST)
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), rng.uniform(0, 360), 1.0)
+    image = cv2.warpAffine(upright, turn, (width, height), borderMode=cv2.BORDER_WRAP)
+    return np.asarray(image, np.uint8)
