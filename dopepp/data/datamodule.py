@@ -24,6 +24,7 @@ from dopepp.data.sample import (
     resize_sample,
 )
 from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, focal_length, transform
@@ -39,8 +40,8 @@ _SEEN_ITEMS: Final = 200
 class PoseDataModule(LightningDataModule):
     """Training, validation and test data for pose estimation.
 
-    Training items are resized, masked, augmented and padded; validation items only letterboxed;
-    test items come at their native resolution, as :class:`Sample`.
+    Training items are resized, jittered, masked, augmented and padded; validation items only
+    letterboxed; test items come at their native resolution, as :class:`Sample`.
 
     Args:
         val: Validation data (model selection, thresholds); its epoch is always 0.
@@ -58,6 +59,7 @@ class PoseDataModule(LightningDataModule):
         batch_size: int,
         num_workers: int = 0,
         seed: int = 0,
+        jitter: CameraJitter | None = None,
         masking: RandomMask | None = None,
         augment: Photometric | None = None,
         backgrounds: Backgrounds | None = None,
@@ -74,16 +76,19 @@ class PoseDataModule(LightningDataModule):
         self.train_source, self.val_source, self.test_source = train, val, test
         self.object_names, self.input_size = list(object_names), input_size
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-        self._masking, self._augment, self._backgrounds = masking, augment, backgrounds
+        self._jitter, self._masking, self._augment = jitter, masking, augment
+        self._backgrounds = backgrounds
 
     def train_item(self, epoch: int, index: int) -> Sample:
         """Return a training item, a pure function of (seed, epoch, index).
 
-        Masking and augmentation come between resizing and padding: the padding is neither
+        Jitter, masking and augmentation come between resizing and padding: the padding is neither
         background nor does it get noise, as at prediction.
         """
         sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
         rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
+        if self._jitter is not None:
+            sample = self._jitter(sample, rng)
         if self._masking is not None and self._backgrounds is not None:
             sample = self._masking(sample, rng, self._backgrounds)
         if self._augment is not None:

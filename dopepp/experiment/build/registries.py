@@ -17,6 +17,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.models.registry import TARGET, Registry
 from dopepp.training.system import OptimizerFactory, SchedulerFactory
@@ -33,6 +34,9 @@ SCHEDULERS: Registry[LRScheduler] = Registry(
     "scheduler",
     LRScheduler,
     (f"torch.optim.lr_scheduler.{one}LR" for one in ("CosineAnnealing", "Linear", "OneCycle")),
+)
+JITTERS: Registry[CameraJitter] = Registry(
+    "jitter", CameraJitter, ["dopepp.data.transforms.jitter.CameraJitter"]
 )
 MASKINGS: Registry[RandomMask] = Registry(
     "masking", RandomMask, ["dopepp.data.transforms.masking.RandomMask"]

@@ -28,7 +28,7 @@ from dopepp.data.sources.hybrid import HybridSource
 from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
 from dopepp.data.sources.windowed import WindowedSource
 from dopepp.drawing.pictures import Size
-from dopepp.experiment.build.registries import AUGMENTATIONS, MASKINGS, build_optional
+from dopepp.experiment.build.registries import AUGMENTATIONS, JITTERS, MASKINGS, build_optional
 from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint.schema import Checkpoint
@@ -105,6 +105,7 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
         batch_size=data.batch_size,
         num_workers=available_cores() if data.num_workers is None else data.num_workers,
         seed=seed,
+        jitter=build_optional(JITTERS, data.jitter),
         masking=build_optional(MASKINGS, data.masking),
         augment=build_optional(AUGMENTATIONS, data.augment),
         backgrounds=backgrounds,

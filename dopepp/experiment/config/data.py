@@ -25,7 +25,7 @@ MAX_WORKERS: Final = 1024
 _MULTIPLE: Final = 32
 """What both sides of an input are multiples of, pixels."""
 
-_CLOSED: Final = ("data.masking", "data.augment", "data.image_sets")
+_CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_sets")
 """Nodes of an evaluation's data in which every option that can be changed is there already."""
 
 
@@ -124,6 +124,7 @@ class DataConfig:
             the root has it.
         classes: Class in NDDS files to part, where the names differ.
         download_dir: Where shards from URLs are kept; None downloads nothing.
+        jitter: Node of the camera jitter; without a target there is none.
         masking: Node of the random masks; without a target there are none.
         augment: Node of the photometric augmentation; without a target there is none.
         virtual: How images are rendered.
@@ -155,6 +156,7 @@ class DataConfig:
     targets: str | None = None
     classes: Mapping[str, str] | None = None
     download_dir: str | None = None
+    jitter: Mapping[str, Any] = field(default_factory=dict)
     masking: Mapping[str, Any] = field(default_factory=dict)
     augment: Mapping[str, Any] = field(default_factory=dict)
     virtual: VirtualConfig = VirtualConfig()

@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.data.sources.rendered import RenderedSource
+from dopepp.data.transforms.jitter import CameraJitter
+from dopepp.geometry.camera import make_transform
+from dopepp.geometry.rotation import random_rotation
+from dopepp.parts.catalogue import load_part
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.renderers import find_renderer
+
+STILL = CameraJitter(roll_deg=0, zoom=(1, 1), shift=0)
+
+
+@pytest.fixture(scope="module")
+def factory():
+    return Factory([load_part("pivconnector")], PRESETS["quickstart"].resized(128, 96), seed=0)
+
+
+def posed(rng: np.random.Generator) -> Sample:
+    """Return a grey picture of a box, of a camera whose pixels are not square."""
+    K = np.array([[300.0, 0, 70], [0, 280, 40], [0, 0, 1]])
+    T_cam_obj = make_transform(random_rotation(rng), np.array([0.02, -0.03, 0.6]))
+    corners = rng.uniform(-0.05, 0.05, (9, 3))
+    pixels, _ = cv2.projectPoints(corners, T_cam_obj[:3, :3], T_cam_obj[:3, 3], K, None)
+    one = Instance("box", T_cam_obj, pixels[:, 0], 0.8)
+    sample = Sample(np.full((96, 128, 3), 90, np.uint8), K, [one])
+    sample.corners = corners  # type: ignore[attr-defined]
+    return sample
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 2**31), roll=st.floats(0, 180), shift=st.floats(0, 0.4))
+def test_keypoints_are_the_posed_points_of_the_new_camera(seed, roll, shift):
+    rng = np.random.default_rng(seed)
+    sample = posed(rng)
+    seen = CameraJitter(roll, (0.5, 2.0), shift)(sample, rng)
+    (one,) = seen.instances
+    rotation, place = one.T_cam_obj[:3, :3], one.T_cam_obj[:3, 3]
+    expected, _ = cv2.projectPoints(sample.corners, rotation, place, seen.K, None)
+    np.testing.assert_allclose(one.keypoints, expected[:, 0], atol=1e-6)
+    assert place[2] == pytest.approx(0.6)  # the camera rolls and zooms, it does not travel
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+    assert seen.K[0, 1] == 0
+
+
+def test_masks_are_those_of_the_scene_rendered_through_the_new_camera(factory):
+    source, render = RenderedSource(factory, 10), find_renderer("raster")
+    jitter, rolls = CameraJitter(roll_deg=60, zoom=(0.7, 1.4), shift=0.1), []
+    for index in range(10):
+        sample = source.sample(index)
+        seen = jitter(sample, np.random.default_rng(index))
+        turn = seen.instances[0].T_cam_obj @ np.linalg.inv(sample.instances[0].T_cam_obj)
+        scene = factory.scene(0, index)
+        objects = tuple(replace(o, T_cam_obj=turn @ o.T_cam_obj) for o in scene.objects)
+        again = render(replace(scene, K=seen.K, objects=objects))
+        for one, number in zip(seen.instances, again.scene.targets, strict=True):
+            expected = again.instances == number
+            overlap = (one.mask & expected).sum() / (one.mask | expected).sum()
+            assert overlap > 0.93
+        rolls.append(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
+    assert min(rolls) < -20
+    assert max(rolls) > 20
+
+
+def test_the_picture_moves_with_the_keypoints():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        sample = posed(rng)
+        place = rng.uniform((50, 35), (78, 60))
+        sample.instances[0].keypoints[:] = place
+        cv2.circle(sample.image, np.rint(place * 16).astype(int).tolist(), 64, (255,) * 3, -1, 8, 4)
+        seen = CameraJitter(30, (0.8, 1.25), 0.05)(sample, rng)
+        rows, columns = np.nonzero(seen.image[..., 0] > 172)
+        expected = seen.instances[0].keypoints[0]
+        np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=0.6)
+
+
+def test_what_leaves_the_picture_is_not_visible():
+    mask = np.zeros((100, 100), bool)
+    mask[40:60, 90:100] = True
+    one = Instance("box", np.eye(4), np.zeros((9, 2)), 0.5, mask)
+    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [one])
+    seen = [CameraJitter(0, (1, 1), 0.1)(sample, np.random.default_rng(n)) for n in range(40)]
+    for other in seen:
+        (moved,) = other.instances
+        assert moved.visible_fraction == pytest.approx(0.5 * moved.mask.sum() / mask.sum())
+    assert {round(other.instances[0].visible_fraction, 1) for other in seen} > {0.3, 0.4}
+    assert sample.instances[0].mask.sum() == mask.sum()
+
+
+def test_no_jitter_changes_nothing_but_the_depth(factory):
+    sample = RenderedSource(factory, 1).sample(0)
+    same = STILL(sample, np.random.default_rng(0))
+    np.testing.assert_array_equal(same.image, sample.image)
+    np.testing.assert_allclose(same.K, sample.K)
+    for one, before in zip(same.instances, sample.instances, strict=True):
+        np.testing.assert_array_equal(one.mask, before.mask)
+        np.testing.assert_allclose(one.keypoints, before.keypoints)
+        np.testing.assert_allclose(one.T_cam_obj, before.T_cam_obj)
+        assert one.visible_fraction == before.visible_fraction
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"roll_deg": -1}, {"roll_deg": 181}, {"zoom": (0, 1)}, {"zoom": (2, 1)}, {"shift": 0.5}],
+)
+def test_wrong_options(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        CameraJitter(**options)
