@@ -48,20 +48,19 @@ class CameraJitter:
         """
         size = np.array(sample.size)
         middle = (size - 1) / 2
-        turn = rotation_vector_to_matrix(
-            np.array([0, 0, np.radians(rng.uniform(-self.roll_deg, self.roll_deg))])
-        )
+        roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
+        turn = rotation_vector_to_matrix(np.array([0, 0, roll]))
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
-        moved = middle + rng.uniform(-self.shift, self.shift, 2) * size
+        goal = middle + rng.uniform(-self.shift, self.shift, 2) * size
         K = np.diag([zoom, zoom, 1.0]) @ sample.K
         # A homography, and an affine one, because the camera rolls about its axis.
         warp = (K @ turn @ np.linalg.inv(sample.K))[:2]
-        offset = moved - warp @ [*middle, 1.0]
+        offset = goal - warp @ [*middle, 1.0]
         warp[:, 2] += offset
 
         def warped(pixels: NDArray[np.uint8], border: int, how: int) -> NDArray[np.uint8]:
-            seen = cv2.warpAffine(pixels, warp, sample.size, flags=how, borderMode=border)
-            return np.asarray(seen, np.uint8)
+            moved = cv2.warpAffine(pixels, warp, sample.size, flags=how, borderMode=border)
+            return np.asarray(moved, np.uint8)
 
         def seen(one: Instance) -> Instance:
             mask, visible = one.mask, one.visible_fraction

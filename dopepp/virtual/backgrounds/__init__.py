@@ -43,7 +43,8 @@ _LEAST_REDUCTION: Final = 2.0
 """A crop is cut out of the smallest halving of a photo that it still reduces so many times, as a
 small piece of a large photo would cost as much as all of that photo."""
 
-_SMALLEST_HALF_PX: Final = 30
+_SMALLEST_PX: Final = 30
+"""Shorter side of the smallest halving, at least."""
 
 _KEPT_BYTES: Final = 200_000_000
 """Decoded photos and their halvings a process keeps: about 260 of VOC2007."""
@@ -147,14 +148,7 @@ class PhotoBackgrounds:
         except ValueError as error:
             self._quarantine(path, str(error))
             return None
-        sizes = [photo]
-        while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_HALF_PX:
-            sizes.append(
-                np.asarray(
-                    cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
-                    np.uint8,
-                )
-            )
+        sizes = _halvings(photo)
         self._photos[path] = sizes
         self._kept_bytes += _bytes(sizes)
         while self._kept_bytes > _KEPT_BYTES and len(self._photos) > 1:
@@ -191,6 +185,15 @@ def bundled_photos() -> PhotoBackgrounds:
             "pip install scikit-image, or give a folder of photos",
         )
     return PhotoBackgrounds(folder, names)
+
+
+def _halvings(photo: Picture) -> list[Picture]:
+    """Return a photo and its halves, halves of these and so on."""
+    sizes = [photo]
+    while min(sizes[-1].shape[:2]) >= 2 * _SMALLEST_PX:
+        half = cv2.resize(sizes[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        sizes.append(np.asarray(half, np.uint8))
+    return sizes
 
 
 def _bytes(pictures: Iterable[Picture]) -> int:
