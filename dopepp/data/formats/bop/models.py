@@ -36,6 +36,8 @@ MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 
 INFO_FILE: Final = "models_info.json"
 
+_NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
+
 SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 
 Discrete = Float[np.ndarray, "symmetries 4 4"]
@@ -99,7 +101,7 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}
     for part in parts:
-        number = re.fullmatch(r"obj_(\d{1,9})", part.name)
+        number = _NUMBERED.fullmatch(part.name)
         if part.name not in names and (names or number is None):
             raise UserError(
                 f"part {part.name!r} for the data set {root}",
@@ -229,12 +231,24 @@ def _rows(place: Place, value: object) -> list[Any]:
     return []
 
 
+def model_numbers(parts: Sequence[Part]) -> dict[str, int]:
+    """Return the number of each part by name: 1, 2, … unless all are called as BOP's files are.
+
+    A data set that is rendered of another one's models goes on with that one's numbers.
+    """
+    named = [_NUMBERED.fullmatch(part.name) for part in parts]
+    stated = [int(name[1]) for name in named if name is not None]
+    if len(set(stated)) < len(parts) or 0 in stated:
+        stated = list(range(1, len(parts) + 1))
+    return {part.name: number for part, number in zip(parts, stated, strict=True)}
+
+
 def write_models(root: Path, parts: Sequence[Part]) -> None:
-    """Write the parts as objects 1, 2, …; ``models_info.json`` last, as the sign that all is there.
+    """Write the parts' models (:func:`model_numbers`); ``models_info.json`` last, as a sign.
 
     A UserError: a part has no mesh, or the folder holds models of other parts.
     """
-    meshes = []
+    meshes, numbers = [], model_numbers(parts)
     for part in parts:
         if part.mesh is None:
             raise UserError(
@@ -243,7 +257,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
             )  # fmt: skip
         meshes.append(part.mesh)
     folder = root / MODEL_FOLDERS[0]
-    entries = {str(number): model_info(part) for number, part in enumerate(parts, start=1)}
+    entries = {str(numbers[part.name]): model_info(part) for part in parts}
     content = (json.dumps(entries, indent=2, ensure_ascii=False) + "\n").encode()
     path = folder / INFO_FILE
     if path.exists():
@@ -253,7 +267,7 @@ def write_models(root: Path, parts: Sequence[Part]) -> None:
                 "choose an empty folder",
             )  # fmt: skip
         return
-    for number, mesh in enumerate(meshes, start=1):
+    for number, mesh in zip(numbers.values(), meshes, strict=True):
         model, texture = folder / f"obj_{number:06d}.ply", folder / f"obj_{number:06d}.png"
         write_whole(model, ply_bytes(mesh, None if mesh.texture is None else texture.name))
         if mesh.texture is not None:

@@ -25,7 +25,12 @@ from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
 from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.images import depth_units, encode_png
-from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS, write_models
+from dopepp.data.formats.bop.models import (
+    INFO_FILE,
+    MODEL_FOLDERS,
+    model_numbers,
+    write_models,
+)
 from dopepp.data.formats.bop.records import MAX_SCENE_BYTES, MM
 from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
@@ -52,7 +57,7 @@ NO_BOX = [-1, -1, -1, -1]
 
 
 class BopFolder:
-    """A folder with models, numbered from 1 in the parts' order, beside a split of images."""
+    """A folder with models, numbered as :func:`model_numbers` says, beside a split of images."""
 
     chunk_size = IMAGES_A_SCENE
 
@@ -76,8 +81,7 @@ class BopFolder:
 
     def labels(self, sample: Sample) -> Labels:
         """Annotate a sample, see :func:`make_labels`."""
-        ids = {part.name: number for number, part in enumerate(self._parts, start=1)}
-        return make_labels(sample, ids, self._surfaces)
+        return make_labels(sample, model_numbers(self._parts), self._surfaces)
 
 
 class BopWriter(BopFolder):

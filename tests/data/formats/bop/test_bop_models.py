@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.models import bop_parts, parts_by_id, read_models, write_models
+from dopepp.data.formats.bop.models import (
+    bop_parts,
+    model_numbers,
+    parts_by_id,
+    read_models,
+    write_models,
+)
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.read import read_mesh, ycb_part
@@ -75,6 +82,27 @@ def test_texture_round_trip(ycb_root, tmp_path):
     np.testing.assert_array_equal(read.mesh.texture, part.mesh.texture)
     np.testing.assert_allclose(read.mesh.uv, part.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(read.mesh.vertices, part.mesh.vertices, atol=1e-7)
+
+
+def test_parts_called_as_bops_files_keep_their_numbers(tmp_path):
+    parts = [replace(servoholder(), name="obj_000012"), replace(pivconnector(), name="obj_000005")]
+    write_models(tmp_path, parts)
+    found = parts_by_id(tmp_path, bop_parts(tmp_path))
+    assert {number: part.name for number, part in found.items()} == {
+        5: "obj_000005",
+        12: "obj_000012",
+    }
+    np.testing.assert_allclose(found[5].diameter, parts[1].diameter, rtol=1e-6)
+    assert found[5].diameter != pytest.approx(found[12].diameter, rel=1e-3)
+
+
+@pytest.mark.parametrize("names", [("obj_5", "part"), ("obj_5", "obj_05"), ("obj_0", "obj_1")])
+def test_other_parts_are_numbered_in_their_order(names):
+    parts = [
+        replace(part(), name=name)
+        for part, name in zip((servoholder, pivconnector), names, strict=True)
+    ]
+    assert model_numbers(parts) == dict(zip(names, (1, 2), strict=True))
 
 
 def test_objects_without_a_name_are_called_after_their_file(tmp_path):
