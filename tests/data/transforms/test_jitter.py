@@ -24,27 +24,25 @@ def factory():
     return Factory([load_part("pivconnector")], PRESETS["quickstart"].resized(128, 96), seed=0)
 
 
-def posed(rng: np.random.Generator) -> Sample:
-    """Return a grey picture of a box, of a camera whose pixels are not square."""
+def posed(rng: np.random.Generator) -> tuple[Sample, np.ndarray]:
+    """Return a grey picture, of a camera whose pixels are not square, and its object's points."""
     K = np.array([[300.0, 0, 70], [0, 280, 40], [0, 0, 1]])
     T_cam_obj = make_transform(random_rotation(rng), np.array([0.02, -0.03, 0.6]))
     corners = rng.uniform(-0.05, 0.05, (9, 3))
     pixels, _ = cv2.projectPoints(corners, T_cam_obj[:3, :3], T_cam_obj[:3, 3], K, None)
     one = Instance("box", T_cam_obj, pixels[:, 0], 0.8)
-    sample = Sample(np.full((96, 128, 3), 90, np.uint8), K, [one])
-    sample.corners = corners  # type: ignore[attr-defined]
-    return sample
+    return Sample(np.full((96, 128, 3), 90, np.uint8), K, [one]), corners
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 2**31), roll=st.floats(0, 180), shift=st.floats(0, 0.4))
 def test_keypoints_are_the_posed_points_of_the_new_camera(seed, roll, shift):
     rng = np.random.default_rng(seed)
-    sample = posed(rng)
+    sample, points = posed(rng)
     seen = CameraJitter(roll, (0.5, 2.0), shift)(sample, rng)
     (one,) = seen.instances
     rotation, place = one.T_cam_obj[:3, :3], one.T_cam_obj[:3, 3]
-    expected, _ = cv2.projectPoints(sample.corners, rotation, place, seen.K, None)
+    expected, _ = cv2.projectPoints(points, rotation, place, seen.K, None)
     np.testing.assert_allclose(one.keypoints, expected[:, 0], atol=1e-6)
     assert place[2] == pytest.approx(0.6)  # the camera rolls and zooms, it does not travel
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -74,7 +72,7 @@ def test_masks_are_those_of_the_scene_rendered_through_the_new_camera(factory):
 def test_the_picture_moves_with_the_keypoints():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        sample = posed(rng)
+        sample, _ = posed(rng)
         place = rng.uniform((50, 35), (78, 60))
         sample.instances[0].keypoints[:] = place
         cv2.circle(sample.image, np.rint(place * 16).astype(int).tolist(), 64, (255,) * 3, -1, 8, 4)
