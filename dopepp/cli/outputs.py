@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import FileIO
@@ -189,8 +188,10 @@ class BopCsv:
 
 
 def _number(name: str, names: Iterable[str]) -> int:
-    named = re.fullmatch(r"obj_(\d{1,9})", name)
-    return int(named[1]) if named else 1 + list(names).index(name)
+    from dopepp.data.formats.bop.records import number_in_name
+
+    stated = number_in_name(name)
+    return 1 + list(names).index(name) if stated is None else stated
 
 
 @contextmanager

@@ -143,6 +143,28 @@ def hull_areas(
     return float(inside), float(cv2.contourArea(hull))
 
 
+def less_visible(
+    before: Instance, after: Instance, shapes: tuple[Shape, Shape], scale: float = 1.0
+) -> Instance:
+    """Return an object as another view of its image shows it, with what of it is left there.
+
+    The visible fraction becomes smaller by the share of the mask's pixels that the view lost or,
+    where there is no mask, of the area of the cuboid's outline.
+
+    Args:
+        before: The object on the image.
+        after: The same with keypoints and mask of the view.
+        shapes: (height, width) of the image and of the view.
+        scale: Pixels of the view for one of the image.
+    """
+    whole, left = (
+        hull_areas(one.keypoints, shape)[0] if one.mask is None else float(one.mask.sum())
+        for one, shape in zip((before, after), shapes, strict=True)
+    )
+    share = min(left / (scale**2 * whole), 1.0) if whole else 0.0
+    return replace(after, visible_fraction=before.visible_fraction * share)
+
+
 class Purpose(IntEnum):
     """What a generator is for; the numbers are part of the data and must not change."""
 
@@ -221,8 +243,7 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
     """Cut (width, height) pixels out of an image, from (left, top) on.
 
-    Of the objects, visible fractions become smaller by what lies outside: of the mask's pixels, or,
-    where there is no mask, of the area of the cuboid's outline.
+    Of the objects, visible fractions become smaller by what lies outside (:func:`less_visible`).
     """
     width, height = size
 
@@ -231,17 +252,9 @@ def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
 
     def kept(one: Instance) -> Instance:
         """Return an object as the crop shows it."""
-        keypoints = one.keypoints - (left, top)
-        if one.mask is None:
-            mask = None
-            inside, _ = hull_areas(keypoints, (height, width))
-            before, _ = hull_areas(one.keypoints, sample.image.shape)
-        else:
-            mask = cut(one.mask)
-            inside, before = float(mask.sum()), float(one.mask.sum())
-        share = min(inside / before, 1.0) if before else 0.0
-        visible = one.visible_fraction * share
-        return replace(one, keypoints=keypoints, mask=mask, visible_fraction=visible)
+        mask = None if one.mask is None else cut(one.mask)
+        moved = replace(one, keypoints=one.keypoints - (left, top), mask=mask)
+        return less_visible(one, moved, (sample.image.shape[:2], (height, width)))
 
     return replace(
         sample,

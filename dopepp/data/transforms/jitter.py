@@ -14,11 +14,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dopepp.data.sample import Instance, Sample
+from dopepp.data.sample import Instance, Sample, less_visible
 from dopepp.geometry.camera import crop_camera, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-
-Range = tuple[float, float]
 
 
 class CameraJitter:
@@ -31,7 +29,7 @@ class CameraJitter:
     """
 
     def __init__(
-        self, roll_deg: float = 20.0, zoom: Range = (0.9, 1.1), shift: float = 0.1
+        self, roll_deg: float = 20.0, zoom: tuple[float, float] = (0.9, 1.1), shift: float = 0.1
     ) -> None:
         if not (0 <= roll_deg <= 180 and 0 < zoom[0] <= zoom[1] and 0 <= shift < 0.5):
             raise ValueError(
@@ -43,8 +41,8 @@ class CameraJitter:
     def __call__(self, sample: Sample, rng: Generator) -> Sample:
         """Return a sample seen by another camera; the argument is not changed.
 
-        Of the objects, visible fractions become smaller by the pixels of the mask, where there is
-        one, that leave the picture.
+        Of the objects, visible fractions become smaller by what leaves the picture
+        (:func:`~dopepp.data.sample.less_visible`).
         """
         size = np.array(sample.size)
         middle = (size - 1) / 2
@@ -63,19 +61,19 @@ class CameraJitter:
             return np.asarray(moved, np.uint8)
 
         def seen(one: Instance) -> Instance:
-            mask, visible = one.mask, one.visible_fraction
+            """Return an object as the other camera sees it."""
+            mask = one.mask
             if mask is not None:
-                whole = zoom**2 * np.count_nonzero(mask)
                 codes = warped(mask.astype(np.uint8), cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)
                 mask = codes.astype(bool)
-                visible *= min(np.count_nonzero(mask) / whole, 1.0) if whole else 1.0
-            return replace(
+            moved = replace(
                 one,
                 T_cam_obj=make_transform(turn, np.zeros(3)) @ one.T_cam_obj,
                 keypoints=one.keypoints @ warp[:, :2].T + warp[:, 2],
                 mask=mask,
-                visible_fraction=visible,
             )
+            shape = sample.image.shape[:2]
+            return less_visible(one, moved, (shape, shape), zoom)
 
         return replace(
             sample,

@@ -95,6 +95,18 @@ def test_what_leaves_the_picture_is_not_visible():
     assert sample.instances[0].mask.sum() == mask.sum()
 
 
+def test_without_a_mask_the_cuboids_outline_tells_what_is_visible():
+    keypoints = np.array([[90.0, 40], [98, 40], [98, 60], [90, 60]] * 2 + [[94, 50]])
+    one = Instance("box", np.eye(4), keypoints, 0.5)
+    sample = Sample(np.zeros((100, 100, 3), np.uint8), np.eye(3), [one])
+    for seed in range(20):
+        (moved,) = CameraJitter(0, (1, 1), 0.1)(sample, np.random.default_rng(seed)).instances
+        inside = np.clip(99.5 - moved.keypoints[0, 0], 0, 8) / 8
+        assert moved.visible_fraction == pytest.approx(0.5 * inside, abs=1e-6)
+        (zoomed,) = CameraJitter(0, (0.8, 0.8), 0)(sample, np.random.default_rng(seed)).instances
+        assert zoomed.visible_fraction == pytest.approx(0.5, abs=1e-6)
+
+
 def test_no_jitter_changes_nothing_but_the_depth(factory):
     sample = RenderedSource(factory, 1).sample(0)
     same = STILL(sample, np.random.default_rng(0))

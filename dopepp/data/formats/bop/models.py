@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.formats.bop.images import encode_png
-from dopepp.data.formats.bop.records import MM, is_number
+from dopepp.data.formats.bop.records import MM, is_number, number_in_name
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.parts.mesh.read import read_mesh
@@ -35,8 +34,6 @@ MODEL_FOLDERS: Final = ("models", "models_cad", "models_reconst", "models_eval")
 """Where data sets keep their models, the full ones first."""
 
 INFO_FILE: Final = "models_info.json"
-
-_NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
 
 SYMMETRY_FIELDS: Final = ("symmetries_discrete", "symmetries_continuous")
 
@@ -101,14 +98,14 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}
     for part in parts:
-        number = _NUMBERED.fullmatch(part.name)
+        number = number_in_name(part.name)
         if part.name not in names and (names or number is None):
             raise UserError(
                 f"part {part.name!r} for the data set {root}",
                 ", ".join(names) or f"obj_NNNNNN, as there is no {MODEL_FOLDERS[0]}/{INFO_FILE}",
                 f'choose from these, or write "name": "{part.name}" into {INFO_FILE}',
             )
-        numbered[names[part.name] if number is None or names else int(number[1])] = part
+        numbered[names[part.name] if number is None or names else number] = part
     return numbered
 
 
@@ -236,11 +233,11 @@ def model_numbers(parts: Sequence[Part]) -> dict[str, int]:
 
     A data set that is rendered of another one's models goes on with that one's numbers.
     """
-    named = [_NUMBERED.fullmatch(part.name) for part in parts]
-    stated = [int(name[1]) for name in named if name is not None]
-    if len(set(stated)) < len(parts) or 0 in stated:
-        stated = list(range(1, len(parts) + 1))
-    return {part.name: number for part, number in zip(parts, stated, strict=True)}
+    stated = {part.name: number_in_name(part.name) for part in parts}
+    numbers = {name: number for name, number in stated.items() if number}
+    if len(set(numbers.values())) == len(parts):
+        return numbers
+    return {part.name: number for number, part in enumerate(parts, start=1)}
 
 
 def write_models(root: Path, parts: Sequence[Part]) -> None:

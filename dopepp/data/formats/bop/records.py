@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,8 @@ DEPTH_SUFFIXES: Final = (".png", ".tif", ".tiff")
 
 MM: Final = 1000.0
 """Millimetres per metre."""
+
+_NUMBERED: Final = re.compile(r"obj_(\d{1,9})")
 
 EXACT: Final = 1e-3
 INEXACT: Final = 1e-2
@@ -353,6 +356,12 @@ def image_files(
         else:
             found[number] = path
     return found
+
+
+def number_in_name(name: str) -> int | None:
+    """Return the number in a name as BOP's files have it, ``obj_000005``; None in any other."""
+    numbered = _NUMBERED.fullmatch(name)
+    return int(numbered[1]) if numbered else None
 
 
 def is_number(text: str) -> bool:
