@@ -6,6 +6,7 @@ Configs, specs and presets come from users and from files, so nothing about thei
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 
 from dopepp.core.errors import UserError
 
@@ -28,6 +29,17 @@ def check_integer(name: str, value: object, lowest: int, highest: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
         raise _refused(name, value, f"an integer from {lowest} to {highest}")
     return value
+
+
+def check_integers(
+    name: str, values: object, length: int, lowest: int, highest: int
+) -> Sequence[int]:
+    """Return a list of so many integers of a closed range; else a :class:`UserError`."""
+    if not isinstance(values, (list, tuple)) or len(values) != length:
+        raise _refused(name, values, f"a list of {length} integers")
+    for position, value in enumerate(values):
+        check_integer(f"{name}[{position}]", value, lowest, highest)
+    return values
 
 
 def check_flag(name: str, value: object, of: object = None) -> bool:

@@ -7,14 +7,14 @@ To add one: a subclass of :class:`Backbone` in this module and one YAML file in
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Final
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dopepp.core.checks import check_flag, check_integer
+from dopepp.core.checks import check_flag, check_integers
 from dopepp.core.errors import UserError
 from dopepp.models.checkpoint.storage import read_mapping
 from dopepp.models.layers import (
@@ -109,17 +109,8 @@ class VGG19(Backbone):
             if step == POOL:
                 position += 1
                 continue
-            for name, parameter in convolutions[number].named_parameters():
-                key = f"features.{position}.{name}"
-                value = weights.get(key)
-                if not isinstance(value, Tensor) or value.shape != parameter.shape:
-                    got = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
-                    raise UserError(
-                        f"{got} under {key} in {path}",
-                        f"a tensor of shape {tuple(parameter.shape)}",
-                        "pass a state_dict of torchvision.models.vgg19",
-                    )
-                parameter.data.copy_(value)
+            name = f"features.{position}"
+            copy_layer(weights, name, convolutions[number], path, "torchvision.models.vgg19")
             position, number = position + 2, number + 1
 
 
@@ -200,10 +191,10 @@ class Pyramid(Backbone):
         super().__init__()
         scaled = [
             scaled_channels(count, width)
-            for count in _integers("channels", channels, 4, 8, MAX_CHANNELS)
+            for count in check_integers("channels", channels, 4, 8, MAX_CHANNELS)
         ]
-        _integers("blocks", blocks, 4, 1, MAX_BLOCKS)
-        _integers("top_down", top_down, 2, 0, MAX_BLOCKS)
+        check_integers("blocks", blocks, 4, 1, MAX_BLOCKS)
+        check_integers("top_down", top_down, 2, 0, MAX_BLOCKS)
         self.stem = nn.Sequential(
             nn.PixelUnshuffle(4), conv_block(3 * 4**2, scaled[0], 3, batch_norm=True)
         )
@@ -239,12 +230,17 @@ class Pyramid(Backbone):
         return features  # type: ignore[no-any-return]
 
 
-def _integers(
-    name: str, values: Sequence[int], length: int, lowest: int, highest: int
-) -> Sequence[int]:
-    """Return a list of so many integers of a closed range."""
-    if not isinstance(values, (list, tuple)) or len(values) != length:
-        raise UserError(f"{name}={values!r:.100}", f"a list of {length} integers", f"change {name}")
-    for position, value in enumerate(values):
-        check_integer(f"{name}[{position}]", value, lowest, highest)
-    return values
+def copy_layer(
+    weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
+) -> None:
+    """Copy what a file holds of a layer under a name; a :class:`UserError` if it does not fit."""
+    for key, own in layer.state_dict().items():
+        value = weights.get(f"{name}.{key}")
+        if not isinstance(value, Tensor) or value.shape != own.shape:
+            got = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
+            raise UserError(
+                f"{got} under {name}.{key} in {path}",
+                f"a tensor of shape {tuple(own.shape)}",
+                f"pass a state_dict of {network}",
+            )
+        own.copy_(value)

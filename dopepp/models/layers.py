@@ -27,6 +27,10 @@ MAX_BLOCKS: Final = 16
 """Bounds of the width factor, and of channels and blocks where they are options, so that a hostile
 spec cannot ask for unlimited memory."""
 
+IMAGENET_MEAN: Final = tuple(255 * value for value in (0.485, 0.456, 0.406))
+IMAGENET_STD: Final = tuple(255 * value for value in (0.229, 0.224, 0.225))
+"""Of red, green and blue on the 0–255 scale, which torchvision's weights expect."""
+
 _CHANNEL_STEP: Final = 8
 """Channel counts are multiples of this: what vectorised convolutions block by."""
 

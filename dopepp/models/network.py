@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Final
 
 import torch
 from jaxtyping import Num
@@ -21,13 +20,9 @@ from dopepp.core.errors import UserError
 from dopepp.models.attention import Attention
 from dopepp.models.backbones import Backbone
 from dopepp.models.heads import Head, Stage
-from dopepp.models.layers import find_activation
+from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD, find_activation
 
 Images = Num[Tensor, "batch 3 height width"]
-
-# ImageNet's statistics, which torchvision's weights expect, on the 0–255 scale.
-_MEAN: Final = tuple(255 * value for value in (0.485, 0.456, 0.406))
-_STD: Final = tuple(255 * value for value in (0.229, 0.224, 0.225))
 
 
 class PoseNetwork(nn.Module):
@@ -59,8 +54,8 @@ class PoseNetwork(nn.Module):
         self.stride = backbone.stride
         self.size_multiple = backbone.stride * math.lcm(backbone.cell_multiple, head.cell_multiple)
         # Not persistent: they are constants of the code, and a checkpoint must not alter them.
-        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, images: Images) -> list[Stage]:
         """Return the belief logits and vector field of every stage.

@@ -17,6 +17,7 @@ from dopepp.models.network import PoseNetwork
 from dopepp.models.registry import TARGET, Registry
 
 BACKBONES = Registry.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
+BACKBONES.register("dopepp.models.efficientnet.EfficientNetLite")
 ATTENTIONS = Registry.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
 HEADS = Registry.of_module("head", heads.Head, heads)
 LOSSES = Registry.of_module("loss", losses.MapLoss, losses)  # type: ignore[type-abstract]

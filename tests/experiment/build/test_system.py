@@ -11,20 +11,24 @@ from dopepp.experiment.config.run import TrainerConfig
 
 
 @pytest.mark.parametrize(
-    ("accelerator", "flags", "gpu_is_fast", "expected"),
+    ("accelerator", "vendor", "flags", "gpu_is_fast", "expected"),
     [
-        ("cpu", {"sse2", "avx512_bf16"}, False, "bf16-mixed"),
-        ("cpu", {"sse2", "avx2"}, True, "32-true"),
-        ("cpu", set(), True, "32-true"),
-        ("cuda", set(), True, "bf16-mixed"),
-        ("cuda", {"avx512_bf16"}, False, "32-true"),
-        ("mps", {"avx512_bf16"}, True, "32-true"),
+        ("cpu", "AuthenticAMD", "sse2 avx512_bf16", False, "bf16-mixed"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16", False, "32-true"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16 amx_bf16", False, "bf16-mixed"),
+        ("cpu", "", "asimd bf16", False, "bf16-mixed"),
+        ("cpu", "AuthenticAMD", "sse2 avx2", True, "32-true"),
+        ("cpu", "", "", True, "32-true"),
+        ("cuda", "", "", True, "bf16-mixed"),
+        ("cuda", "AuthenticAMD", "avx512_bf16", False, "32-true"),
+        ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
     ],
 )
-def test_bf16_is_taken_only_where_it_is_computed_in(
-    accelerator, flags, gpu_is_fast, expected, monkeypatch
+def test_bf16_is_taken_only_where_it_is_fast(
+    accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch
 ):
-    monkeypatch.setattr(built, "cpu_fact", lambda *names: " ".join(flags))
+    facts = {("vendor_id",): vendor, ("flags", "Features"): flags}
+    monkeypatch.setattr(built, "cpu_fact", lambda *names: facts[names])
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
     assert choose_precision("auto", accelerator)[0] == expected
     assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")

