@@ -31,8 +31,8 @@ class Agreement:
         maps: Of a value of a map, as a share of the largest one's size where that is over 1.
         position_mm: Of a position, millimetres.
         rotation_deg: Of a rotation, degrees.
-        num_poses: Poses that both found.
-        num_single: Poses that only one of them found.
+        num_poses: Best-scored poses that both found.
+        num_single: Those that only one of them found.
         num_pictures: Pictures they looked at.
     """
 
@@ -67,17 +67,22 @@ def compare(
     original: PoseEstimator,
     pictures: Sequence[tuple[Picture, CameraMatrix]],
 ) -> Agreement:
-    """Compare maps and poses on pictures with their camera matrices."""
+    """Compare maps and poses on pictures with their camera matrices.
+
+    Of each object, a picture's best-scored pose: what a network sees in clutter beside the parts
+    may lie on the brink of two poses, and float32's rounding decides which.
+    """
     maps, apart, num_single = [0.0], [(0.0, 0.0)], 0
     for picture, K in pictures:
         for box in letterboxes(original.checkpoint, K, picture):
             pixels = letterboxed(picture, box, original.network.size_multiple)
             for one, other in zip(exported.maps(pixels), original.maps(pixels), strict=True):
                 maps.append(_difference(one, other))
-        found = [each.predict(picture, K, cropped=True) for each in (original, exported)]
-        pairs = _pairs(*found)
-        apart += [_apart(*pair) for pair in pairs]
-        num_single += sum(map(len, found)) - 2 * len(pairs)
+        ours, theirs = (
+            _best(each.predict(picture, K, cropped=True)) for each in (original, exported)
+        )
+        apart += [_apart(ours[name], theirs[name]) for name in ours.keys() & theirs.keys()]
+        num_single += len(ours.keys() ^ theirs.keys())
     positions, rotations = zip(*apart, strict=True)
     return Agreement(
         max(maps), max(positions), max(rotations), len(apart) - 1, num_single, len(pictures)
@@ -90,21 +95,9 @@ def _difference(one: torch.Tensor, other: torch.Tensor) -> float:
     return largest if math.isfinite(largest) else math.inf
 
 
-def _pairs(
-    ours: Sequence[Detection], theirs: Sequence[Detection]
-) -> list[tuple[Detection, Detection]]:
-    """Return detections of the same object, the nearest ones first, each in one pair."""
-    distances = [
-        (_apart(one, other)[0], i, k)
-        for i, one in enumerate(ours)
-        for k, other in enumerate(theirs)
-        if one.object == other.object
-    ]
-    pairs: dict[int, int] = {}
-    for _, i, k in sorted(distances):
-        if i not in pairs and k not in pairs.values():
-            pairs[i] = k
-    return [(ours[i], theirs[k]) for i, k in pairs.items()]
+def _best(found: Sequence[Detection]) -> dict[str, Detection]:
+    """Return each object's best-scored detection; they are given in that order."""
+    return {one.object: one for one in reversed(found)}
 
 
 def _apart(one: Detection, other: Detection) -> tuple[float, float]:
