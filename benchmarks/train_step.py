@@ -1,8 +1,9 @@
 """Speed of the quickstart with each network: a training step, and one picture's maps.
 
 ``python benchmarks/train_step.py`` runs ``experiment=quickstart`` with every model below in turn in
-one process: images a second of forward, loss and backward, with and without glibc keeping freed
-memory, and milliseconds of one picture's maps in float32, memory not kept, as in a user's program.
+one process: images a second of forward, loss and backward in the precision that a training here
+takes, with and without glibc keeping freed memory, with memory kept in float32 and in bf16, and
+milliseconds of one picture's maps in float32, memory not kept, as in a user's program.
 The first model is what the others are compared with. Other models:
 ``python benchmarks/train_step.py dopepp dopepp_fast …``.
 """
@@ -41,14 +42,13 @@ def make_network(model: str) -> PoseNetwork:
     return network.to(memory_format=torch.channels_last)
 
 
-def make_step(network: PoseNetwork) -> Callable[[], None]:
-    """Return one forward and backward pass of a network."""
+def make_step(network: PoseNetwork, half: bool) -> Callable[[], None]:
+    """Return one forward and backward pass of a network, in bf16 or in float32."""
     loss = SpatialCrossEntropy(sigma=1.0)
     images = torch.randint(0, 256, (BATCH, 3, SIZE, SIZE), dtype=torch.uint8)
     images = images.contiguous(memory_format=torch.channels_last)
     belief = torch.rand(BATCH, 9, SIZE // 8, SIZE // 8)
     field = torch.rand(BATCH, 16, SIZE // 8, SIZE // 8)
-    half = choose_precision("auto", "cpu")[0].startswith("bf16")
 
     def step() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
@@ -89,25 +89,38 @@ def return_freed_memory() -> None:
 def main(models: tuple[str, ...]) -> None:
     """Print a line per model: its size, and each rate with its ratio to the first model's."""
     networks = {model: make_network(model) for model in models}
-    calls = {model: (make_step(one), make_prediction(one)) for model, one in networks.items()}
-    # Of each model: a step and a picture with glibc's default, a step with memory kept.
-    times: dict[str, list[tuple[float, float, float]]] = {model: [] for model in models}
+    calls = {
+        model: (make_step(one, half=False), make_step(one, half=True), make_prediction(one))
+        for model, one in networks.items()
+    }
+    half = choose_precision("auto", "cpu")[0].startswith("bf16")
+    # Of each model: a step and a picture with glibc's default, steps with memory kept.
+    times: dict[str, list[tuple[float, float, float, float]]] = {model: [] for model in models}
     for _ in range(ROUNDS):
-        for model, (step, predict) in calls.items():
+        for model, (single_step, half_step, predict) in calls.items():
             return_freed_memory()
-            default, picture = seconds(step, STEPS), seconds(predict, PICTURES)
+            default = seconds(half_step if half else single_step, STEPS)
+            picture = seconds(predict, PICTURES)
             keep_freed_memory()
-            times[model].append((default, picture, seconds(step, STEPS)))
-    print(f"{torch.get_num_threads()} threads, {BATCH} images of {SIZE}×{SIZE}")
+            kept = seconds(single_step, STEPS), seconds(half_step, STEPS)
+            times[model].append((default, picture, *kept))
+    chosen = "bf16" if half else "float32"
+    print(
+        f"{torch.get_num_threads()} threads, {BATCH} images of {SIZE}×{SIZE}, trained in {chosen}"
+    )
     first = None
     for model, rounds in times.items():
-        default, picture, kept = (statistics.median(one) for one in zip(*rounds, strict=True))
+        default, picture, single_s, half_s = (
+            statistics.median(one) for one in zip(*rounds, strict=True)
+        )
+        kept = half_s if half else single_s
         num_parameters, gmacs = network_cost(networks[model], (SIZE, SIZE))
         first = first or (kept, picture)
         print(
             f"{model:12} {num_parameters / 1e6:.2f} M weights, {gmacs:.3f} GMACs; training: "
             f"{BATCH / default:.1f} images/s, memory kept {BATCH / kept:.1f} "
-            f"({first[0] / kept:.2f}×); one picture: {1000 * picture:.1f} ms "
+            f"({first[0] / kept:.2f}×), float32 {BATCH / single_s:.1f}, bf16 {BATCH / half_s:.1f} "
+            f"({single_s / half_s:.2f}×); one picture: {1000 * picture:.1f} ms "
             f"({first[1] / picture:.2f}×)"
         )
 
