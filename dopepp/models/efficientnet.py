@@ -109,7 +109,7 @@ class EfficientNetLite(Backbone):
         if weights_path is not None:
             self._load(_weights_file(weights_path))
         self._num_frozen = (0, *self.strides).index(frozen)
-        self.down[: self._num_frozen].requires_grad_(False)
+        self.down[: self._num_frozen].requires_grad_(False).eval()
 
     def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
         """Return the feature maps of normalised images; their sides are multiples of 32."""

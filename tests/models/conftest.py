@@ -17,8 +17,9 @@ def make_spec():
         num_objects: int = 1,
         **arguments: Any,
     ) -> dict[str, Any]:
+        module = "efficientnet" if backbone == "EfficientNetLite" else "backbones"
         nodes: dict[str, Any] = {
-            "backbone": {"_target_": f"dopepp.models.backbones.{backbone}"},
+            "backbone": {"_target_": f"dopepp.models.{module}.{backbone}"},
             "attention": {"_target_": f"dopepp.models.attention.{attention}"},
             "head": {"_target_": f"dopepp.models.heads.{head}"},
         }

@@ -8,6 +8,7 @@ from dopepp.core import errors
 from dopepp.core.errors import UserError
 from dopepp.models.efficientnet import EfficientNetLite
 from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD
+from dopepp.models.spec import architecture, build_network
 
 ENDS = (4, 10, 15)
 """The published network's last blocks at strides 8, 16 and 32."""
@@ -120,6 +121,15 @@ def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"weights_path=imagenet without .*'dopepp\[imagenet\]'"):
         EfficientNetLite(weights_path="imagenet")
+
+
+def test_what_a_checkpoint_stores_needs_no_extra(monkeypatch, make_spec):
+    spec = make_spec("EfficientNetLite", backbone_weights_path="imagenet", backbone_width=0.125)
+    trained = build_network(spec)
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
+    network = build_network(architecture(spec))
+    network.load_state_dict(trained.state_dict())
+    assert network.backbone.down[0].training is False
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def num_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-@pytest.mark.parametrize("backbone", ["VGG19", "DSC", "Pyramid"])
+@pytest.mark.parametrize("backbone", ["VGG19", "DSC", "Pyramid", "EfficientNetLite"])
 @pytest.mark.parametrize("attention", ["Identity", "SE", "CBAM"])
 @pytest.mark.parametrize("head", ["Cascade", "MultiScale", "SharedTrunk"])
 @pytest.mark.parametrize("num_objects", [1, 2])
@@ -41,7 +41,13 @@ def test_every_combination_gives_stages_of_the_right_shape(
 
 
 @pytest.mark.parametrize(
-    ("backbone", "head"), [("Pyramid", "SharedTrunk"), ("DSC", "MultiScale"), ("VGG19", "Cascade")]
+    ("backbone", "head"),
+    [
+        ("Pyramid", "SharedTrunk"),
+        ("EfficientNetLite", "SharedTrunk"),
+        ("DSC", "MultiScale"),
+        ("VGG19", "Cascade"),
+    ],
 )
 def test_the_copy_for_inference_answers_the_same_without_batch_norm(make_spec, backbone, head):
     options = {"backbone_width": 0.125, "head_width": 0.125}

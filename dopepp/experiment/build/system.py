@@ -47,8 +47,8 @@ _BF16_FLAGS: Final = frozenset({"amx_bf16", "bf16"})
 """x86's and Arm's names of the instruction sets."""
 
 _AMD_BF16_FLAG: Final = "avx512_bf16"
-"""Intel's multiply no faster with it than in float32 and convert besides: 0.7 of the images a second
-(``benchmarks/train_step.py``). There AMX is what makes bf16 fast."""
+"""Intel's multiply no faster with it than in float32, and convert besides: 0.7 times the images a
+second (``benchmarks/train_step.py``). There AMX is what makes bf16 fast."""
 
 
 def build_system(

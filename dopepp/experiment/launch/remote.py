@@ -43,12 +43,16 @@ def configure_logging() -> None:
 def quiet_lightning() -> None:
     """Leave out Lightning's messages that only repeat ours; for once it is imported.
 
-    One warning goes as well: Lightning 2.6 makes a ``LeafSpec`` of every batch, which PyTorch calls
-    deprecated since 2.9, and nobody but Lightning can change that.
+    Two warnings go as well: Lightning 2.6 makes a ``LeafSpec`` of every batch, which PyTorch calls
+    deprecated since 2.9, and nobody but Lightning can change that; and layers in evaluation mode,
+    which are those that a backbone keeps as they are.
     """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+    warnings.filterwarnings(
+        "ignore", r"Found \d+ module\(s\) in eval mode at the start of training"
+    )
 
 
 def is_first_process() -> bool:
