@@ -5,6 +5,7 @@ Choices that need a package of an extra are refused in one line where it is not 
 
 from __future__ import annotations
 
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 
 
@@ -35,11 +36,13 @@ class RunError(RuntimeError):
         super().__init__(" ".join(reason.split()))
 
 
-def require(package: str, choice: str, extra: str) -> None:
-    """Check that what a choice needs is installed, or raise a :class:`UserError`."""
-    if find_spec(package) is None:
+def require(package: str, choice: str, extra: str) -> ModuleSpec:
+    """Look up the package that a choice needs; a :class:`UserError` where it is not installed."""
+    spec = find_spec(package)
+    if spec is None:
         raise UserError(
             f"{choice} without the package {package}",
             f"an installation with the extra {extra}",
             f"pip install 'dopepp[{extra}]', or leave {choice} out",
         )
+    return spec

@@ -8,7 +8,6 @@ Images for Deep Learning").
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Final, cast
 
@@ -144,11 +143,9 @@ class EfficientNetLite(Backbone):
     def _names(self) -> list[str]:
         """Return what the file calls the convolutions and batch norms of the way down, in order."""
         names = ["_conv_stem", "_bn0"]
-        expansions = [
-            expansion for stages in self.plan for _, _, expansion, _, n in stages for _ in range(n)
-        ]
-        for number, expansion in enumerate(expansions):
-            expand = ("_expand_conv", "_bn0") if expansion > 1 else ()
+        blocks = [one for one in self.down.modules() if isinstance(one, InvertedResidual)]
+        for number, block in enumerate(blocks):
+            expand = ("_expand_conv", "_bn0") if block.expansion > 1 else ()
             own = (*expand, "_depthwise_conv", "_bn1", "_project_conv", "_bn2")
             names += [f"_blocks.{number}.{layer}" for layer in own]
         return names
@@ -171,6 +168,7 @@ class InvertedResidual(nn.Module):
             same_conv(inside, inside, kernel_size, stride=stride, groups=inside),
             same_conv(inside, out_channels, 1, relu=False),
         )
+        self.expansion = expansion
         self.added = stride == 1 and in_channels == out_channels
 
     def forward(
@@ -214,8 +212,6 @@ def _weights_file(path: object) -> str:
         raise UserError(f"weights_path={path!r:.200}", f"a file's path or {IMAGENET}", "correct it")
     if path != IMAGENET:
         return path
-    require(_PACKAGE, f"weights_path={IMAGENET}", "imagenet")
-    package = find_spec(_PACKAGE)  # looked up, not imported: its file is all that is needed
-    assert package is not None
-    assert package.origin is not None
-    return str(Path(package.origin).parent / _FILE)
+    # Looked up, not imported: the package's file is all that is needed.
+    package = require(_PACKAGE, f"weights_path={IMAGENET}", "imagenet")
+    return str(Path(cast(str, package.origin)).parent / _FILE)

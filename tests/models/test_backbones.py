@@ -4,6 +4,7 @@ from torch import nn
 
 from dopepp.core.errors import UserError
 from dopepp.models.backbones import DSC, VGG19, Pyramid, VGG19Original
+from dopepp.models.efficientnet import EfficientNetLite
 
 
 def num_weights(module: nn.Module) -> int:
@@ -51,10 +52,11 @@ def test_a_pyramid_counts_as_its_blocks_do():
     assert all(one.bias is None for one in backbone.modules() if isinstance(one, nn.Conv2d))
 
 
+@pytest.mark.parametrize("backbone", [Pyramid, EfficientNetLite])
 @pytest.mark.parametrize("size", [(64, 64), (32, 160)])
 @pytest.mark.parametrize(("width", "channels"), [(0.125, 24), (0.25, 48)])
-def test_a_pyramid_publishes_its_channels_and_stride(size, width, channels):
-    backbone = Pyramid(width=width).eval()
+def test_a_pyramid_publishes_its_channels_and_stride(backbone, size, width, channels):
+    backbone = backbone(width=width).eval()
     assert (backbone.out_channels, backbone.stride, backbone.cell_multiple) == (channels, 8, 4)
     with torch.no_grad():
         features = backbone(torch.zeros(1, 3, *size))
