@@ -6,7 +6,7 @@ from torch import nn
 
 from dopepp.core import errors
 from dopepp.core.errors import UserError
-from dopepp.models.efficientnet import EfficientNetLite
+from dopepp.models.efficientnet import DepthwiseConv, EfficientNetLite
 from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD
 from dopepp.models.spec import architecture, build_network
 
@@ -74,6 +74,20 @@ def test_frozen_layers_stay_and_the_others_learn(frozen, count):
             continue
         same = torch.equal(value, before[name])
         assert same == (".".join(name.split(".")[:2]) in kept), name
+
+
+def test_learned_depthwise_convolutions_stay_in_float32_on_the_cpu():
+    torch.manual_seed(0)
+    layer = DepthwiseConv(8, 8, 5, stride=2, padding=2, groups=8, bias=False)
+    images = torch.randn(2, 8, 16, 16)
+    expected = layer(images)
+    with torch.autocast("cpu", torch.bfloat16):
+        learned = layer(images)
+        with torch.no_grad():
+            assert layer(images).dtype == torch.bfloat16
+        assert layer.requires_grad_(False)(images).dtype == torch.bfloat16
+    assert learned.requires_grad
+    assert torch.equal(learned, expected)
 
 
 def test_every_scale_reaches_the_features():
