@@ -365,5 +365,14 @@ def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer
         seed,
         find_backgrounds(data.virtual.backgrounds),
         renderer=renderer,
-        negatives=[load_part(name, data.unit) for name in data.virtual.negatives],
+        negatives=_negatives(data, parts),
     )
+
+
+def _negatives(data: DataConfig, parts: Parts) -> list[Part]:
+    """Return what is shown and not to be found: the listed parts, and a BOP root's other models."""
+    listed = [load_part(name, data.unit) for name in data.virtual.negatives]
+    if data.root is None or data.format != "bop" or data.objects is None:
+        return listed
+    known = {part.name for part in (*parts, *listed)}
+    return listed + [part for part in bop_parts(data.root) if part.name not in known]

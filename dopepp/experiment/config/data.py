@@ -53,7 +53,8 @@ class VirtualConfig:
             with a ``data.root``, else ``paper``.
         scene: Fields of the preset that are changed.
         backgrounds: Folder of photos, ``skimage`` for its own photos; None for procedural pictures.
-        negatives: Parts that are shown but must not be found: built-in names or mesh files.
+        negatives: Parts that are shown but must not be found: built-in names or mesh files. Of a
+            BOP data set, models that are none of ``data.objects`` are shown anyway.
         renderer: ``raster``, or ``photoreal``.
         camera: That the parts are to be found with; a file is read once, and its numbers stand in
             its place. None takes the preset's.

@@ -37,6 +37,9 @@ _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", 
 _BESIDE: Final = ("shading", "scale_factors", "by", "num_bins", "bop_csv", "all_measures")
 """Options that measure more beside the result, and leave it as it is."""
 
+_CHOSEN_SIZES: Final = (("data", "input_size"), ("virtual", "camera_scale"))
+"""Where null in a config is replaced by what suits the objects' sizes."""
+
 _LONGEST_NAME: Final = 60
 """Characters of a name that tables and legends have room for."""
 
@@ -50,7 +53,7 @@ class Run:
         report: Its result, None where there is none.
         failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
         config: The resolved config, empty where there is none.
-        recipe: Everything but seed and parts that decides about the result, as one text; empty
+        recipe: Everything but seed and objects that decides about the result, as one text; empty
             where unknown.
         cost: What its network costs.
         pruned: Whether it has no result because a search stopped it.
@@ -155,13 +158,13 @@ def read_run(folder: Path) -> Run:
     if report is not None and "checkpoint" in report.details:
         checkpoint = folder / str(report.details["checkpoint"])
     training, overrides = config, overrides_of(folder)
-    configs = [config] if config else []
+    configs = [_as_asked(folder, config)] if config else []
     if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
         checkpoint = Path(str(config["ckpt_path"]))
         trained = checkpoint.parent.parent
         training = _mapping(trained / record.CONFIG_FILE)
         overrides = [*overrides_of(trained), *overrides]
-        configs = [config, training] if training else []
+        configs = [config, _as_asked(trained, training)] if training else []
     model = _model(training or _mapping(folder / _HYDRA / "config.yaml"), overrides, report)
     seed = training.get("seed")
     seed = seed if isinstance(seed, int) else None
@@ -182,15 +185,25 @@ def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report |
     return "run" if report is None else report.name
 
 
+def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's config without the sizes that were chosen for its objects, not asked for."""
+    asked, kept = _mapping(folder / _HYDRA / "config.yaml"), dict(config)
+    for node, name in _CHOSEN_SIZES:
+        if (asked.get(node) or {}).get(name, name) is None and isinstance(kept.get(node), dict):
+            kept[node] = {**kept[node], name: None}
+    return kept
+
+
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
-    """Return configs as one text, without seed, parts and what does not touch the result."""
+    """Return configs as one text, without seed, objects and what does not touch the result."""
     kept = [
         {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE, *_BESIDE)}
         for config in map(as_written_now, configs)
     ]
     for config in kept:
         if isinstance(config.get("data"), dict):
-            config["data"] = {k: v for k, v in config["data"].items() if k != "parts"}
+            data = config["data"].items()
+            config["data"] = {k: v for k, v in data if k not in ("parts", "objects")}
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 

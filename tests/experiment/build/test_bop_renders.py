@@ -76,6 +76,14 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
 
 
+def test_models_that_are_not_learned_are_shown_all_the_same(config):
+    given = config("virtual.preset=upright", "data.objects=[red]")
+    parts = build_parts(given.data)
+    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    assert [part.name for part in factory.parts] == ["red"]
+    assert factory.negatives[0].name == "blue"
+
+
 def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
     given = config(
         "virtual.preset=upright", "data.real_fraction=0.5", "data.image_sets.train=test",

@@ -247,13 +247,13 @@ def test_refined_in_one_seed_of_two_is_no_row():
     assert [one.name for one in with_refined([both])] == ["x"]
 
 
-def test_refined_poses_of_a_network_a_part_have_a_mean():
-    def of_part(one: Report, part: str, after: Report | None = None) -> Report:
-        rows = {part: replace(one.rows["part0"], object=part), MEAN: one.rows[MEAN]}
-        return replace(
-            one, rows=rows, references={}, errors={part: one.errors["part0"]}, refined=after
-        )
+def of_part(one: Report, part: str, after: Report | None = None) -> Report:
+    """Return a result on one part as one on a part of this name."""
+    rows = {part: replace(one.rows["part0"], object=part), MEAN: one.rows[MEAN]}
+    return replace(one, rows=rows, references={}, errors={part: one.errors["part0"]}, refined=after)
 
+
+def test_refined_poses_of_a_network_a_part_have_a_mean():
     bad, good, best = (report("x", add) for add in (BAD, GOOD, [0.001] * 32))
     bolt, nut = of_part(bad, "bolt", of_part(good, "bolt")), of_part(bad, "nut")
     joined = Report.joined([replace(nut, refined=of_part(best, "nut")), bolt])
@@ -280,6 +280,19 @@ def test_a_failed_job_is_a_row(others, tmp_path, capsys):
 
 
 # Run folders
+
+
+@pytest.mark.parametrize(("asked", "count"), [(None, 1), (0.5, 2)])
+def test_a_scale_that_was_chosen_for_the_object_is_no_other_recipe(asked, count, tmp_path):
+    for part, scale in (("bolt", 0.5), ("nut", 0.9)):
+        config = {"data": {"objects": [part]}, "virtual": {"camera_scale": scale}}
+        overrides, result = [f"data.objects=[{part}]"], of_part(report("x", GOOD), part)
+        folder = write_run(tmp_path / part, overrides, result, **config)
+        given = {"virtual": {"camera_scale": asked}}
+        (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(given))
+    entries = group(find_runs([tmp_path / "bolt", tmp_path / "nut"]))
+    assert len(entries) == count
+    assert len(entries[0].objects) == (3 if count == 1 else 1)
 
 
 def test_runs_that_differ_in_the_seed_are_one_method(tmp_path):

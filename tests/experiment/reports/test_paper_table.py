@@ -45,7 +45,8 @@ def job(
     record.write_json(folder / record.METRICS_FILE, report.to_record())
     seed = next((int(text[5:]) for text in overrides if text.startswith("seed=")), 0)
     model = {"name": "x", "width": 1}
-    data = {"parts": [part]}
+    of_a_data_set = any(text.startswith("data.objects=") for text in overrides)
+    data = {"objects" if of_a_data_set else "parts": [part]}
     record.write_config(
         folder, {"model": model, "seed": seed, "data": data, "a": overrides[0], **config}
     )
@@ -107,11 +108,12 @@ def test_pass_rates_with_seeds_failures_and_the_papers_figures(tmp_path):
     assert "VGG19" not in text
 
 
-def test_one_network_a_part_is_one_method_with_a_mean(tmp_path):
+@pytest.mark.parametrize("option", ["data.parts", "data.objects"])
+def test_one_network_a_part_is_one_method_with_a_mean(option, tmp_path):
     errors = {"none": {"bolt": [0.06, 0.06], "nut": [0.004] * 8 + [0.06] * 2},
               "random": {"bolt": [0.004, 0.06], "nut": [0.004] * 9 + [0.06]}}  # fmt: skip
     for number, (seed, mask, part) in enumerate(product((1, 2), errors, ("bolt", "nut"))):
-        overrides = [f"data/masking={mask}", f"data.parts=[{part}]", f"seed={seed}"]
+        overrides = [f"data/masking={mask}", f"{option}=[{part}]", f"seed={seed}"]
         job(tmp_path / str(number), overrides, errors[mask][part], part)
     labels = {"data/masking=none": "without", "data/masking=random": "with"}
     printed = {
