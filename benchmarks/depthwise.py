@@ -3,7 +3,7 @@
 ``python benchmarks/depthwise.py`` runs the forward and backward pass of those that
 `efficientnet_lite` learns at 128×128, a batch of 32, in one process and one thread: milliseconds a
 batch of ``nn.Conv2d``, of :class:`dopepp.models.efficientnet.DepthwiseConv`, and their ratio; then
-the same of the whole backbone, whose other layers do not change.
+the same of the whole backbone at the quickstart's width, whose other layers do not change.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main() -> None:
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         both = (depthwise(make, channels, kernel, stride) for make in (nn.Conv2d, DepthwiseConv))
         compare(f"{channels}, {kernel}×{kernel}, stride {stride}", *both, inputs)
-    plain, ours = (EfficientNetLite().train().to(memory_format=torch.channels_last) for _ in "ab")
+    plain, ours = (EfficientNetLite(width=0.5).train().to(memory_format=torch.channels_last) for _ in "ab")
     for layer in plain.modules():
         if isinstance(layer, DepthwiseConv):
             layer.__class__ = nn.Conv2d

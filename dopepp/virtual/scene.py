@@ -47,6 +47,10 @@ class Grooves:
     irregularity: float = 0.0
 
 
+NOISE_LIMITS: Final = (0.05, 2.0)
+"""Least and greatest factor of a material's noise on its albedo."""
+
+
 @dataclass(frozen=True)
 class Material:
     """How a surface reflects light (Lambert plus GGX, metallic workflow).
@@ -58,7 +62,8 @@ class Material:
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
         metallic: 0 is a dielectric, 1 a metal: no diffuse light, and the colour is its reflectance
             at normal incidence.
-        noise: Relative amplitude of the albedo's variation over the surface.
+        noise: Relative amplitude of the albedo's variation over the surface, which is kept within
+            :data:`NOISE_LIMITS` times the albedo.
         noise_pitch: Size of that variation, metres.
     """
 

@@ -34,8 +34,10 @@ class Materials:
         texture_gain: Factor on the colours of surfaces that have some.
         texture_tint: Largest relative deviation of one colour channel from that factor: a scan's
             colours are another camera's.
+        texture_noise: Relative amplitude of the variation of these colours over the surface: a
+            thing has shades, stains and openings that its model lacks.
         noise: Relative amplitude of the albedo's variation over an untextured surface.
-        noise_pitch: Size of that variation over the object's radius.
+        noise_pitch: Size of either variation over the object's radius.
         metal_albedo: Their reflectance at normal incidence.
         brushed_share: Share of metals that are brushed.
         brush_pitch: Mean distance of brush marks, metres.
@@ -53,6 +55,7 @@ class Materials:
     specular: tuple[float, float] = (0.02, 0.07)
     texture_gain: tuple[float, float] = (0.7, 1.2)
     texture_tint: float = 0.0
+    texture_noise: tuple[float, float] = (0.0, 0.0)
     noise: tuple[float, float] = (0.0, 0.12)
     noise_pitch: tuple[float, float] = (0.02, 0.2)
     metal_share: float = 0.15
@@ -76,6 +79,7 @@ class Materials:
         for name in ("roughness", "metal_roughness"):
             check_range(name, getattr(self, name), 0.02, 1.0, "GGX roughness", of=self)
         check_range("texture_gain", self.texture_gain, 0.0, 4.0, "factor", of=self)
+        check_range("texture_noise", self.texture_noise, 0.0, 10.0, "factor", of=self)
         check_range("noise_pitch", self.noise_pitch, 1e-3, 10.0, "radii", of=self)
         for name in ("brush_pitch", "layer_pitch"):
             check_range(name, getattr(self, name), 1e-6, 0.1, "metres", of=self)
@@ -90,7 +94,9 @@ class Materials:
             if self.texture_tint:
                 gain *= 1 + rng.uniform(-self.texture_tint, self.texture_tint, 3)
             roughness, specular = rng.uniform(*self.roughness), rng.uniform(*self.specular)
-            return Material(triple(gain), roughness, specular, noise_pitch=pitch)
+            # Without it nothing is drawn, so that other presets' images stay as they are.
+            noise = rng.uniform(*self.texture_noise) if self.texture_noise[1] else 0.0
+            return Material(triple(gain), roughness, specular, noise=noise, noise_pitch=pitch)
         noise = rng.uniform(*self.noise)
         if rng.random() < self.metal_share:
             return self._metal(rng, noise, pitch)

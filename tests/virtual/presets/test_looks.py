@@ -115,11 +115,21 @@ def test_a_tint_changes_every_channel_of_a_texture_by_a_share_of_its_own(sheet):
     assert np.abs(np.corrcoef(colours.T) - np.eye(3)).max() < 0.1
 
 
+def test_only_what_has_colours_is_stained(sheet, box_surface):
+    materials = Materials(texture_noise=(1.0, 3.0))
+    coloured = make_surface(sheet(0.1, np.full((4, 4, 3), 99, np.uint8)))
+    rng = np.random.default_rng(0)
+    drawn = [materials.draw(rng, coloured).noise for _ in range(200)]
+    assert 1.0 <= min(drawn) < 1.1 < 2.9 < max(drawn) <= 3.0
+    assert all(materials.draw(rng, box_surface).noise <= 0.12 for _ in range(200))
+
+
 @pytest.mark.parametrize(
     "make",
     [
         lambda: Materials(metal_share=1.5),
         lambda: Materials(texture_tint=1.5),
+        lambda: Materials(texture_noise=(0.0, 11.0)),
         lambda: Materials(layer_pitch=(float("nan"), 1e-4)),
         lambda: Materials(roughness=(0.0, 0.5)),
         lambda: Materials(albedo=(0.1,)),

@@ -28,7 +28,7 @@ from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
 from dopepp.virtual.renderers.raster.shadow import ShadowMap, ambient_row, lit_shares
 from dopepp.virtual.renderers.raster.visibility import Projected, Samples
-from dopepp.virtual.scene import Grooves, Scene, SceneObject
+from dopepp.virtual.scene import NOISE_LIMITS, Grooves, Scene, SceneObject
 from dopepp.virtual.surface.occlusion import look_up_sky
 from dopepp.virtual.surface.texture import sample_texture
 from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
@@ -114,7 +114,7 @@ def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragmen
     if material.noise > 0.0:
         _tint_albedo(
             _NOISE, fragments.position, item.T_cam_obj, float(scene.K[0, 0]), material.noise,
-            material.noise_pitch, albedo,
+            material.noise_pitch, albedo, *NOISE_LIMITS,
         )  # fmt: skip
     return albedo
 
@@ -148,7 +148,7 @@ def _blend_colours(face: Array, share: Array, faces: Array, colours: Array, albe
 @compiled(fastmath=True)
 def _tint_albedo(
     noise: Array, position: Array, T_cam_obj: Array, focal: float, amplitude: float, pitch: float,
-    albedo: Array,
+    albedo: Array, least: float, greatest: float,
 ) -> None:  # fmt: skip
     """Vary the albedo over an object's surface; variation finer than a pixel fades.
 
@@ -169,6 +169,7 @@ def _tint_albedo(
             (T_cam_obj[0, 1] * x + T_cam_obj[1, 1] * y + T_cam_obj[2, 1] * z) / pitch,
             (T_cam_obj[0, 2] * x + T_cam_obj[1, 2] * y + T_cam_obj[2, 2] * z) / pitch,
         )
+        tint = min(max(tint, least), greatest)
         for c in range(3):
             albedo[c, p] *= tint
 

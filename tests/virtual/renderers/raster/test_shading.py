@@ -67,6 +67,14 @@ def test_lambert_closed_form(scene_of, sheet):
     assert linear(render(scene).image[60, 79, 0]) == pytest.approx(0.30, abs=0.006)
 
 
+def test_strong_noise_stays_between_black_and_twice_the_colour(scene_of, sheet):
+    matt = Material((0.3, 0.3, 0.3), specular=0.0, noise=10.0, noise_pitch=0.02)
+    item = facing(make_surface(sheet(0.2)), (0, 0, 0.3), matt)
+    image = linear(render(scene_of(item, lights=(), ambient=even(1.0))).image[40:80, 60:100])
+    assert image.min() == pytest.approx(0.05 * 0.3, abs=0.004)
+    assert image.max() == pytest.approx(2 * 0.3, abs=0.01)
+
+
 def test_a_shadow_falls_where_the_light_is_blocked(scene_of, sheet, surface_of):
     floor = facing(make_surface(sheet(0.6)), (0, 0, 0.5))
     box = facing(surface_of(trimesh.creation.box((0.05, 0.05, 0.05))), (-0.05, 0, 0.4))
