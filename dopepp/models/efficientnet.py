@@ -182,7 +182,7 @@ class InvertedResidual(nn.Module):
 class DepthwiseConv(nn.Conv2d):
     """A depthwise convolution, learned in float32 on CPUs under bf16 autocast, too.
 
-    Its backward pass in bf16 takes up to thirteen times as long there, but for 3×3 with a stride of
+    Its backward pass in bf16 takes up to fifteen times as long there, but for 3×3 with a stride of
     1 (``benchmarks/depthwise.py``).
     """
 
