@@ -63,7 +63,9 @@ def main() -> None:
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         both = (depthwise(make, channels, kernel, stride) for make in (nn.Conv2d, DepthwiseConv))
         compare(f"{channels}, {kernel}×{kernel}, stride {stride}", *both, inputs)
-    plain, ours = (EfficientNetLite(width=0.5).train().to(memory_format=torch.channels_last) for _ in "ab")
+    plain, ours = (
+        EfficientNetLite(width=0.5).train().to(memory_format=torch.channels_last) for _ in "ab"
+    )
     for layer in plain.modules():
         if isinstance(layer, DepthwiseConv):
             layer.__class__ = nn.Conv2d
