@@ -374,5 +374,5 @@ def _negatives(data: DataConfig, parts: Parts) -> list[Part]:
     listed = [load_part(name, data.unit) for name in data.virtual.negatives]
     if data.root is None or data.format != "bop" or data.objects is None:
         return listed
-    known = {part.name for part in (*parts, *listed)}
-    return listed + [part for part in bop_parts(data.root) if part.name not in known]
+    known = {part.mesh_hash for part in (*parts, *listed)}
+    return listed + [part for part in bop_parts(data.root) if part.mesh_hash not in known]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -81,6 +82,20 @@ def test_models_that_are_not_learned_are_shown_all_the_same(config):
     parts = build_parts(given.data)
     factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
     assert [part.name for part in factory.parts] == ["red"]
+    assert factory.negatives[0].name == "blue"
+
+
+def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
+    copy = shutil.copytree(root, tmp_path / "set")
+    models = copy / "models"
+    shutil.copy(models / "obj_000001.ply", models / "obj_000003.ply")
+    info = json.loads((models / "models_info.json").read_text())
+    info["3"] = {**info["1"], "name": "twin"}
+    (models / "models_info.json").write_text(json.dumps(info))
+    given = config(f"data.root={copy}", "virtual.preset=upright", "data.objects=[red]")
+    parts = build_parts(given.data)
+    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    assert "twin" not in [part.name for part in factory.negatives]
     assert factory.negatives[0].name == "blue"
 
 
