@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.parts.mesh.measure import face_areas
-from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.scene import NOISE_LIMITS, Ambient, Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.surface.texture import Texture
 from dopepp.virtual.tone import SRGB_TO_LINEAR
@@ -169,7 +169,8 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     # Random from cell to cell, always the same: only the look of a rough surface.
     cells = np.random.default_rng(0).uniform(-1, 1, (_NOISE_CELLS, _NOISE_CELLS, 1))
     scale = 1.0 / (_NOISE_CELLS * material.noise_pitch)
-    texels = (colour * (1 + material.noise * cells)).astype(np.float32)
+    tint = np.clip(1 + material.noise * cells, *NOISE_LIMITS)
+    texels = (colour * tint).astype(np.float32)
     return _bitmap(mi, texels, np.diag([scale, scale, 1.0, 1.0]))
 
 

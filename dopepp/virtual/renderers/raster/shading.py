@@ -153,7 +153,8 @@ def _tint_albedo(
     """Vary the albedo over an object's surface; variation finer than a pixel fades.
 
     ``position`` is in the camera frame, metres, shape (3, n); ``focal`` in pixels; ``pitch`` that
-    of the lattice, metres; ``albedo`` linear RGB, shape (3, n), updated in place.
+    of the lattice, metres; ``albedo`` linear RGB, shape (3, n), updated in place, by factors from
+    ``least`` to ``greatest``.
     """
     for p in range(position.shape[1]):
         # Two lattice steps are the shortest wave; it needs two pixels.
