@@ -24,7 +24,9 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, crop_sample, resize_sample
 from dopepp.drawing.pictures import Picture
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_parts, labelled_images, seen_preset
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.renders import seen_preset
+from dopepp.experiment.build.sources import labelled_images
 from dopepp.experiment.build.system import build_system
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs.record import CONFIG_FILE

@@ -80,7 +80,7 @@ def untrained(model: str):
     """Return an untrained network in its full width."""
     import torch
 
-    from dopepp.experiment.build.sources import build_parts
+    from dopepp.experiment.build.parts import build_parts
     from dopepp.experiment.build.system import build_untrained
 
     config = config_of(model)

@@ -51,7 +51,7 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     import numpy as np
     import torch
 
-    from dopepp.experiment.build.sources import build_parts
+    from dopepp.experiment.build.parts import build_parts
     from dopepp.experiment.build.system import build_untrained
     from dopepp.inference.export import EXPORTERS
     from dopepp.inference.runtimes.description import Export

@@ -21,7 +21,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from dopepp.experiment.build.sources import build_parts
+from dopepp.experiment.build.parts import build_parts
 from dopepp.experiment.build.system import build_untrained, choose_precision, keep_freed_memory
 from dopepp.experiment.config.run import RunConfig
 from dopepp.models.losses import SpatialCrossEntropy

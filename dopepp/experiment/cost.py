@@ -28,7 +28,8 @@ from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_parts, held_out_source
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.reports.tables import read_csv

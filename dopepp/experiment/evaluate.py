@@ -16,12 +16,9 @@ from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_na
 from dopepp.data.sample import Source
 from dopepp.drawing.curves import save_accuracy_curves
 from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.build.sources import (
-    build_parts,
-    build_scaled_test_source,
-    held_out_source,
-    share_in_words,
-)
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.renders import scaled_test_renders
+from dopepp.experiment.build.sources import held_out_source, share_in_words
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.experiment.reports import conditions, evaluators
@@ -82,7 +79,7 @@ def measure_and_record(
         conditions.check_masks(source)
     if protocols.scales:
         conditions.SCALE.check_methods(methods)
-    scaled = {one: build_scaled_test_source(data, parts, one) for one in protocols.scales}
+    scaled = {one: scaled_test_renders(data, parts, one) for one in protocols.scales}
     samples = (source.sample(index, 0) for index in range(len(source)))
     is_bop = data.root is not None and data.format in ("bop", "webdataset")
     measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))

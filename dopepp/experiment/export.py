@@ -15,7 +15,7 @@ import numpy as np
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import draft
 from dopepp.data.sample import Sample, Source
-from dopepp.experiment.build.sources import validation_renders
+from dopepp.experiment.build.renders import validation_renders
 from dopepp.experiment.config.data import trained_on
 from dopepp.experiment.reports.evaluators import EstimatorMethod
 from dopepp.experiment.reports.report import measure

@@ -24,7 +24,8 @@ from dopepp.core.files import write_csv, write_png
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.curves import figure_image, figure_with_axes
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_datamodule, build_parts
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import build_datamodule
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
 from dopepp.experiment.runs import display, record

@@ -23,7 +23,8 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_datamodule, build_parts
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import build_datamodule
 from dopepp.experiment.build.system import (
     build_system,
     build_trainer,

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, Source
 from dopepp.data.transforms.shading import shade
-from dopepp.experiment.build import sources
+from dopepp.experiment.build.renders import empty_renders
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.config.data import Count, DataConfig
 from dopepp.experiment.config.parse import Share
 from dopepp.experiment.memory import Memory
@@ -117,11 +118,11 @@ def tune(
     """
     old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
     estimator = memory.behind(estimator)
-    validation = memory.of(sources.held_out_source(data, parts, "val"))
-    test = memory.of(sources.held_out_source(data, parts, "test"))
+    validation = memory.of(held_out_source(data, parts, "val"))
+    test = memory.of(held_out_source(data, parts, "test"))
     count, rate = target.num_empty, target.false_positive_rate
-    empty = memory.of(sources.build_source_without_objects(data, parts, "val", count))
-    empty_test = memory.of(sources.build_source_without_objects(data, parts, "test", count))
+    empty = memory.of(empty_renders(data, parts, "val", count))
+    empty_test = memory.of(empty_renders(data, parts, "test", count))
 
     def scored(options: RecoveryOptions, source: Source) -> Scored:
         estimator.recovery = options

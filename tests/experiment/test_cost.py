@@ -9,7 +9,8 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.build.sources import build_parts, held_out_source
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.build.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.cost import (

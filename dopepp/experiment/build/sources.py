@@ -1,4 +1,4 @@
-"""From the ``data`` config to the objects to learn, and to the DataModule: what a split shows.
+"""From the ``data`` config to the DataModule, and to what each split shows.
 
 A split's images are labelled ones in a format of the field, or renders. To add a format, write a
 source and an entry in :data:`FORMATS`.
@@ -7,86 +7,38 @@ source and an entry in :data:`FORMATS`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import cache_folder
 from dopepp.core.futures import available_cores
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.ndds.source import NddsSource
 from dopepp.data.formats.webdataset.source import WebdatasetSource
-from dopepp.data.formats.ycb_video.frame import read_classes, read_image_set
+from dopepp.data.formats.ycb_video.frame import read_image_set
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
-from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource
-from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
+from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.data.sources.windowed import WindowedSource
-from dopepp.drawing.pictures import Size
 from dopepp.experiment.build.registries import AUGMENTATIONS, JITTERS, MASKINGS, build_optional
-from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
+from dopepp.experiment.build.renders import (
+    held_out_renders,
+    kept,
+    training_renders,
+    validation_windows,
+)
+from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Letterbox
-from dopepp.models.checkpoint.schema import Checkpoint
-from dopepp.parts.catalogue import load_part, with_meshes
-from dopepp.parts.mesh.read import ycb_part
-from dopepp.parts.part import Part, Parts
+from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
-from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import Preset, customised_preset
 
 _log = logging.getLogger(__name__)
 
 _TRAINING_SHARE: Final = 0.8
 """Of the images of a folder that training shares with validation or test."""
-
-PAPER_OBJECTS: Final = (
-    "003_cracker_box",
-    "005_tomato_soup_can",
-    "006_mustard_bottle",
-    "009_gelatin_box",
-    "010_potted_meat_can",
-)
-"""The YCB objects of the paper's tables."""
-
-
-def build_parts(data: DataConfig) -> list[Part]:
-    """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
-
-    They have the symmetries that ``data.symmetries`` says. A :class:`UserError` tells what is wrong
-    with root, objects or parts, or that real frames were asked for without a root.
-    """
-    return choose_symmetries(_read_parts(data), data.symmetries)
-
-
-def _read_parts(data: DataConfig) -> list[Part]:
-    if data.root is None:
-        for option, value in (("objects", data.objects), ("frames", data.frames)):
-            if value is not None:
-                raise UserError(
-                    f"data.{option}={list(value)} without data.root",
-                    f"data.{option} names {option} of a data set; data.parts names meshes",
-                    "set data.root, or use data.parts",
-                )
-    elif data.format == "ycb_video":
-        return _ycb_parts(data.root, data.objects)
-    elif data.format in ("bop", "webdataset"):
-        return bop_parts(data.root, data.objects)
-    return [load_part(name, data.unit) for name in data.parts]
-
-
-def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
-    classes = read_classes(root)
-    names = PAPER_OBJECTS if objects is None else objects
-    unknown = [name for name in names if name not in classes]
-    if unknown:
-        fix = "choose from this list"
-        raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
-    return [ycb_part(root, name) for name in names]
 
 
 def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
@@ -120,8 +72,7 @@ def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
     source = held_out_source(data, parts, "val")
     if data.virtual.view is None or not isinstance(source, RenderedSource):
         return source
-    factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
-    return RenderedSource(factory, data.num_val, "val")
+    return validation_windows(data, parts)
 
 
 def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
@@ -142,27 +93,6 @@ def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSo
         labelled.name, ", ".join(part.name for part in parts),
     )  # fmt: skip
     return held_out_renders(data, parts, split)
-
-
-def build_scaled_test_source(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
-    """Build the test scenes, which must be renders, with a camera so many times as near."""
-    if not data.is_rendered("test"):
-        raise UserError(
-            f"scale={scale:g} on the images in data.root={data.root}",
-            "renders, whose camera can be moved",
-            "leave out scale, or test on renders of these objects with data.test.renderer=raster",
-        )
-    return held_out_renders(data, parts, "test", scale)
-
-
-def build_source_without_objects(
-    data: DataConfig, parts: Parts, split: Split, num_images: int
-) -> DescribedSource:
-    """Render a held-out range without the objects: what the network must be silent on."""
-    scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
-    virtual = replace(data.virtual, scene=scene)
-    empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
-    return held_out_renders(empty, parts, split)
 
 
 def _train_source(
@@ -274,13 +204,6 @@ FORMATS: Final[dict[str, Opener]] = {
 """How the images of each format are opened."""
 
 
-def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
-    """Render at the size the network sees, which costs a fraction of the native one."""
-    factory = _factory(data, parts, seen_preset(data), seed, data.virtual.renderer)
-    source = RenderedSource(factory, data.samples_per_epoch)
-    return kept(source, data, data.cache, data.network_input)
-
-
 def share_in_words(data: DataConfig) -> str | None:
     """Say it where the test is only a share of the images in its folder; None where it is all."""
     if data.is_rendered("test") or data.format == "ycb_video":
@@ -296,83 +219,3 @@ def share_in_words(data: DataConfig) -> str | None:
         f"data.image_sets names it for {' and '.join(sharing)} as well: {all_of_it} measures all "
         "of it, training images included, and data.image_sets.test=FOLDER another one"
     )
-
-
-def held_out_renders(
-    data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
-) -> DescribedSource:
-    """Render a range that no other split uses, at its native size, with parts of any scale."""
-    renderer, count = data.virtual.renderer, data.num_val
-    cache: Cache = "none"
-    if split == "test":
-        renderer, count, cache = data.test.renderer or renderer, data.num_test, data.test.cache
-    factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
-    name = "virtual" if renderer == "raster" else renderer
-    return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
-
-
-def validation_renders(
-    checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
-) -> DescribedSource:
-    """Render a checkpoint's parts, by the meshes in it, as its validation images are rendered.
-
-    The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of their
-    own; those of a camera that the checkpoint was trained for keep theirs.
-    """
-    data = replace(chosen_data({}, {}, trained_on(checkpoint.data), str(path)), num_val=count)
-    if size is not None and data.virtual.view is None:
-        scene = {**(data.virtual.scene or {}), "width": size[0], "height": size[1]}
-        data = replace(data, virtual=replace(data.virtual, scene=scene))
-    return held_out_renders(data, with_meshes(checkpoint.parts), "val")
-
-
-def kept(
-    source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
-) -> DescribedSource:
-    """Put the chosen cache around a source; a :class:`UserError` where there is no room."""
-    if cache == "none":
-        return source
-    folder = None
-    if cache == "disk":
-        folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
-    return CachedSource(source, input_size, folder, identity=code_hash())
-
-
-def choose_preset(data: DataConfig) -> Preset:
-    """Return the preset with the config's changes, at the size of a camera's whole pictures."""
-    preset, view = _customised(data), data.virtual.view
-    return preset if view is None else view.whole(preset, data.virtual.camera_scale or 1.0)
-
-
-def seen_preset(data: DataConfig) -> Preset:
-    """Return the same scenes as the network sees them: resized, or in windows of such pictures."""
-    preset, view = _customised(data), data.virtual.view
-    if view is not None:
-        return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
-    box = Letterbox.fit((preset.width, preset.height), data.network_input)
-    return preset.resized(box.width, box.height)
-
-
-def _customised(data: DataConfig) -> Preset:
-    name = data.virtual.preset or ("paper" if data.root is None else "ycb")
-    return customised_preset(name, data.virtual.scene or {})
-
-
-def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:
-    return Factory(
-        parts,
-        preset,
-        seed,
-        find_backgrounds(data.virtual.backgrounds),
-        renderer=renderer,
-        negatives=_negatives(data, parts),
-    )
-
-
-def _negatives(data: DataConfig, parts: Parts) -> list[Part]:
-    """Return what is shown and not to be found: the listed parts, and a BOP root's other models."""
-    listed = [load_part(name, data.unit) for name in data.virtual.negatives]
-    if data.root is None or data.format != "bop" or data.objects is None:
-        return listed
-    known = {part.mesh_hash for part in (*parts, *listed)}
-    return listed + [part for part in bop_parts(data.root) if part.mesh_hash not in known]

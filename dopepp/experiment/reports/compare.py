@@ -28,7 +28,8 @@ from dopepp.drawing.curves import (
 from dopepp.drawing.overlay import BLUE, GREEN, MIN_WIDTH_PX, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, contact_sheet, grid, message_picture
-from dopepp.experiment.build.sources import build_parts, held_out_source
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.config.data import chosen_data, trained_on
 from dopepp.experiment.reports.differences import figures, full, headline, notes
 from dopepp.experiment.reports.entries import (

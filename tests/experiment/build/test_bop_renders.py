@@ -15,7 +15,8 @@ from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sources.rendered import RenderedSource
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_datamodule, build_parts, held_out_source
+from dopepp.experiment.build.parts import build_negatives, build_parts
+from dopepp.experiment.build.sources import build_datamodule, held_out_source
 from dopepp.geometry.camera import project_keypoints
 from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory
@@ -83,6 +84,7 @@ def test_models_that_are_not_learned_are_shown_all_the_same(config):
     factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
     assert [part.name for part in factory.parts] == ["red"]
     assert factory.negatives[0].name == "blue"
+    assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
 
 
 def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):

@@ -8,7 +8,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.build.camera import fitted_to_camera
-from dopepp.experiment.build.sources import build_datamodule, build_parts, held_out_source
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import build_datamodule, held_out_source
 from dopepp.experiment.config.data import chosen_data
 from dopepp.parts.catalogue import pivconnector
 

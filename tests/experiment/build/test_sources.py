@@ -6,13 +6,8 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build.sources import (
-    PAPER_OBJECTS,
-    build_datamodule,
-    build_parts,
-    held_out_source,
-    share_in_words,
-)
+from dopepp.experiment.build.parts import PAPER_OBJECTS, build_parts
+from dopepp.experiment.build.sources import build_datamodule, held_out_source, share_in_words
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
 from dopepp.experiment.evaluate import measure_and_record, parts_of

@@ -5,7 +5,8 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.build import system as built
-from dopepp.experiment.build.sources import build_datamodule, build_parts
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.sources import build_datamodule
 from dopepp.experiment.build.system import build_system, choose_precision, estimate_training_s
 from dopepp.experiment.config.run import TrainerConfig
 

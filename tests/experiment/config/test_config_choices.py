@@ -12,8 +12,9 @@ from hydra.utils import get_class
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.build import registries
+from dopepp.experiment.build.parts import build_parts
 from dopepp.experiment.build.registries import SCHEDULERS, optimizer_factory, scheduler_factory
-from dopepp.experiment.build.sources import build_datamodule, build_parts
+from dopepp.experiment.build.sources import build_datamodule
 from dopepp.experiment.build.system import build_system, build_trainer
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.runs.tracking import tracked

@@ -10,7 +10,9 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.build.sources import build_parts, build_scaled_test_source, held_out_source
+from dopepp.experiment.build.parts import build_parts
+from dopepp.experiment.build.renders import scaled_test_renders
+from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.evaluate import measure_and_record
 from dopepp.experiment.reports.conditions import (
@@ -150,7 +152,7 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(tiny):
             condition.check_methods({**METHODS, "posecnn": poses})
     data = replace(tiny().data, root=Path("photos"))
     with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
-        build_scaled_test_source(data, [], 2.0)
+        scaled_test_renders(data, [], 2.0)
     assert "\n" not in str(error.value)
 
 
@@ -158,7 +160,7 @@ def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
     data = tiny().data
     (part,) = build_parts(data)
     source = held_out_source(data, [part], "test")
-    scaled = {scale: build_scaled_test_source(data, [part], scale) for scale in (0.5, 20.0)}
+    scaled = {scale: scaled_test_renders(data, [part], scale) for scale in (0.5, 20.0)}
     usual = [source.sample(index).instances[0] for index in range(3)]
     far = [scaled[0.5].sample(index).instances[0] for index in range(3)]
     for one, other in zip(usual, far, strict=True):

@@ -1,0 +1,76 @@
+"""From the ``data`` config to the objects to learn, and to what is shown and not to be found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.part_symmetries import choose_symmetries
+from dopepp.experiment.config.data import DataConfig
+from dopepp.parts.catalogue import load_part
+from dopepp.parts.mesh.read import ycb_part
+from dopepp.parts.part import Part, Parts
+
+PAPER_OBJECTS: Final = (
+    "003_cracker_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+)
+"""The YCB objects of the paper's tables."""
+
+
+def build_parts(data: DataConfig) -> list[Part]:
+    """Build the objects to learn: those of the labelled images in ``root``, else the listed parts.
+
+    They have the symmetries that ``data.symmetries`` says. A :class:`UserError` tells what is wrong
+    with root, objects or parts, or that real frames were asked for without a root.
+    """
+    return choose_symmetries(_read_parts(data), data.symmetries)
+
+
+def _read_parts(data: DataConfig) -> list[Part]:
+    if data.root is None:
+        for option, value in (("objects", data.objects), ("frames", data.frames)):
+            if value is not None:
+                raise UserError(
+                    f"data.{option}={list(value)} without data.root",
+                    f"data.{option} names {option} of a data set; data.parts names meshes",
+                    "set data.root, or use data.parts",
+                )
+    elif data.format == "ycb_video":
+        return _ycb_parts(data.root, data.objects)
+    elif data.format in ("bop", "webdataset"):
+        return bop_parts(data.root, data.objects)
+    return [load_part(name, data.unit) for name in data.parts]
+
+
+def _ycb_parts(root: Path, objects: Sequence[str] | None) -> list[Part]:
+    classes = read_classes(root)
+    names = PAPER_OBJECTS if objects is None else objects
+    unknown = [name for name in names if name not in classes]
+    if unknown:
+        fix = "choose from this list"
+        raise UserError(f"data.objects with {unknown[0]!r}", ", ".join(classes), fix)
+    return [ycb_part(root, name) for name in names]
+
+
+def build_negatives(data: DataConfig, parts: Parts) -> list[Part]:
+    """Build what is shown and not to be found: the listed parts, and a BOP root's other models."""
+    listed = [load_part(name, data.unit) for name in data.virtual.negatives]
+    if data.root is None or data.format != "bop" or data.objects is None:
+        return listed
+    known = {part.mesh_hash for part in (*parts, *listed)}
+    return listed + [part for part in _all_models(data.root) if part.mesh_hash not in known]
+
+
+@lru_cache(maxsize=1)
+def _all_models(root: Path) -> tuple[Part, ...]:
+    """Read a BOP data set's models, once for all the factories of a run."""
+    return tuple(bop_parts(root))
