@@ -4,6 +4,7 @@
 
 Each object that is at least half visible starts 10 mm off in a random direction and turned by 5°
 about a random axis, RGB alone; errors are to the published pose, symmetric ones to the nearest.
+With ``--from-truth`` it starts at the published pose: how far pictures and annotation agree.
 Published rotations that are orthogonal to some thousandths only are replaced by the nearest ones.
 """
 
@@ -69,6 +70,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--split", default="test")
     parser.add_argument("--every", type=int, default=1, help="every so manieth frame")
+    parser.add_argument("--from-truth", action="store_true", help="start at the published poses")
     parser.add_argument("--pictures", type=Path, help="a sheet of every 20th: truth green, start "
                         "blue, refined yellow")  # fmt: skip
     arguments = parser.parse_args()
@@ -89,7 +91,7 @@ def main() -> None:
         step = rng.normal(size=6)
         step[:3] *= TURN / np.linalg.norm(step[:3])
         step[3:] *= SHIFT / np.linalg.norm(step[3:])
-        start = moved(true, step)
+        start = true if arguments.from_truth else moved(true, step)
         group = symmetry_group(part.symmetries_discrete, part.symmetries_continuous)
         equivalents = true @ group
         began = time.process_time()
