@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from io import FileIO
 from pathlib import Path
@@ -153,8 +153,8 @@ class JsonLines:
 class BopCsv:
     """A BOP challenge file: a scene for each source, an image for each picture.
 
-    Objects are counted from 1 in the checkpoint's order, or have the number in a name as BOP's,
-    ``obj_000005``.
+    Objects are counted from 1 in the checkpoint's order, or have the numbers in their names where
+    all are called as BOP's files are, ``obj_000005``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -169,12 +169,14 @@ class BopCsv:
 
     def take(self, result: PoseResult) -> None:
         """Keep the poses until all are known."""
+        from dopepp.data.formats.bop.records import model_numbers
         from dopepp.data.formats.bop.results import PoseResult as Row
 
+        numbers = model_numbers(list(result.shapes))
         seconds = sum(result.speed.values()) / 1000
         self._rows += [
-            Row(self._scene, result.number, _number(one.object, result.shapes), one.score,
-                one.T_cam_obj, seconds)
+            Row(self._scene, result.number, numbers[one.object], one.score, one.T_cam_obj,
+                seconds)
             for one in result.detections
         ]  # fmt: skip
 
@@ -185,13 +187,6 @@ class BopCsv:
         from dopepp.data.formats.bop.results import write_results
 
         write_results(self._path, self._rows)
-
-
-def _number(name: str, names: Iterable[str]) -> int:
-    from dopepp.data.formats.bop.records import number_in_name
-
-    stated = number_in_name(name)
-    return 1 + list(names).index(name) if stated is None else stated
 
 
 @contextmanager

@@ -14,28 +14,17 @@ from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.data.formats.bop.images import encode_png
 from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS
-from dopepp.data.formats.bop.records import MM, number_in_name
+from dopepp.data.formats.bop.records import MM, model_numbers
 from dopepp.parts.part import Mesh, Part
 
 
-def model_numbers(parts: Sequence[Part]) -> dict[str, int]:
-    """Return the number of each part by name: 1, 2, … unless all are called as BOP's files are.
-
-    A data set that is rendered of another one's models goes on with that one's numbers.
-    """
-    stated = {part.name: number_in_name(part.name) for part in parts}
-    numbers = {name: number for name, number in stated.items() if number}
-    if len(set(numbers.values())) == len(parts):
-        return numbers
-    return {part.name: number for number, part in enumerate(parts, start=1)}
-
-
 def write_models(root: Path, parts: Sequence[Part]) -> None:
-    """Write the parts' models (:func:`model_numbers`); ``models_info.json`` last, as a sign.
+    """Write the parts' models, and ``models_info.json`` last, as a sign.
 
-    A UserError: a part has no mesh, or the folder holds models of other parts.
+    They are numbered as :func:`~dopepp.data.formats.bop.records.model_numbers` says. A UserError: a
+    part has no mesh, or the folder holds models of other parts.
     """
-    meshes, numbers = [], model_numbers(parts)
+    meshes, numbers = [], model_numbers([part.name for part in parts])
     for part in parts:
         if part.mesh is None:
             raise UserError(

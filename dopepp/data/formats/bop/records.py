@@ -364,6 +364,18 @@ def number_in_name(name: str) -> int | None:
     return int(numbered[1]) if numbered else None
 
 
+def model_numbers(names: Sequence[str]) -> dict[str, int]:
+    """Return the number of each object by name: 1, 2, … unless all are called as BOP's files are.
+
+    A data set that is rendered of another one's models goes on with that one's numbers.
+    """
+    stated = {name: number_in_name(name) for name in names}
+    numbers = {name: number for name, number in stated.items() if number}
+    if len(set(numbers.values())) == len(names):
+        return numbers
+    return {name: number for number, name in enumerate(names, start=1)}
+
+
 def is_number(text: str) -> bool:
     """Tell whether a key or a name is an image's, an object's or a scene's number."""
     return text.isascii() and text.isdecimal() and len(text) < 10

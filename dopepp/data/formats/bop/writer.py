@@ -25,9 +25,9 @@ from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
 from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.images import depth_units, encode_png
-from dopepp.data.formats.bop.model_writer import model_numbers, write_models
+from dopepp.data.formats.bop.model_writer import write_models
 from dopepp.data.formats.bop.models import INFO_FILE, MODEL_FOLDERS
-from dopepp.data.formats.bop.records import MAX_SCENE_BYTES, MM
+from dopepp.data.formats.bop.records import MAX_SCENE_BYTES, MM, model_numbers
 from dopepp.data.formats.tolerances import Box
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask
@@ -77,7 +77,9 @@ class BopFolder:
 
     def labels(self, sample: Sample) -> Labels:
         """Annotate a sample, see :func:`make_labels`."""
-        return make_labels(sample, model_numbers(self._parts), self._surfaces)
+        return make_labels(
+            sample, model_numbers([part.name for part in self._parts]), self._surfaces
+        )
 
 
 class BopWriter(BopFolder):
