@@ -64,7 +64,7 @@ _PANEL_PX: Final = 768
 """Width of a panel, where there is none to take it from."""
 _GAP_PX: Final = 12
 """Room between tiles."""
-_TOO_WIDE: Final = ("Δ rotation °", "parameters", "GMACs")
+_TOO_WIDE: Final = ("Δ rotation °", "rotation-S °", "parameters", "GMACs")
 """What a terminal has no room for."""
 
 
@@ -77,7 +77,9 @@ def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> N
 def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
     """Print and write table and AUC curves; returns the text of ``compare.md``."""
     table = figures(entries)
-    compact, said = headline(table), notes(entries, table)
+    means = [report.mean for entry in entries for report in entry.reports]
+    symmetric = any(row.num_symmetries > 1 for row in means)
+    compact, said = headline(table, symmetric), notes(entries, table)
     display.show_table(
         "comparison",
         [{key: text for key, text in row.items() if key not in _TOO_WIDE} for row in compact],

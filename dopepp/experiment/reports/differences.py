@@ -37,6 +37,9 @@ _HEADLINE: Final = ("add_01d", "pass_5cm", "pass_10cm", "auc_10cm", "median_rota
                     "miss_rate")  # fmt: skip
 """Fields of the compact table."""
 
+_SYMMETRIC: Final = ("add_or_s_01d", "median_rotation_s_deg")
+"""More of them where an object has symmetries, of which the others know nothing."""
+
 _WITH_INTERVAL: Final = ("add_01d", "auc_10cm", "median_rotation_deg")
 """Those of them whose Δ stands beside them; the full table has every one of ``COMPARED``."""
 
@@ -183,9 +186,14 @@ def _cost_figures(entry: Entry, name: str) -> Iterator[Figure]:
             yield Figure(entry.name, name, f"{prefix}{title}", text)
 
 
-def headline(table: Sequence[Figure]) -> list[Row]:
-    """Return the compact table: ``value ± deviation`` and ``Δ [interval]`` in one cell each."""
+def headline(table: Sequence[Figure], symmetric: bool = False) -> list[Row]:
+    """Return the compact table: ``value ± deviation`` and ``Δ [interval]`` in one cell each.
+
+    ``symmetric`` says whether an object has symmetries.
+    """
     chosen = {"object", *_HEADLINE, *(f"{DELTA}{field}" for field in _WITH_INTERVAL), *_COSTS}
+    if symmetric:
+        chosen.update(_SYMMETRIC)
     if _has_seeds(table):
         chosen.add(_SEEDS)
     return pivot(

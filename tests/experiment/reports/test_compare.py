@@ -113,6 +113,21 @@ def test_dope_stands_first_and_others_have_a_difference_to_it(tmp_path):
         assert stream.readline().strip() == "threshold_m,dope,dopepp"
 
 
+@pytest.mark.parametrize(("symmetries", "shown"), [(1, False), (2, True)])
+def test_symmetric_objects_are_shown_by_what_knows_of_symmetries(symmetries, shown, tmp_path):
+    one = report("dopepp", GOOD)
+    for row in one.rows.values():
+        row.num_symmetries, row.add_or_s_01d, row.median_rotation_s_deg = symmetries, 0.75, 3.0
+    header, _, cells, *_ = (
+        [cell.strip() for cell in line.split("|")]
+        for line in write_comparison([entry("dopepp", one)], tmp_path).splitlines()
+        if "|" in line
+    )
+    found = dict(zip(header, cells, strict=True))
+    assert found.get("ADD(-S)-0.1d %") == ("75.0" if shown else None)
+    assert found.get("rotation-S °") == ("3.0" if shown else None)
+
+
 def test_differences_are_those_of_the_rows():
     rng = np.random.default_rng(0)
     one, other = (report(name, rng.gamma(1, 0.02, 60)) for name in "ab")
