@@ -25,7 +25,7 @@ from dopepp.inference.refinement.solver import (
     descend,
 )
 from dopepp.inference.refinement.view import GATE, lay_over, view_around
-from dopepp.inference.refinement.visible import Depth, PoseMatrix, SurfacePoints, visible
+from dopepp.inference.refinement.visible import Depth, PoseMatrix, Seen, SurfacePoints, visible
 
 
 @dataclass(frozen=True)
@@ -88,42 +88,42 @@ class DepthEvidence:
             raise UndecidedError("the part lies outside the depth image")
         self.prior = prior
         self._surface, self._diameter, self._view = surface, diameter, view
-        self._seen = visible(surface, prior.T_cam_obj)
-        self._before = fit_of(view, surface, prior.T_cam_obj, self._seen)
+        self._given_seen = visible(surface, prior.T_cam_obj)
+        self._before = fit_of(view, surface, prior.T_cam_obj, self._given_seen)
 
     def descend(self) -> Solution:
         """Search and descend, coarse to fine; :class:`UndecidedError` where depth is too little."""
-        end = Solution(self.prior.T_cam_obj, self.prior.information)
+        end, seen = Solution(self.prior.T_cam_obj, self.prior.information), self._given_seen
         for stage in STAGES:
             pose = end.T_cam_obj
             if stage.anew:
-                self.look(pose)
-            start = self._searched(pose, stage) if stage.search else pose
+                seen = self.seen(pose)
+            start = self._searched(pose, seen, stage) if stage.search else pose
             found = None
             if start is not None:
-                found = descend(start, self.prior, [self.evidence(stage)], stage.steps)
+                found = descend(start, self.prior, [self.evidence(seen, stage)], stage.steps)
             if found is None:
                 raise UndecidedError("too little depth was measured on the part")
             end = found
         return end
 
-    def look(self, pose: camera.Transform) -> None:
-        """Find the points anew that are visible at a pose."""
-        self._seen = visible(self._surface, pose)
+    def seen(self, pose: camera.Transform) -> Seen:
+        """Tell which of the part's points are visible at a pose."""
+        return visible(self._surface, pose)
 
-    def information(self, pose: camera.Transform) -> PoseMatrix:
-        """Return what is known at a pose by depth and the prior."""
+    def information(self, pose: camera.Transform, seen: Seen) -> PoseMatrix:
+        """Return what is known at a pose by the prior and the depth of the points seen."""
         known = self.prior.information
-        terms = self.evidence()(pose, (known, np.zeros(6)))
+        terms = self.evidence(seen)(pose, (known, np.zeros(6)))
         return known if terms is None else np.asarray(known + terms[0])
 
-    def evidence(self, stage: Stage = FINE) -> Evidence:
-        """Return what pulls, as a function of the pose."""
+    def evidence(self, seen: Seen, stage: Stage = FINE) -> Evidence:
+        """Return how the points seen pull, as a function of the pose."""
         surface, view = self._surface, self._view
         reach = max(stage.reach * self._diameter, GATE * view.noise)
 
         def terms(pose: camera.Transform, known: Terms) -> Terms | None:
-            overlay = lay_over(view, surface, self._seen, pose)
+            overlay = lay_over(view, surface, seen, pose)
             if overlay is None:
                 return None
             origin = pose[:3, 3]
@@ -138,15 +138,17 @@ class DepthEvidence:
 
     def check(self, pose: camera.Transform) -> None:
         """Raise an :class:`UndecidedError` where depth does not speak for a pose."""
-        after = fit_of(self._view, self._surface, pose, visible(self._surface, pose))
+        after = fit_of(self._view, self._surface, pose, self.seen(pose))
         reason = after.doubt(self._before) or self.prior.doubt(pose)
         if reason:
             raise UndecidedError(reason)
 
-    def _searched(self, pose: camera.Transform, stage: Stage) -> camera.Transform | None:
+    def _searched(
+        self, pose: camera.Transform, seen: Seen, stage: Stage
+    ) -> camera.Transform | None:
         """Return a pose shifted to where most points find their depth."""
         shift = best_shift(
-            self._view, camera.transform(pose, self._surface.points[self._seen]), self.prior,
+            self._view, camera.transform(pose, self._surface.points[seen]), self.prior,
             pose[:3, 3] - self.prior.T_cam_obj[:3, 3], stage.search * self._diameter,
             stage.tolerance * self._view.noise,
         )  # fmt: skip

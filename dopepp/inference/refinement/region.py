@@ -152,11 +152,11 @@ class RegionRefiner:
         Raises:
             UndecidedError: The picture does not decide.
         """
-        depth.look(start.T_cam_obj)
-        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.evidence()])
+        seen = depth.seen(start.T_cam_obj)
+        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.evidence(seen)])
         reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
         end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
-        known = depth.information(end.T_cam_obj)
+        known = depth.information(end.T_cam_obj, seen)
         return end, rounds[-1].believed(end, depth.prior, reach, known)
 
     def _rounds(
