@@ -33,8 +33,9 @@ from dopepp.experiment.build.system import (
 )
 from dopepp.experiment.config.run import RunConfig, TrainerConfig
 from dopepp.experiment.cost import measure_cost
-from dopepp.experiment.evaluate import measure_and_record, refining, tune_and_record
+from dopepp.experiment.evaluate import tune_and_record
 from dopepp.experiment.lr_finder import find_learning_rate
+from dopepp.experiment.measurement import measure_and_record, refining
 from dopepp.experiment.reports.conditions import check_masks
 from dopepp.experiment.reports.paper_table import PaperTable
 from dopepp.experiment.reports.report import FULL_SIZE_COST, Report, full_size_cost

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dopepp.experiment.evaluate import evaluate, made_worse
+from dopepp.experiment.evaluate import evaluate
+from dopepp.experiment.measurement import made_worse
 from dopepp.experiment.reports.evaluators import Cost
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.runs.record import METRICS_FILE, read_json

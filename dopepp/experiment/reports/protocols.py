@@ -3,7 +3,7 @@
 Rates per bin of a quantity, such as the distance, tell where a method fails. To add a quantity,
 write a function of the instances of one object and name it in :data:`QUANTITIES`. To add a
 protocol, give :class:`Protocols` its option, write a module that measures and records it, and call
-that in :func:`dopepp.experiment.evaluate.measure_and_record`.
+that in :func:`dopepp.experiment.measurement.measure_and_record`.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ from dopepp.experiment.build.parts import PAPER_OBJECTS, build_parts
 from dopepp.experiment.build.sources import build_datamodule, held_out_source, share_in_words
 from dopepp.experiment.build.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
-from dopepp.experiment.evaluate import measure_and_record, parts_of
+from dopepp.experiment.evaluate import parts_of
+from dopepp.experiment.measurement import measure_and_record
 from dopepp.experiment.runs.record import METRICS_FILE, read_json
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.row import shown_columns

@@ -14,7 +14,7 @@ from dopepp.experiment.build.parts import build_parts
 from dopepp.experiment.build.renders import scaled_test_renders
 from dopepp.experiment.build.sources import held_out_source
 from dopepp.experiment.build.system import build_untrained
-from dopepp.experiment.evaluate import measure_and_record
+from dopepp.experiment.measurement import measure_and_record
 from dopepp.experiment.reports.conditions import (
     SCALE,
     SHADING,
