@@ -84,11 +84,16 @@ def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
         return orthogonalised(matrix.T).T
     matrix = matrix / (matrix.norm() + 1e-12)
     gram = matrix @ matrix.T
-    one = torch.eye(len(gram), dtype=matrix.dtype, device=matrix.device)
-    a, b, c = _QUINTIC
-    whole = one
-    for _ in range(_ROUNDS):
-        now = a * one + b * gram + c * (gram @ gram)
-        whole = now @ whole
+    now = whole = _polynomial(gram)
+    for _ in range(_ROUNDS - 1):
         gram = now @ now @ gram
+        now = _polynomial(gram)
+        whole = now @ whole
     return whole @ matrix
+
+
+def _polynomial(gram: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+    """Return what a round multiplies a matrix of this Gram matrix by."""
+    a, b, c = _QUINTIC
+    one = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    return a * one + b * gram + c * (gram @ gram)
