@@ -20,7 +20,7 @@ PLAIN = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(PLAIN, st.booleans(), st.sampled_from([None, 1]))
 def test_reads_what_json_writes(value, ascii_only, indent):
     text = json.dumps(value, ensure_ascii=ascii_only, indent=indent)
@@ -70,7 +70,7 @@ def test_brackets_in_strings_are_no_nesting():
     assert parse_json(deepest, "here") == json.loads(deepest)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=60) | st.text("[]{}\":,\\ntrue1.e-NaInfy 'u", max_size=60))
 def test_any_bytes_give_a_value_or_a_user_error(content):
     try:

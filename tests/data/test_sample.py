@@ -18,7 +18,7 @@ from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     shape=st.tuples(st.integers(1, 50), st.integers(1, 50)),
     target=st.tuples(st.integers(1, 70), st.integers(1, 70)),
@@ -59,7 +59,7 @@ def dot_sample(size: tuple[int, int], dot: tuple[float, float]) -> Sample:
     return Sample(image, np.eye(3), [instance], depth)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     x=st.floats(0.25, 0.75),
     y=st.floats(0.25, 0.75),
@@ -81,7 +81,7 @@ def test_a_bright_dot_moves_with_its_keypoint(x, y, size, target):
     np.testing.assert_allclose(mask_centre, centre, atol=0.6 * max(1, scale))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(width=st.integers(50, 700), height=st.integers(50, 700), side=st.sampled_from([128, 416]))
 def test_keypoints_and_camera_follow_one_rule(width, height, side):
     K = np.array([[1.1 * width, 0, 0.4 * width], [0, 1.2 * width, 0.6 * height], [0, 0, 1]])

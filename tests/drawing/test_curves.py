@@ -27,7 +27,7 @@ ERRORS = st.lists(
 
 
 @given(ERRORS)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_a_curve_counts_what_is_strictly_below(errors):
     thresholds, accuracy = accuracy_curve(np.array(errors))
     for threshold, share in zip(thresholds, accuracy, strict=True):
@@ -36,7 +36,7 @@ def test_a_curve_counts_what_is_strictly_below(errors):
 
 
 @given(ERRORS)
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_the_legend_shows_the_exact_auc_of_metrics(errors):
     figure = accuracy_figure({"a": np.array(errors)})
     label = figure.axes[0].get_legend_handles_labels()[1][0]

@@ -101,7 +101,7 @@ def test_a_line_between_points_far_outside_crosses_the_image():
     st.integers(1, 40),
     st.integers(1, 40),
 )
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_any_keypoints_on_any_image_are_drawn_without_an_error(points, width, height):
     frames = [Wireframe(points, BLUE, "a long name")]  # whose legend is cut, not refused
     assert overlay(black(width, height), frames, width).shape == (height, width, 3)

@@ -53,7 +53,7 @@ def test_a_long_line_is_pale_and_smooth_and_what_it_is_compared_with_dashed():
     assert [one.get_linestyle() for one in (smooth, other)] == ["-", "--"]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(num=st.integers(1, 400), slope=st.floats(-3, 3))
 def test_smoothing_keeps_length_level_and_straight_lines(num, slope):
     values = 5 + slope * np.arange(num, dtype=float)

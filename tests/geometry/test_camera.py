@@ -81,7 +81,7 @@ def test_resized_camera_sees_the_resized_points():
 SIZES = st.tuples(st.integers(1, 3000), st.integers(1, 3000))
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(SIZES, SIZES)
 def test_letterbox_fits_and_comes_back(size, input_size):
     box = Letterbox.fit(size, input_size)

@@ -191,9 +191,7 @@ def test_colmap_models_of_one_focal_length(line, focal, lens, tmp_path):
 NUMBERS = st.floats(-1e6, 1e6).map(lambda one: 0.0 if abs(one) < 1e-300 else one)
 
 
-@settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from(["yaml", "yml", "xml", "json"]),
     st.tuples(st.floats(1e-3, 1e6), st.floats(1e-3, 1e6), NUMBERS, NUMBERS),
@@ -319,9 +317,7 @@ SAMPLES = [ROS, ECHOED, OPENCV_2, OPENCV_XML, BOP, NDDS, COLMAP.format("PINHOLE 
 MARKS = [b"[", b"{", b"-", b": ", b"&a ", b"!!", b"<", b"1e999", b"\n"]
 
 
-@settings(
-    deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_changed_file_is_a_camera_or_refused(tmp_path, data):
     """Bytes replaced, inserted and cut out: nothing but a camera or one line comes of it."""

@@ -76,7 +76,7 @@ def check(result: PnPResult, object_points: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("name", CUBOIDS)
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_clean_points_give_the_exact_pose(name, seed):
     cuboid, rng = CUBOIDS[name], np.random.default_rng(seed)
@@ -243,7 +243,7 @@ SPECIAL = [0.0, 1.0, 200.0, np.nan, np.inf, -np.inf, 1e-300, 1e300]
 NUMBERS = st.one_of(st.floats(), st.floats(-2, 2), st.sampled_from(SPECIAL))
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.lists(st.lists(NUMBERS, min_size=6, max_size=6), max_size=9))
 def test_garbage_never_breaks_it(rows):
     table = np.array(rows, float).reshape(-1, 6)

@@ -23,7 +23,7 @@ QUATERNIONS = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
 AXES = st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(
     lambda a: float(np.linalg.norm(a)) > 1e-3
 )
-wide = settings(deadline=None, max_examples=200)
+wide = settings(max_examples=200)
 
 
 @wide
@@ -122,7 +122,7 @@ def test_is_rotation():
     assert not is_rotation(np.eye(4))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_the_nearest_rotation_is_the_polar_factor(seed):
     rng = np.random.default_rng(seed)

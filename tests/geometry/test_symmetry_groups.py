@@ -21,7 +21,7 @@ def is_group(elements: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("name", ["C7", "C12", "D2", "D6", "D12", "T", "O", "I"])
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_measured_generators_make_the_exact_group(name, seed):
     rng = np.random.default_rng(seed)
     frame = Rotation.random(random_state=seed).as_matrix()

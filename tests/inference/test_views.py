@@ -80,7 +80,7 @@ def whole(estimator, scene, picture):
     return found.T_cam_obj
 
 
-@settings(max_examples=8, deadline=None, derandomize=True, database=None)
+@settings(max_examples=8, derandomize=True, database=None)
 @given(VIEWS)
 @example(VGA)
 @example(PORTRAIT)

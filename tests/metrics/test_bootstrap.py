@@ -79,7 +79,7 @@ def test_few_seeds_are_not_believed_too_much(num_seeds):
     assert hits > 0.9 * 150
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10_000), num=st.integers(1, 30), seeds=st.integers(1, 3),
     name=st.sampled_from(["mean", "median"]), same=st.booleans(),
@@ -101,7 +101,7 @@ def test_the_methods_change_places_and_the_interval_its_sign(seed, num, seeds, n
     assert itself.num_differing == 0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(values=st.lists(st.floats(0, 180) | st.just(np.inf) | st.just(np.nan), min_size=1))
 def test_the_median_is_of_what_is_finite(values):
     finite = [value for value in values if np.isfinite(value)]
@@ -186,7 +186,7 @@ def test_what_cannot_be_paired_is_a_users_mistake(mine, baseline, message):
         paired_difference(mine, baseline)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     gain=st.floats(0.005, 0.1),
     spread=st.floats(0.001, 0.2),

@@ -55,7 +55,7 @@ def matched_loop(errors, threshold):
     return len(taken)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.integers(0, 4), st.integers(1, 4), st.integers(0, 2**32 - 1))
 def test_matching_is_the_plain_loop(num_estimates, num_targets, seed):
     errors = np.random.default_rng(seed).integers(0, 5, (num_estimates, num_targets)) / 4

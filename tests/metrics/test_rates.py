@@ -43,7 +43,7 @@ ERRORS = st.lists(
 
 
 @given(ERRORS)
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_auc_equals_loops(errors):
     values = torch.tensor(errors, dtype=torch.float64)
     exact = sum(1 - e / 0.1 for e in errors if e <= 0.1) / max(len(errors), 1)
@@ -86,7 +86,7 @@ def test_match_of_nothing_and_of_nan():
 
 
 @given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 10_000))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_match_equals_a_plain_loop(p, g, seed):
     rng = np.random.default_rng(seed)
     scores, distances = rng.random(p), rng.uniform(0, 0.2, (p, g))
@@ -99,7 +99,7 @@ def test_match_equals_a_plain_loop(p, g, seed):
     assert match(torch.from_numpy(scores), torch.from_numpy(distances)).tolist() == expected
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 100_000), count=st.integers(1, 40))
 def test_average_precision_is_its_definition(seed, count):
     rng = np.random.default_rng(seed)
@@ -141,7 +141,7 @@ def test_average_recall_is_the_mean_of_strict_pass_rates():
         average_recall(errors, [])
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     counts=st.integers(0, 5000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))),
     confidence=st.floats(0.5, 0.999),
@@ -157,7 +157,7 @@ def test_wilsons_interval_is_scipys(counts, confidence):
     assert 0 <= low <= passed / num <= high <= 1
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 60), bins=st.integers(1, 20))
 def test_calibration_error_is_its_definition(seed, count, bins):
     rng = np.random.default_rng(seed)

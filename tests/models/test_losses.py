@@ -50,7 +50,7 @@ def test_mse_is_the_sum_over_stages_of_both_errors():
 
 
 @given(st.integers(0, 1000), st.floats(0, 15), st.floats(0, 15), st.floats(-8, 0), st.booleans())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_terms_are_the_poisson_divergence(seed, x, y, level, second):
     """Σ e^z − g·z − g + g·log g over the cells, in float64, is where + count, in Gaussians."""
     generator = torch.Generator().manual_seed(seed)

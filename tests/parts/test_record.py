@@ -178,7 +178,7 @@ JUNK = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 @given(
     field=st.sampled_from(FIELDS),
     place=st.none() | st.tuples(st.integers(0, 1), st.integers(0, 2)),

@@ -145,7 +145,7 @@ def test_corners_behind_the_camera_have_no_say():
     assert np.isfinite(detection_features(detection(T_cam_obj=near), CUBOID, K)).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(belief=st.floats(0, 1), error=st.floats(0, 1e6), variance=st.floats(0, 1e12))
 def test_features_are_finite_whatever_the_detection(belief, error, variance):
     one = detection(belief=belief, reprojection_error_px=error, covariance=variance * np.eye(6))

@@ -117,7 +117,7 @@ def sound(case: dict[str, Any]) -> bool:
     )
 
 
-@settings(max_examples=QUICK, deadline=None, derandomize=True, database=None)
+@settings(max_examples=QUICK, derandomize=True, database=None)
 @given(CASES)
 @example(PLAIN)
 @example({**PLAIN, "objects": 0})  # found: a reshape of nothing
@@ -128,9 +128,7 @@ def test_any_maps(case):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@settings(
-    max_examples=THOROUGH, deadline=None, database=None, suppress_health_check=list(HealthCheck)
-)
+@settings(max_examples=THOROUGH, database=None, suppress_health_check=list(HealthCheck))
 @given(CASES)
 def test_many_maps(case):
     check(case)

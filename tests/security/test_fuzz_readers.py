@@ -311,7 +311,7 @@ def fuzz(target: Target, folder: Path, num_files: int, *, repeat: bool) -> None:
     assert num_taken == len(target.reads) or (num_taken and len(target.reads) > 2)
 
     @settings(
-        max_examples=num_files, deadline=None, derandomize=repeat, database=None,
+        max_examples=num_files, derandomize=repeat, database=None,
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(damage())

@@ -98,7 +98,7 @@ def test_a_huge_file_and_what_is_no_file(tmp_path, refused):
         read_safetensors(path)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     array=hnp.arrays(
         st.sampled_from(["f4", "f8", "f2", "i8", "i4", "i2", "i1", "u1", "?"]),

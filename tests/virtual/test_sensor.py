@@ -25,7 +25,7 @@ def test_a_zero_sensor_changes_nothing(picture):
     assert capture(picture, Sensor()) is picture
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     exposure=st.floats(-8, 8),
     blur=st.floats(0, 5),

@@ -37,7 +37,7 @@ def items(source: HybridSource, epoch: int) -> list[tuple[str, str]]:
     return [(sample.source, sample.key) for sample in samples]
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     real=st.builds(Named, st.just("real"), st.integers(1, 12)),
     virtual=st.builds(Named, st.just("virtual"), st.integers(1, 40)),

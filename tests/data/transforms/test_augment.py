@@ -22,7 +22,7 @@ def only(**options: Any) -> Photometric:
     return Photometric(**(OFF | options))
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), epoch=st.integers(0, 100))
 def test_pure_function_of_the_generator(seed, epoch):
     image = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)

@@ -34,7 +34,7 @@ def posed(rng: np.random.Generator) -> tuple[Sample, np.ndarray]:
     return Sample(np.full((96, 128, 3), 90, np.uint8), K, [one]), corners
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 2**31), roll=st.floats(0, 180), shift=st.floats(0, 0.4))
 def test_keypoints_are_the_posed_points_of_the_new_camera(seed, roll, shift):
     rng = np.random.default_rng(seed)

@@ -47,7 +47,7 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     return rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(
     st.builds(ellipse, st.floats(5, 55), st.floats(5, 75), st.floats(3, 25), st.floats(3, 30)),
     st.floats(0.1, 1.0),

@@ -50,7 +50,7 @@ def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     return rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.builds(ellipse, st.floats(10, 60), st.floats(10, 80), st.floats(5, 25), st.floats(5, 30)),
     st.floats(0, 1),
@@ -116,7 +116,7 @@ def test_more_shading_contains_less_and_depends_on_nothing_else():
         assert (other[1].sample.image != together[1].sample.image).any()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     masks=st.lists(
         st.tuples(st.floats(15, 55), st.floats(20, 75), st.floats(6, 18), st.floats(6, 20)),

@@ -90,7 +90,7 @@ def test_quantities_in_closed_form(measured):
     np.testing.assert_allclose(values["rotation"], np.degrees(np.arccos(cosines)), atol=1e-6)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     values=st.lists(st.integers(0, 12) | st.floats(0, 12), max_size=60), num_bins=st.integers(1, 8)
 )

@@ -23,7 +23,7 @@ def make_report(share: float | None = 0.5) -> Report:
     return Report("dopepp", rows("dopepp", share), references, errors, Cost(1, 1.5, 7.25), 4)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     errors=st.lists(st.floats(0, 10) | st.just(np.inf), max_size=5),
     share=st.none() | st.floats(0, 1),

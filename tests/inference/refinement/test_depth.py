@@ -233,7 +233,7 @@ def test_outline_pulls_a_shifted_part_back(box):
         assert abs(moved[1]) < 0.002
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
 def test_prior_measures_turns_and_shifts(values):
     turn, shift = np.array(values[:3]), np.array(values[3:])

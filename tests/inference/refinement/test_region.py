@@ -115,7 +115,7 @@ def test_contour_is_the_border_of_the_brute_force_silhouette(part: Part, seed: i
     assert_allclose(project(contour.arms + T[:3, 3], K), contour.pixels, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_winding_border_fills_what_all_triangles_fill(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -59,7 +59,7 @@ def test_a_ball_stays_a_ball_that_faces_outwards():
     assert cells.max() <= moved
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     num_faces=st.integers(30, 400),

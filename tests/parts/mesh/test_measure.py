@@ -15,7 +15,7 @@ from dopepp.parts.mesh.measure import (
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     num_points=st.integers(2, 80),
     seed=st.integers(0, 2**32 - 1),

@@ -158,7 +158,7 @@ def test_a_missing_texture_and_a_folded_polygon_are_named(refused):
     refused("a.ply", folded, "a polygon that is not convex, face 0")
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.data())
 def test_a_changed_byte_gives_a_mesh_or_one_line(tmp_path_factory, data):
     form = data.draw(st.sampled_from(sorted(FORMATS)))

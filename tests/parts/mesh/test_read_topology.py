@@ -43,7 +43,7 @@ def test_edges_agree_with_trimesh():
     assert find_topology(soup, np.arange(len(soup)).reshape(-1, 3)).is_closed
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1), whole=st.booleans())
 def test_any_closed_solid_ends_up_facing_outwards(seed, share, whole):
     rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ def touching(rotations, noise=0.0, seed=0):
     )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.integers(4, 20))
 def test_the_tip_is_exact_without_noise(seed, num):
     tip = find_tip(touching(Rotation.random(num, rng=np.random.default_rng(seed))))

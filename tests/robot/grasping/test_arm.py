@@ -28,7 +28,7 @@ def denavit_hartenberg(joints):
     return T
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(angles)
 def test_the_flange_is_where_the_closed_form_has_it(arm, joints):
     ours, theirs = arm.flange(np.array(joints)), denavit_hartenberg(joints)
@@ -36,7 +36,7 @@ def test_the_flange_is_where_the_closed_form_has_it(arm, joints):
     np.testing.assert_allclose(ours[:3, 2], theirs[:3, 2], atol=1e-3)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.18, 0.4), st.floats(-1.5, 1.5)))
 def test_joints_take_the_flange_to_a_pose_over_the_tray(arm, place):
     x, y, z, yaw = place

@@ -197,7 +197,7 @@ def test_a_window_larger_than_the_picture_has_it_in_its_middle():
     assert 0 <= PRESETS["quickstart"].K[1, 2] - K[1, 2] <= 32
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 10_000),
     origin=st.floats(-3, 3),
@@ -234,7 +234,7 @@ def test_field_of_view_follows_the_width():
     assert PRESETS["paper"].K[0, 0] == pytest.approx(320.0)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 10_000),
     share=st.floats(0.1, 1.0),

@@ -168,7 +168,7 @@ def test_scenes_images_targets_and_shares(tmp_path, block):
         keys(targets="test_targets_bop19.json")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 200), st.lists(st.floats(0.01, 0.99), max_size=4, unique=True))
 def test_shares_are_disjoint_and_complete(num_items, inner):
     bounds = [0.0, *sorted(inner), 1.0]

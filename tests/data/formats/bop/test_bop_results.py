@@ -57,7 +57,7 @@ def test_a_header_alone_is_a_method_that_found_nothing(tmp_path):
     assert read_results(write(tmp_path, HEADER + "\n"), {1}) == []
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 12))
 def test_what_is_written_is_read_back(seed, count, tmp_path_factory):
     rng = np.random.default_rng(seed)

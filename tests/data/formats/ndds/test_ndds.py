@@ -312,7 +312,7 @@ def test_every_habit_is_found(tmp_path, order, unit, habits, frame, caplog):
 
 
 @given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from(["xyzw", "wxyz"]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
     wild = Wild(tmp_path_factory.mktemp("one"), order=order)
     wild.rng = np.random.default_rng(seed)

@@ -103,7 +103,7 @@ def test_bytes_do_not_depend_on_the_order_and_survive_a_kill(written, parts, sam
     assert contents(root) == contents(written)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))
 def test_runs_round_trip(mask):
     record = encode_runs(mask)

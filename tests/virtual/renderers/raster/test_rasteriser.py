@@ -74,7 +74,7 @@ def test_plane_has_its_closed_form_depth(scene_of, sheet):
     np.testing.assert_allclose(rendered.depth, expected, rtol=1e-6)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @example(1, pivconnector())
 @given(st.integers(0, 10_000), st.none())
 def test_box_and_part_agree_with_ray_casting(box_surface, seed, part):
