@@ -36,7 +36,8 @@ from dopepp.experiment.reports.tables import read_csv
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.readme import write_job_readme
 from dopepp.geometry.camera import Letterbox
-from dopepp.inference.estimator import Maps, PoseEstimator, letterboxed
+from dopepp.inference.estimator import Maps, PoseEstimator
+from dopepp.inference.picture import letterboxed
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.network import network_cost
 from dopepp.training.targets import draw_maps

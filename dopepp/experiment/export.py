@@ -22,8 +22,9 @@ from dopepp.experiment.reports.report import measure
 from dopepp.experiment.runs.program import typed
 from dopepp.inference import runtimes
 from dopepp.inference.agreement import Agreement, compare
-from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, PRECISIONS, check_possible
+from dopepp.inference.picture import letterboxed
 from dopepp.inference.runtimes.description import Export
 from dopepp.inference.runtimes.runtime import Pixels
 from dopepp.inference.scales import letterboxes

@@ -13,7 +13,8 @@ import torch
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
-from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.picture import letterboxed
 from dopepp.inference.scales import letterboxes
 from dopepp.recovery.detection import Detection
 

@@ -4,39 +4,42 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar, Unpack
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
-    ANYWHERE,
-    WHOLE,
     CameraMatrix,
     Letterbox,
-    check_camera,
-    crop_camera,
     project_keypoints,
 )
 from dopepp.geometry.cuboid import Cuboid
 from dopepp.inference import runtimes
+from dopepp.inference.picture import (
+    Region,
+    checked_distortion,
+    checked_picture,
+    cut,
+    letterboxed,
+)
 from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.inference.scales import Distances, letterboxes, merged
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Part
-from dopepp.recovery.calibration import rescored
+from dopepp.recovery.calibration import RecoveryOptions, rescored
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import RecoveryOptions, explain, recover
+from dopepp.recovery.recover import explain, recover
 from dopepp.recovery.silence import Reason, rejected_refined
 
 if TYPE_CHECKING:
@@ -51,9 +54,6 @@ STEPS: Final = ("pre", "network", "decode", "refine")
 poses, and making these precise."""
 
 Decoded = TypeVar("Decoded")
-
-Region = tuple[int, int, int, int]
-"""x, y, width and height, pixels."""
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -103,7 +103,7 @@ class PoseEstimator:
         self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
         self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
-        self.recovery = parse_recovery({"sigma": checkpoint.sigma, **checkpoint.recovery})
+        self.recovery = RecoveryOptions.of({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     @classmethod
     def load(
@@ -195,7 +195,7 @@ class PoseEstimator:
         if depth is not None:
             depth = checked_depth(depth, (image.shape[1], image.shape[0]))
         if distortion is not None:
-            coefficients = _checked_distortion(distortion)
+            coefficients = checked_distortion(distortion)
             image = cv2.undistort(image, K, coefficients)
             depth = None if depth is None else undistorted_depth(depth, K, coefficients)
         detections = self._detect(image, K, distances, roi)
@@ -352,77 +352,6 @@ def checked_device(device: str | torch.device) -> torch.device:
         reason = str(error).partition("\n")[0]
         raise UserError(f"device {device} ({reason:.100})", there, "pass one of these") from error
     return chosen
-
-
-def parse_recovery(stored: Mapping[str, float]) -> RecoveryOptions:
-    """Turn the thresholds of a config or a checkpoint into options.
-
-    A :class:`UserError`: a name is none of the options', or a value is out of its range.
-    """
-    allowed = [entry.name for entry in fields(RecoveryOptions)]
-    unknown = sorted(set(stored) - set(allowed))
-    if unknown:
-        got, fix = (
-            f"recovery option {unknown[0]!r}",
-            "remove it; a checkpoint must be of this version",
-        )
-        raise UserError(got, ", ".join(allowed), fix)
-    return RecoveryOptions(**stored)  # type: ignore[arg-type]
-
-
-def letterboxed(
-    image: Picture, letterbox: Letterbox, multiple: int
-) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Resize an image into a letterbox and pad it, right and bottom, to a multiple."""
-    image = letterbox.image(image)
-    rows, columns = -image.shape[0] % multiple, -image.shape[1] % multiple
-    return np.pad(image, ((0, rows), (0, columns), (0, 0)))
-
-
-def checked_picture(
-    image: Picture, K: CameraMatrix, cropped: bool = False
-) -> tuple[Picture, CameraMatrix]:
-    """Check that the arguments are an RGB image and its camera matrix; a UserError if not.
-
-    The principal point of one that was ``cropped`` may lie anywhere.
-    """
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise UserError(
-            f"an image of shape {image.shape} and type {image.dtype}",
-            "(height, width, 3) uint8 in RGB order",
-            "convert the image, e.g. cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)",
-        )
-    # Flipped views, as of bgr[..., ::-1], have strides that OpenCV and torch do not take.
-    size, off_centre = (image.shape[1], image.shape[0]), ANYWHERE if cropped else WHOLE
-    return np.ascontiguousarray(image), check_camera(K, size, "predict", off_centre)
-
-
-def _checked_distortion(distortion: Coefficients) -> Coefficients:
-    """Check that the coefficients are those of one of OpenCV's lens models."""
-    coefficients = np.asarray(distortion, np.float64).ravel()
-    if coefficients.size not in (4, 5, 8, 12, 14) or not np.isfinite(coefficients).all():
-        raise UserError(
-            f"distortion {coefficients.tolist()!s:.200}",
-            "4, 5, 8, 12 or 14 finite numbers in OpenCV's order (k1, k2, p1, p2, k3, …)",
-            "pass the camera's calibration, or None for an undistorted image",
-        )
-    return coefficients
-
-
-def cut(
-    image: Picture, K: CameraMatrix, roi: Region | None
-) -> tuple[Picture, CameraMatrix, tuple[int, int]]:
-    """Return a region of an image, its K and its upper left corner, pixels."""
-    if roi is None:
-        return image, K, (0, 0)
-    height, width = image.shape[:2]
-    x, y, columns, rows = (round(one) for one in roi)
-    if not (0 <= x < x + columns <= width and 0 <= y < y + rows <= height):
-        allowed = f"(x, y, width, height) within the {width}×{height} image, pixels"
-        raise UserError(f"roi {tuple(roi)}", allowed, "cut it to the image")
-    window = np.ascontiguousarray(image[y : y + rows, x : x + columns])
-    return window, crop_camera(K, x, y), (x, y)
 
 
 def _in_original(

@@ -32,8 +32,9 @@ from dopepp.geometry.camera import LEAST_VIEW_DEG, MOST_VIEW_DEG, CameraMatrix, 
 from dopepp.geometry.camera_file import Camera, read_camera
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.overlay import make_shape
+from dopepp.inference.picture import letterboxed
 from dopepp.inference.results import PoseResult
 from dopepp.inference.scales import letterboxes
 from dopepp.parts.wording import part_in_words

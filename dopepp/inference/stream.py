@@ -13,9 +13,10 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_files.values import Size
-from dopepp.inference.estimator import PoseEstimator, Region
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.lens import Lens, one_camera
 from dopepp.inference.overlay import make_shape
+from dopepp.inference.picture import Region
 from dopepp.inference.results import PoseResult, spent_between
 from dopepp.inference.scales import Distances
 from dopepp.inference.sources import Frame, SourceLike, open_sources

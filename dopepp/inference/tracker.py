@@ -20,8 +20,9 @@ from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Step, project_keypoints, transform
-from dopepp.inference.estimator import PoseEstimator, Region, checked_picture
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.motion import Motion, at_rest
+from dopepp.inference.picture import Region, checked_picture
 from dopepp.recovery.detection import Detection
 
 AROUND: Final = 0.5

@@ -25,8 +25,9 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import crop_camera
 from dopepp.geometry.cuboid import CENTROID, EDGES
 from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.overlay import AXIS, COLOURS, silhouette
+from dopepp.inference.picture import letterboxed
 from dopepp.inference.results import PoseResult
 from dopepp.inference.scales import letterboxes
 from dopepp.inference.sources import Source

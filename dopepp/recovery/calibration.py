@@ -17,7 +17,7 @@ and give ``RecoveryOptions`` its weight.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
@@ -142,6 +142,19 @@ class RecoveryOptions:
                 raise UserError(
                     f"recovery option {name}={value}", f"{lowest:g} to {highest:g}", "change it"
                 )
+
+    @classmethod
+    def of(cls, stored: Mapping[str, float]) -> RecoveryOptions:
+        """Turn the thresholds of a config or a checkpoint into options.
+
+        A :class:`UserError`: a name is none of the options', or a value is out of its range.
+        """
+        allowed = [entry.name for entry in fields(cls)]
+        unknown = sorted(set(stored) - set(allowed))
+        if unknown:
+            fix = "remove it; a checkpoint must be of this version"
+            raise UserError(f"recovery option {unknown[0]!r}", ", ".join(allowed), fix)
+        return cls(**stored)  # type: ignore[arg-type]
 
     @property
     def score_weights(self) -> tuple[float, ...]:

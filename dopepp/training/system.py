@@ -26,8 +26,9 @@ from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork
 from dopepp.parts.part import Part
+from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import RecoveryOptions, recover_batch
+from dopepp.recovery.recover import recover_batch
 from dopepp.training.callbacks.averaging import go_on_with_trained
 from dopepp.training.callbacks.finite import check_state
 from dopepp.training.loggers import MetricsTable

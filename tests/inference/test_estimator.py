@@ -21,7 +21,7 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.rotation import random_rotation, rotation_angle, rotation_vector_to_matrix
 from dopepp.inference import estimator as module
-from dopepp.inference.estimator import letterboxed, parse_recovery
+from dopepp.inference.picture import letterboxed
 from dopepp.maps import MapGeometry, encode
 from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
 from dopepp.models.spec import build_network
@@ -213,13 +213,6 @@ def test_bad_input(estimator, checkpoint_path, bad, message):
     assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match=r"refine='icp'.*region, depth, several of them, or none"):
         PoseEstimator.load(checkpoint_path, refine="icp")
-
-
-def test_a_recovery_option_of_another_program():
-    with pytest.raises(UserError, match="recovery option 'nms_radius'"):
-        parse_recovery({"nms_radius": 3.0})
-    with pytest.raises(UserError, match="recovery option max_peaks=0"):
-        parse_recovery({"max_peaks": 0})
 
 
 LOADED = "\nimport sys; print(*sys.modules)"

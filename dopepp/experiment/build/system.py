@@ -21,13 +21,13 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment.build.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
 from dopepp.experiment.runs import display
-from dopepp.inference.estimator import parse_recovery
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 from dopepp.models.spec import LOSSES, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.seen import Seen
+from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.training.callbacks.averaging import AveragedWeights
 from dopepp.training.callbacks.throughput import RunProgress, make_profiler
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
@@ -82,7 +82,7 @@ def build_system(
         LOSSES.build(config.model.loss),
         parts,
         map_geometry(config.maps, network.stride),
-        parse_recovery(description.recovery),
+        RecoveryOptions.of(description.recovery),
         optimizer_factory(config.optimizer),
         scheduler_factory(config.scheduler),
         description.to_payload(),
@@ -106,7 +106,7 @@ def build_untrained(config: RunConfig, parts: list[Part]) -> tuple[PoseNetwork, 
     }
     network = build_network(spec)
     sigma = config.maps.sigma
-    recovery = vars(parse_recovery({"sigma": sigma, **config.recovery}))
+    recovery = vars(RecoveryOptions.of({"sigma": sigma, **config.recovery}))
     size = config.data.network_input
     return network, Checkpoint(spec, {}, parts, size, network.stride, sigma, recovery)
 

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
-from dopepp.inference.estimator import PoseEstimator, letterboxed
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.picture import letterboxed
 from dopepp.inference.scales import letterboxes
 from dopepp.parts.part import Part
 from dopepp.parts.seen import Seen, widest
