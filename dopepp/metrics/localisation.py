@@ -30,7 +30,7 @@ from dopepp.metrics.functional import (
     vsd,
 )
 from dopepp.metrics.pose import PredictedPose, TruePose, counted
-from dopepp.metrics.row import extreme_points, symmetries
+from dopepp.metrics.row import bop_points, symmetries
 from dopepp.parts.part import Part
 
 Draw = Callable[[Part, Transform, CameraMatrix, Size], DepthMap]
@@ -177,15 +177,14 @@ def _errors(
     K: CameraMatrix,
     width: int,
 ) -> _Group:
-    """Compute them for all pairs of an estimate and a target."""
+    """Compute them for all pairs of an estimate and a target, all over the mesh's vertices."""
     shape = len(estimated), len(true)
     T_est = torch.from_numpy(np.repeat(estimated.astype(np.float64), shape[1], axis=0))
     T_gt = torch.from_numpy(np.tile(true.astype(np.float64), (shape[0], 1, 1)))
     poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
-    vertices, group = extreme_points(part), symmetries(part)
+    vertices, group = bop_points(part), symmetries(part)
     cameras = torch.from_numpy(np.asarray(K, np.float64)).expand(len(T_est), 3, 3)
-    points = torch.from_numpy(np.asarray(part.points, np.float64))
-    surface = add_s if len(group) > 1 else add
+    average = add_s if len(group) > 1 else add
 
     def table(errors: Tensor) -> Errors:
         return np.asarray(errors.numpy().reshape(shape))
@@ -193,5 +192,5 @@ def _errors(
     return _Group(
         mssd=table(mssd(*poses, vertices, group)) / part.diameter,
         mspd=table(mspd(*poses, vertices, cameras, group)) * (640 / width),
-        add_or_s=table(surface(*poses, points)) / part.diameter,
+        add_or_s=table(average(*poses, vertices)) / part.diameter,
     )

@@ -24,7 +24,7 @@ from torch import Tensor
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import nearest_rotation, random_rotation
 from dopepp.metrics.functional import add, add_s, mssd, pass_rate, rotation_error_deg
-from dopepp.metrics.row import PoseErrors, PoseRow, extreme_points, summarise, symmetries
+from dopepp.metrics.row import PoseErrors, PoseRow, bop_points, summarise, symmetries
 from dopepp.parts.part import Part
 
 CHANCE_ALL: Final = "chance, all rotations"
@@ -89,7 +89,7 @@ def _row(part: Part, name: str, Q: Tensor, few_points: Tensor, points: Tensor) -
     errors = PoseErrors(
         add=add(Q, nowhere, identity, nowhere, few_points),
         add_s=add_s(*about_centre, points),
-        mssd=mssd(*turned, extreme_points(part), group),
+        mssd=mssd(*turned, bop_points(part), group),
         mspd=None,
         rotation_deg=rotation_error_deg(Q, identity),
         rotation_s_deg=rotation_error_deg(Q[some], identity[some], group),

@@ -85,7 +85,7 @@ class PoseErrors:
         """
         poses = T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3]
         points = torch.from_numpy(np.asarray(part.points, np.float64))
-        vertices, group = extreme_points(part), symmetries(part)
+        vertices, group = bop_points(part), symmetries(part)
         has_cameras = bool(K.isfinite().all() & width.isfinite().all())
         return cls(
             add=add(*poses, points),
@@ -105,8 +105,8 @@ def symmetries(part: Part) -> Float[Tensor, "s 4 4"]:
     return torch.from_numpy(group)
 
 
-def extreme_points(part: Part) -> Float[Tensor, "v 3"]:
-    """Return what MSSD and MSPD look at: the mesh's vertices as in BOP, else the ADD points.
+def bop_points(part: Part) -> Float[Tensor, "v 3"]:
+    """Return what BOP's scores look at: the mesh's vertices, of a part without mesh the ADD points.
 
     The surface samples of a CAD part miss its corners, where the largest distances are.
     """

@@ -143,6 +143,23 @@ def test_targets_are_those_of_the_list_else_the_visible_and_as_many_estimates_co
     assert scores([([right], [truth(pose(), wanted=False)])]) is None
 
 
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_add_or_s_is_over_the_vertices(seed, symmetric):
+    """As in bop_toolkit, by plain loops; the part's own ADD points lie elsewhere."""
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(30, 3)) * HALF
+    mesh = Mesh(vertices, np.arange(30, dtype=np.int32).reshape(10, 3))
+    turns = HALF_TURN[None] if symmetric else None
+    given_part = part(mesh=mesh, points=vertices.mean(0)[None], symmetries_discrete=turns)
+    T_est, T_gt = pose(0.01 * rng.normal(), 30 * rng.normal()), pose(0.01 * rng.normal())
+    estimated, true = (vertices @ T[:3, :3].T + T[:3, 3] for T in (T_est, T_gt))
+    nearest = [np.linalg.norm(estimated - one, axis=1).min() for one in true]
+    error = np.mean(nearest if symmetric else np.linalg.norm(estimated - true, axis=1))
+    got = scores([([Pose("box", 1.0, T_est)], [truth(T_gt)])], given_part)
+    assert got.add_or_s_01d == (error < 0.1 * given_part.diameter)
+
+
 def test_symmetric_parts_are_scored_with_add_s():
     turned = [([Pose("box", 1.0, pose(turn=180))], [truth(pose())])]
     plain, symmetric = scores(turned), scores(turned, part(symmetries_discrete=HALF_TURN[None]))
