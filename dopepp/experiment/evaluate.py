@@ -71,6 +71,9 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         allowed = "ckpt_path=… or results=… on the command line"
         raise UserError("no ckpt_path", allowed, "add what is to be measured")
     paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
+    if asked.refine is not None and not paths:
+        allowed = "refine=… of a checkpoint: a file's poses are measured as they are"
+        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, "leave refine out")
     device = asked.device
     if device == "auto":
         exported = any(is_export(Path(path)) for path in paths)
@@ -108,7 +111,8 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
         protocols=asked.protocols,
         refine=asked.refine,
     )
-    write_job_readme(run_dir, f"Evaluation of {measured}", reports[-1])
+    own_reports = reports if file is None or not loaded else reports[:-1]
+    write_job_readme(run_dir, f"Evaluation of {measured}", own_reports[-1])
     return reports
 
 

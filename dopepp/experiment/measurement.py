@@ -48,8 +48,8 @@ def measure_and_record(
     challenge CSVs of other methods. The parts are those that are scored, as the test data have
     them; ``details`` are further plain facts for ``metrics.json``. ``bop_csv`` writes the poses of
     each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
-    every estimator is measured without and with it; ``metrics.json`` is the network's, with the
-    refined poses' under ``refined``.
+    every estimator is measured without and with it; ``metrics.json`` is the last estimator's, with
+    its refined poses' under ``refined``, and a file's where there is no estimator.
 
     Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
     """
@@ -83,12 +83,13 @@ def measure_and_record(
         if report.name in measured.bop:
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_silence(methods, measured.silent, source)
-    # Of a network with and without refinement, the network's own result is what is compared.
-    refines = refine is not None and not files
-    main = measured.reports[-2 if refines else -1]
+    # What is compared later is the network's own result, unrefined; a file's where no network is.
+    own = measured.reports[: len(measured.reports) - len(files)] or measured.reports
+    refines = refine is not None and bool(estimators)
+    main = own[-2 if refines else -1]
     main.details.update(details or {})
     if refines:
-        main.refined = measured.reports[-1]
+        main.refined = own[-1]
         share = main.details["made_worse"] = made_worse(main, main.refined)
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
     record.write_json(run_dir / record.METRICS_FILE, main.to_record())

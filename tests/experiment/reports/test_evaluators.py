@@ -93,6 +93,19 @@ def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tm
         assert next(csv.reader(stream))[1:] == ["servoholder", "pivconnector"]
 
 
+def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, composed, tmp_path):
+    path = tmp_path / "other_two-test.csv"
+    write_results(path, results(root))
+    network = ("ckpt_path=pretrained/pivconnector", "refine=region")
+    config = composed(*options(root, f"results={path}", *network), config="evaluate")
+    reports = evaluate(config, tmp_path / "run")
+    assert [one.name for one in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
+    written = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert written == reports[0].to_record()
+    assert written["refined"]["name"] == "dopepp_fast + region"
+    assert "| other " not in (tmp_path / "run" / "README.md").read_text()
+
+
 def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog):
     poses = results(root)
     elsewhere = PoseResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
@@ -130,6 +143,8 @@ def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
         evaluate(composed("results=x.csv", config="evaluate"), tmp_path)
     with pytest.raises(UserError, match=r"x\.csv, which does not say how to render"):
         evaluate(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
+    with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave refine out"):
+        evaluate(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
