@@ -71,10 +71,13 @@ def validation_renders(
 ) -> DescribedSource:
     """Render a checkpoint's parts, by the meshes in it, as its validation images are rendered.
 
-    The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of their
-    own; those of a camera that the checkpoint was trained for keep theirs.
+    The other models of the data set it was trained for are not shown: that may be on another
+    machine. The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of
+    their own; those of a camera that the checkpoint was trained for keep theirs.
     """
-    data = replace(chosen_data({}, {}, trained_on(checkpoint.data), str(path)), num_val=count)
+    data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
+    virtual = replace(data.virtual, preset=_preset_name(data))
+    data = replace(data, root=None, objects=None, virtual=virtual, num_val=count)
     if size is not None and data.virtual.view is None:
         scene = {**(data.virtual.scene or {}), "width": size[0], "height": size[1]}
         data = replace(data, virtual=replace(data.virtual, scene=scene))
@@ -109,8 +112,11 @@ def seen_preset(data: DataConfig) -> Preset:
 
 
 def _customised(data: DataConfig) -> Preset:
-    name = data.virtual.preset or ("paper" if data.root is None else "ycb")
-    return customised_preset(name, data.virtual.scene or {})
+    return customised_preset(_preset_name(data), data.virtual.scene or {})
+
+
+def _preset_name(data: DataConfig) -> str:
+    return data.virtual.preset or ("paper" if data.root is None else "ycb")
 
 
 def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:

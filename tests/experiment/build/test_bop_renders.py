@@ -16,8 +16,10 @@ from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sources.rendered import RenderedSource
 from dopepp.experiment.build.camera import fitted_to_camera
 from dopepp.experiment.build.parts import build_negatives, build_parts
+from dopepp.experiment.build.renders import validation_renders
 from dopepp.experiment.build.sources import build_datamodule, held_out_source
 from dopepp.geometry.camera import project_keypoints
+from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets.preset import customised_preset
@@ -85,6 +87,19 @@ def test_models_that_are_not_learned_are_shown_all_the_same(config):
     assert [part.name for part in factory.parts] == ["red"]
     assert factory.negatives[0].name == "blue"
     assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
+
+
+def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tmp_path):
+    given = config("data.objects=[red]")
+    parts = build_parts(given.data)
+    stored = fitted_to_camera(given, parts).stored_data()
+    elsewhere = {**stored, "root": str(tmp_path / "elsewhere")}
+    checkpoint = Checkpoint({}, {}, parts, (64, 64), 8, 1.0, data={"config": elsewhere})
+    source = validation_renders(checkpoint, tmp_path / "best.ckpt", 3)
+    preset, sample = source.factory.preset, source.sample(2)
+    assert (len(source), preset.name) == (3, "ycb")
+    assert "blue" not in [part.name for part in source.factory.negatives]
+    assert {one.label for one in sample.instances} <= {"red"}
 
 
 def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
