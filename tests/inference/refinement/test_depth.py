@@ -177,6 +177,15 @@ def test_planes_pull_by_what_is_measured_on_the_part(box):
         assert_allclose(step[5], -0.004, atol=3e-4)
 
 
+def test_a_descent_depends_on_nothing_asked_before(box):
+    depth, prior = depth_of(box, TRUE), make_prior(TRUE, box.diameter)
+    surface = surface_points(box.points)
+    fresh, asked = (DepthEvidence(surface, box.diameter, depth, K, prior) for _ in range(2))
+    turned = TRUE @ make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # its other sides
+    asked.information(turned, asked.seen(turned))
+    assert_allclose(asked.descend().T_cam_obj, fresh.descend().T_cam_obj, rtol=0, atol=0)
+
+
 def test_depth_is_as_sure_as_its_independent_errors(box):
     """A camera with so many more pixels knows a pose no better: their errors are alike."""
     depth = depth_of(box, FACING)
