@@ -53,7 +53,8 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     """Return a config with the camera, and the distances, of the test's BOP pictures.
 
     Only where renders are learned, those pictures are the test, and no camera is given; nor, where
-    some of what is learned is real, an input size.
+    some of what is learned is real, an input size. A :class:`UserError`: no distance is given and
+    no object annotated.
     """
     data, virtual = config.data, config.data.virtual
     rendered = data.real_fraction == 0 or (data.real_fraction < 1 and data.input_size is None)
@@ -65,10 +66,16 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     ):
         return config
     source = labelled_images(data, parts, data.eval_seed, "test")
-    view = source.view() if isinstance(source, BopSource) else None
-    if view is None:
+    if not isinstance(source, BopSource):
         return config
-    (width, height), K, distance = view
+    (width, height), K, annotated = source.view()
+    distance = virtual.working_distance or annotated
+    if distance is None:
+        raise UserError(
+            f"no annotated object in {source.name}, which would tell how far away they are",
+            "working_distance=[near,far], metres",
+            "state the distances at which the camera is to find the parts",
+        )
     if virtual.working_distance is None:
         _log.info(
             "%s: renders are as its camera sees parts at %g – %g m, as they are annotated there; "
@@ -78,13 +85,13 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
         width=width, height=height,
         fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
     )  # fmt: skip
-    chosen = replace(virtual, camera=lens, working_distance=virtual.working_distance or distance)
+    chosen = replace(virtual, camera=lens, working_distance=distance)
     plain = {
         **config.plain,
         "virtual": {
             **config.plain["virtual"],
             "camera": vars(lens),
-            "working_distance": list(chosen.working_distance or ()),
+            "working_distance": list(distance),
         },
     }
     return replace(config, plain=plain, data=replace(data, virtual=chosen))

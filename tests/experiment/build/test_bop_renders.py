@@ -80,6 +80,19 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
 
 
+def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tmp_path):
+    private = shutil.copytree(root, tmp_path / "set")
+    for annotation in private.glob("**/scene_gt*.json"):
+        annotation.unlink()
+    given = config(f"data.root={private}", "virtual.preset=upright")
+    parts = build_parts(given.data)
+    with pytest.raises(UserError, match=r"no annotated object in bop/test.*working_distance="):
+        fitted_to_camera(given, parts)
+    said = config(f"data.root={private}", "virtual.working_distance=[0.4,0.7]")
+    virtual = fitted_to_camera(said, parts).data.virtual
+    assert (virtual.camera.fx, virtual.working_distance) == (210.0, (0.4, 0.7))
+
+
 def test_models_that_are_not_learned_are_shown_all_the_same(config):
     given = config("virtual.preset=upright", "data.objects=[red]")
     parts = build_parts(given.data)

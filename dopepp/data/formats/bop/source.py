@@ -216,20 +216,21 @@ class BopSource:
         scale = float(scene.depth_scales[row])
         return decode_depth(read_content(path), str(path), scale, shape)
 
-    def view(self) -> tuple[Size, CameraMatrix, tuple[float, float]] | None:
+    def view(self) -> tuple[Size, CameraMatrix, tuple[float, float] | None]:
         """Return the first picture's (width, height) and K, pixels, and how far objects are.
 
         That is the nearest and the farthest depth of a cuboid's centre over all pictures, metres,
-        rounded outwards to centimetres; None where no object is annotated.
+        rounded outwards to centimetres; None where no object is annotated, as where a challenge
+        keeps the truth to itself.
         """
         depths = [
             float(transform(T_cam_obj, self._parts[int(number)].cuboid[[CENTROID]])[0, 2])
             for scene in self._scenes
             for number, T_cam_obj in zip(scene.poses.obj_ids, scene.poses.T_cam_obj, strict=True)
         ]
-        if not depths:
-            return None
         first = self.sample(0)
+        if not depths:
+            return first.size, first.K, None
         return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
 
     def contains(self, label: str) -> bool:

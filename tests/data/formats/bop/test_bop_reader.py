@@ -255,6 +255,8 @@ def test_the_view_is_the_pictures_camera_and_the_annotated_distances(scene, bloc
     size, camera, distances = BopSource(scene.root, [block(2)], "test").view()
     assert (size, distances) == ((64, 48), (0.25, 0.31))
     np.testing.assert_array_equal(camera, np.reshape(K, (3, 3)))
+    scene.annotate({"3": [truth(9)], "11": []}, {})
+    assert BopSource(scene.root, [block(2)], "test").view()[2] is None
 
 
 def test_linemod_occlusion_as_it_is_published(shared_data, caplog):
