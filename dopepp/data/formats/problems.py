@@ -12,7 +12,7 @@ import io
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn, Protocol, TypeVar
@@ -36,6 +36,9 @@ _LOG_EVERY: Final = 1000
 
 FORMATS: Final = ("PNG", "JPEG", "TIFF")
 """Of BOP's images."""
+
+COLOUR_MODES: Final = ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr")
+"""Pillow's names of the pixels that BOP's colour and grey images may have."""
 
 FARTHEST: Final = 1e9
 """No number of a label is larger in any unit, and squares of such numbers stay exact enough."""
@@ -250,31 +253,40 @@ def mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def picture(place: Place, content: bytes | None = None) -> Image.Image | None:
+def picture(
+    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+) -> Image.Image | None:
     """Decode a BOP image, None where it is missing, damaged, too large or of another format.
 
-    ``content`` are its bytes, where they do not lie on the disk by themselves.
+    ``content`` are its bytes, where they do not lie on the disk by themselves; ``modes`` Pillow's
+    names of the pixels it may have, none for any.
     """
     if content is None:
         content = place["image"].attempt(lambda: read_content(Path(place.path)))
     if content is None:
         return None
     try:
-        return whole_picture(content, FORMATS)
+        image = whole_picture(content, FORMATS)
     except ValueError as error:
         got = f"unreadable or truncated, {len(content):,} bytes ({error})"
         allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
         place["image"].report(got, allowed)
         return None
+    if modes and image.mode not in modes:
+        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
+        return None
+    return image
 
 
-def picture_shape(place: Place, content: bytes | None = None) -> tuple[int, int] | None:
-    """Return a picture's (height, width) after reading all of it.
+def picture_shape(
+    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+) -> tuple[int, int] | None:
+    """Return a picture's (height, width) after reading all of it, as :func:`picture` does.
 
     A truncated file still states its size, so that other images can be held against it; None where
     it does not.
     """
-    picture(place, content)
+    picture(place, content, modes)
     file = Path(place.path) if content is None else io.BytesIO(content)
     try:
         with Image.open(file, formats=FORMATS) as stated:

@@ -41,6 +41,9 @@ NORMALS: Final = ("nx", "ny", "nz")
 COORDINATES: Final = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 """Names of a vertex's colour, of its normal and, several, of its texture coordinates."""
 
+_ROUNDING: Final = 1e-3
+"""Share of its range by which a colour may leave it: programs compute with floats."""
+
 
 class Column(NamedTuple):
     """A property: its name, the type of its numbers and, of a list, that of its length.
@@ -123,10 +126,14 @@ def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | 
         return None
     columns = [column for one in elements if one.name == "vertex" for column in one.columns]
     kinds = {column.declared for column in columns if column.name in COLOURS}
-    most = 1.0 if kinds <= {"float", "float32", "double", "float64"} else 255.0
-    if not ((values >= 0) & (values <= most)).all():
+    most = 255.0
+    if kinds <= {"float", "float32", "double", "float64"}:
+        most = 1.0
+    elif kinds <= {"ushort", "uint16"}:
+        most = 65_535.0
+    if not (np.abs(values / most - 0.5) <= 0.5 + _ROUNDING).all():
         raise ValueError(f"a vertex colour that is not from 0 to {most:g}")
-    colours = np.rint(values * (255.0 / most)).astype(np.uint8)
+    colours = np.rint(np.clip(values * (255.0 / most), 0, 255)).astype(np.uint8)
     return None if (colours == colours[0, 0]).all() else colours
 
 

@@ -189,7 +189,8 @@ def _outward(path: Path, vertices: Vertices, faces: Faces) -> Faces:
 
 
 def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
-    allowed = f"a whole mesh with triangles and finite coordinates, under {MAX_BYTES / 1e6:.0f} MB"
+    content = "triangles, finite coordinates and colours of their range"
+    allowed = f"a whole mesh with {content}, under {MAX_BYTES / 1e6:.0f} MB"
     return UserError(f"mesh {path} with {got}", allowed, fix)
 
 

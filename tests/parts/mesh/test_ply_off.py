@@ -278,7 +278,7 @@ SHADES = np.arange(24).reshape(8, 3) * 10
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("float", 1 / 255)])
+@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("ushort", 257), ("float", 1 / 255)])
 def test_vertices_keep_colours_and_normals(form, kind, scale, tmp_path):
     path = tmp_path / "box.ply"
     path.write_bytes(coloured(form, kind, SHADES * scale, normals=True))
@@ -294,6 +294,13 @@ def test_one_grey_everywhere_is_nobodys_choice_and_one_colour_is(tmp_path):
         path.write_bytes(coloured("ascii", "uchar", np.tile(shade, (8, 1))))
         colours = read_mesh(path, unit="mm").colours
         assert (None if colours is None else tuple(colours[3])) == expected
+
+
+def test_a_colour_that_is_rounded_beyond_its_range_is_its_end(tmp_path):
+    path, values = tmp_path / "box.ply", np.zeros((8, 3))
+    values[2] = 1 + 1e-4, -1e-4, 0.5
+    path.write_bytes(coloured("binary_little_endian", "float", values))
+    assert read_mesh(path, unit="mm").colours[2].tolist() == [255, 0, 128]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from dopepp.data.formats.bop.check_image import (
     load_models,
 )
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
-from dopepp.data.formats.problems import CheckReport, Place, picture_shape
+from dopepp.data.formats.problems import COLOUR_MODES, CheckReport, Place, picture_shape
 from dopepp.drawing.pictures import Mask, Shape
 
 _SCENE_FILES: Final = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
@@ -51,6 +51,8 @@ def check_bop(report: CheckReport) -> None:
     # The models lie beside the splits: in this folder, or above the split or scene that it is.
     models = load_models(report, (report.root, *report.root.resolve().parents[:2]))
     for folder in scene_folders(report.root):
+        if folder != report.root and not bop.is_number(folder.name):
+            report.report(folder, "name", "no scene's number", "000000, 000001, …")
         _Scene(report, folder, models).check()
 
 
@@ -98,7 +100,7 @@ class _Scene:
     def _check_image(self, image: int) -> None:
         report, folder, records = self._report, self._folder, self._records
         picture_path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
-        shape = picture_shape(Place(report, picture_path))
+        shape = picture_shape(Place(report, picture_path), modes=COLOUR_MODES)
         if self._depths:
             path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
             one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +18,13 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.data.formats import tolerances
-from dopepp.data.formats.bop.models import INFO_FILE, info_path, parse_models
+from dopepp.data.formats.bop.models import (
+    INFO_FILE,
+    info_path,
+    modelled,
+    parse_models,
+    part_of,
+)
 from dopepp.data.formats.bop.records import (
     INEXACT,
     MM,
@@ -96,7 +103,11 @@ ReadMask = Callable[[str, int], Mask | None]
 
 
 def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
-    """Check the first ``models*/models_info.json`` below one of the folders; None without one."""
+    """Check the first ``models*/models_info.json`` below one of the folders, and its meshes.
+
+    Returns the sizes of the objects whose mesh is there, of all where none is; None without such a
+    file.
+    """
     path = next(filter(None, map(info_path, roots)), None)
     if path is None:
         report.note(f"no {INFO_FILE}: objects' numbers, sizes and boxes are not checked")
@@ -106,14 +117,19 @@ def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
     if records is None:
         return None
     infos = parse_models(path, records, report)
-    for info in infos.values():
-        if not info.path.is_file():
-            report.report(info.path, "file", "missing")
-    return {
+    there = modelled(infos)
+    if absent := infos.keys() - there:
+        numbers = ", ".join(map(str, sorted(absent)))
+        report.note(f"{path.parent}: no file of object {numbers}, left out where it is annotated")
+    for number in sorted(there):
+        info = infos[number]
+        Place(report, info.path)["mesh"].attempt(partial(part_of, info))
+    sizes = {
         int(key): _model(place[key], record, infos[int(key)].diameter)
         for key, record in records.items()
         if is_number(key)
     }
+    return {number: size for number, size in sizes.items() if number in there}
 
 
 def _model(place: Place, record: object, stated: float) -> Model:

@@ -12,7 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dopepp.data.formats.problems import STRICT, Place, mapping, one_channel, picture
+from dopepp.data.formats.problems import (
+    COLOUR_MODES,
+    STRICT,
+    Place,
+    mapping,
+    one_channel,
+    picture,
+)
 from dopepp.drawing.pictures import DepthMap, Mask, Picture, Shape
 
 DEPTH_SCALES_MM: Final = (0.1, 1.0)
@@ -29,11 +36,8 @@ def decode_rgb(content: bytes, where: str) -> Picture:
 
     A UserError: it is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
     """
-    place = Place(STRICT, where)
-    image = picture(place, content)
+    image = picture(Place(STRICT, where), content, COLOUR_MODES)
     assert image is not None
-    if image.mode not in ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr"):
-        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
     return np.array(image.convert("RGB"))
 
 

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.records import MM, is_number, number_in_name
+from dopepp.data.formats.bop.records import EXACT, INEXACT, MM, is_number, number_in_name
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
+from dopepp.geometry.rotation import is_rotation, nearest_rotation
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Part, check_name, make_part
 from dopepp.parts.record import MAX_SYMMETRIES
@@ -83,7 +84,7 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
             raise UserError(
                 f"data.objects with {name!r}", ", ".join(by_name), "choose from this list"
             )
-    return [_part(by_name[name]) for name in wanted]
+    return [part_of(by_name[name]) for name in wanted]
 
 
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
@@ -105,14 +106,20 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
     return numbered
 
 
-def _part(info: ModelInfo) -> Part:
-    part = make_part(
-        info.name,
-        read_mesh(info.path, unit="mm"),
-        symmetries_discrete=info.symmetries_discrete,
-        symmetries_continuous=info.symmetries_continuous,
-        unit="mm",
-    )
+def part_of(info: ModelInfo) -> Part:
+    """Read an object's mesh; a :class:`UserError`: it is missing, damaged or not in millimetres."""
+    mesh = read_mesh(info.path, unit="mm")
+    try:
+        part = make_part(
+            info.name,
+            mesh,
+            symmetries_discrete=info.symmetries_discrete,
+            symmetries_continuous=info.symmetries_continuous,
+            unit="mm",
+        )
+    except UserError as error:  # of its size: BOP's files have one unit
+        allowed, fix = "a model in millimetres, as all of BOP's", "scale the model"
+        raise UserError(f"{info.path}: {error.got}", allowed, fix) from error
     if abs(info.diameter - part.diameter) > _DIAMETER_TOLERANCE * part.diameter:
         _log.warning(
             "%s: %s states a diameter of %.6g m, its vertices have %.6g m, which is used",
@@ -125,6 +132,12 @@ def read_models(root: Path) -> dict[int, ModelInfo]:
     """Return the objects of ``models_info.json`` by number; none where there is no such file."""
     path = info_path(root)
     return {} if path is None else parse_models(path, Place(STRICT, path).load(_ALLOWED))
+
+
+def modelled(infos: Mapping[int, ModelInfo]) -> set[int]:
+    """Return which objects have their model's file, all of them where none has."""
+    there = {number for number, info in infos.items() if info.path.is_file()}
+    return there or set(infos)
 
 
 def info_path(root: Path) -> Path | None:
@@ -191,12 +204,14 @@ def _discrete(place: Place, value: object) -> Discrete | None:
     transforms = []
     for number, row in enumerate(_rows(place, value)):
         matrix = place[number].numbers(row, 4, 4)
-        problem = rotation_problem(matrix[:3, :3])
+        problem = rotation_problem(matrix[:3, :3], INEXACT)
         if problem is not None or (matrix[3] != [0, 0, 0, 1]).any():
             got = problem or f"a last row of {matrix[3].tolist()}"
             if np.isfinite(matrix).all():
                 place[number].report(got, "rigid transforms [R t; 0 0 0 1], row by row")
             continue
+        if not is_rotation(matrix[:3, :3], EXACT):
+            matrix[:3, :3] = nearest_rotation(matrix[:3, :3])
         matrix[:3, 3] /= MM
         if not np.allclose(matrix, np.eye(4), atol=1e-9):
             transforms.append(matrix)

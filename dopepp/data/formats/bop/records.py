@@ -46,6 +46,9 @@ INEXACT: Final = 1e-2
 """How far R·Rᵀ may be from the identity: taken as it is, and as the nearest rotation. (105 of the
 first 805 poses of LM-O, as published, are off by up to 2e-3.)"""
 
+_ROUNDING: Final = 1e-3
+"""By which a visible fraction may leave [0, 1]."""
+
 ESTIMATED: Final = (
     "estimated: mask pixels, or without a mask those inside the image, over the hull of the points"
 )
@@ -118,7 +121,7 @@ def read_poses(
     and a fraction that is not in [0, 1] is a problem.
 
     ``truths`` have ``cam_R_m2c`` (row by row), ``cam_t_m2c`` (mm) and ``obj_id``; ``infos``, one
-    for each of them or None, have ``visib_fract``.
+    for each of them or None, may have ``visib_fract``.
     """
     place, info_place = partial(places, "gt"), partial(places, "gt_info")
     rotations = _column(truths, "cam_R_m2c", 9, place).reshape(-1, 3, 3)
@@ -137,11 +140,12 @@ def read_poses(
         if math.isfinite(ids[number]):
             place(number)["obj_id"].report(f"{ids[number]:g}", "an object's number")
         ids[number] = -1
-    stated = [n for n, info in enumerate(infos) if info is not None]
+    stated = [n for n, info in enumerate(infos) if "visib_fract" in mapping(info)]
     fractions = _stated_column(infos, stated, "visib_fract", info_place)
-    for number in np.flatnonzero((fractions < 0) | (fractions > 1)).tolist():
-        info_place(number)["visib_fract"].report(f"{fractions[number]:g}", "0 – 1")
+    for number in np.flatnonzero((fractions < -_ROUNDING) | (fractions > 1 + _ROUNDING)).tolist():
+        info_place(number)["visib_fract"].report(f"{fractions[number]:.6g}", "0 – 1")
         fractions[number] = math.nan
+    fractions = np.clip(fractions, 0.0, 1.0)
     return BopPoses(ids.astype(np.int64), poses, fractions, inexact)
 
 
@@ -224,8 +228,10 @@ class SceneFolder:
         depth_scales: Millimetres a unit of its depth image; NaN where not stated.
         first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
         gt_ids: Each object's place in its image's list, which names its masks.
-        without_model: How many objects of each number have no model.
+        num_other: Objects that are not of interest and have a model.
+        without_model: How many objects of each number, not of interest, have no model.
         num_behind: Objects of interest behind the camera, left out like the others.
+        has_depth: Whether there are depth images.
     """
 
     folder: Path
@@ -239,6 +245,7 @@ class SceneFolder:
     num_other: int
     without_model: Counter[int]
     num_behind: int
+    has_depth: bool
 
     def objects(self, image: int) -> range:
         """Return which objects are on an image."""
@@ -284,6 +291,7 @@ def read_scene(folder: Path, wanted: set[int], modelled: Collection[int] = ()) -
     is_behind = poses.T_cam_obj[:, 2, 3] <= 0
     keep = is_wanted & ~is_behind
     files = image_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
+    without_model = objects_without_model(poses.of(~is_wanted), modelled)
     return SceneFolder(
         folder,
         np.array(images, np.int64),
@@ -293,9 +301,10 @@ def read_scene(folder: Path, wanted: set[int], modelled: Collection[int] = ()) -
         np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
         table[keep, 1],
         poses.of(keep),
-        int((~is_wanted).sum()),
-        objects_without_model(poses, modelled),
+        int((~is_wanted).sum()) - without_model.total(),
+        without_model,
         int((is_wanted & is_behind).sum()),
+        bool(image_files(folder, ("depth",), DEPTH_SUFFIXES)),
     )
 
 
@@ -310,7 +319,7 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     camera, gt, gt_info = (
         Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
     )
-    cameras, truths, infos = _by_image(camera), _objects(gt), _objects(gt_info)
+    cameras, truths, infos = _by_image(camera), _objects(gt), _objects(gt_info, may_lack=True)
     paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - truths.keys()}
     for image, objects in truths.items():
         stated = image in infos
@@ -321,10 +330,17 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     return SceneRecords(cameras, truths, paired)
 
 
-def _objects(place: Place) -> dict[int, list[Any]]:
-    """Return each image's list of records; nothing where there is no such file."""
+def _objects(place: Place, may_lack: bool = False) -> dict[int, list[Any]]:
+    """Return each image's list of records; nothing where there is no such file.
+
+    An image that ``may_lack`` them has none where its list is empty or null.
+    """
     by_image = _by_image(place) if Path(place.path).exists() else {}
-    return {image: place[f"{image}"].entries(rows) for image, rows in by_image.items()}
+    return {
+        image: place[f"{image}"].entries(rows)
+        for image, rows in by_image.items()
+        if not (may_lack and rows in (None, []))
+    }
 
 
 def _by_image(place: Place) -> dict[int, Any]:

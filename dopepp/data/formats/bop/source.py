@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from math import ceil, floor
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,7 @@ from dopepp.core.json import read_json
 from dopepp.data.formats import share
 from dopepp.data.formats.bop import records as bop
 from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
-from dopepp.data.formats.bop.models import parts_by_id, read_models
+from dopepp.data.formats.bop.models import modelled, parts_by_id, read_models
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.drawing.pictures import DepthMap, Mask, Shape, Size, read_content
 from dopepp.geometry.camera import CameraMatrix, check_camera, transform
@@ -109,8 +109,8 @@ class BopSource:
                 f"{self.root / split}, which has no scene", "folders 000000, 000001, …",
                 "unpack the data set's images into it",
             )  # fmt: skip
-        modelled = read_models(self.root)
-        self._scenes = [bop.read_scene(folder, set(self._parts), modelled) for folder in folders]
+        with_model = modelled(read_models(self.root))
+        self._scenes = [bop.read_scene(folder, set(self._parts), with_model) for folder in folders]
         if targets == AUTO:
             is_there = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
             targets = TARGETS_FILE if is_there else None
@@ -118,14 +118,16 @@ class BopSource:
         items = self._present(self._targets)
         self._items = items[share(len(items), part_of, self.name)]
         other = sum(scene.num_other for scene in self._scenes)
+        without = sum(scene.without_model.total() for scene in self._scenes)
         behind = sum(scene.num_behind for scene in self._scenes)
-        self._left_out = {"other_objects": other, "behind_the_camera": behind}
+        self._left_out = {"other_objects": other + without, "behind_the_camera": behind}
         if other or behind:
             _log.info(
                 "%s: left out %s objects that are none of the parts and %s behind the camera",
                 self.name, f"{other:,}", f"{behind:,}",
             )  # fmt: skip
         self._tell_oddities()
+        self._tell_lacking(with_model)
 
     def _tell_oddities(self) -> None:
         """Say once what of the annotation is not as it should be, and how it is taken."""
@@ -142,6 +144,26 @@ class BopSource:
         fractions = np.concatenate([scene.poses.visible_fractions for scene in self._scenes])
         if unknown := int(np.isnan(fractions).sum()):
             _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
+
+    def _tell_lacking(self, with_model: Set[int]) -> None:
+        """Say how many of the listed instances cannot count: not annotated, or without a model."""
+        lacking = 0
+        for number, row in self._items.tolist() if self._targets is not None else ():
+            scene, objects = self._scenes[number], self._scenes[number].objects(row)
+            there = Counter(scene.poses.obj_ids[objects.start : objects.stop].tolist())
+            asked = self._asked(scene, row) or Counter()
+            known = self._parts.keys() | (asked.keys() - with_model if with_model else set())
+            lacking += sum(max(0, asked[one] - there[one]) for one in known)
+        if lacking:
+            _log.warning(
+                "%s: %s listed instances have no annotation or no model and are not counted",
+                self.name, f"{lacking:,}",
+            )  # fmt: skip
+
+    def _asked(self, scene: bop.SceneFolder, row: int) -> Counter[int] | None:
+        """Return how many instances the list asks for on an image of it; None for all."""
+        assert self._targets is not None
+        return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
 
     def _present(self, targets: Targets | None) -> Int[np.ndarray, "items 2"]:
         """Return (scene, row) of the images that are selected and on disk, in order."""
@@ -179,8 +201,7 @@ class BopSource:
         K = check_camera(scene.K[row], (shape[1], shape[0]), where)
         instances = [self._instance(scene, k, path.stem, K, shape) for k in scene.objects(int(row))]
         if self._targets is not None:
-            asked = self._targets[int(scene.folder.name), int(scene.image_ids[row])]
-            self._mark_wanted(instances, asked)
+            self._mark_wanted(instances, self._asked(scene, int(row)))
         depth = self._depth(scene, int(row), path.stem, shape) if self._read_depth else None
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
@@ -209,7 +230,7 @@ class BopSource:
 
     def _depth(self, scene: bop.SceneFolder, row: int, stem: str, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
-        if not (scene.folder / "depth").is_dir():
+        if not scene.has_depth:
             return None
         paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in bop.DEPTH_SUFFIXES]
         path = next((path for path in paths if path.exists()), paths[0])

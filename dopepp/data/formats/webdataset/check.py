@@ -15,7 +15,7 @@ from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.check_image import Models, Oddities, check_image, load_models
 from dopepp.data.formats.bop.images import DEPTH_MODES, one_channel_of
 from dopepp.data.formats.bop.records import BopPoses
-from dopepp.data.formats.problems import CheckReport, Place, picture_shape
+from dopepp.data.formats.problems import COLOUR_MODES, CheckReport, Place, picture_shape
 from dopepp.data.formats.webdataset import shards
 from dopepp.data.formats.webdataset.source import ShardRecords
 from dopepp.drawing.pictures import Mask, Shape
@@ -88,7 +88,7 @@ def _check_image(
     shape: Shape | None = None
     if "image" in names:
         name = names["image"]
-        shape = picture_shape(Place(report, f"{start}.{name}"), content[name])
+        shape = picture_shape(Place(report, f"{start}.{name}"), content[name], COLOUR_MODES)
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
     if "depth" in names:

@@ -229,12 +229,13 @@ def test_missing_infos_and_models_are_coped_with_and_counted(scene, block, caplo
     (scene.root / "models" / "models_info.json").write_text('{"2": {"diameter": 46.0}}')
     source = BopSource(scene.root, [block(2)], "test")
     assert "left out objects without a model: 9 (2)" in caplog.text
+    assert "none of the parts" not in caplog.text
     assert "1 objects' visible fractions are estimated" in caplog.text
     fractions = [source.sample(i).instances[0].visible_fraction for i in (0, 1)]
     assert fractions == pytest.approx([0.75, 1.0])
 
 
-def test_a_list_of_targets_marks_the_most_visible_instances(scene, block):
+def test_a_list_of_targets_marks_the_most_visible_instances(scene, block, caplog):
     fractions = [0.2, 0.9, 0.05, 0.5]
     truths = [truth(2, (x, 0, 250)) for x in (-30.0, -10.0, 10.0, 30.0)]
     scene.annotate({"3": truths, "11": [truth(2)]}, {"3": fractions, "11": [0.8]})
@@ -243,6 +244,11 @@ def test_a_list_of_targets_marks_the_most_visible_instances(scene, block):
     source = BopSource(scene.root, [block(2)], "test", targets="auto")
     assert len(source) == 1
     assert [one.wanted for one in source.sample(0).instances] == [False, True, False, True]
+    listed[0]["inst_count"] = 7
+    (scene.root / "test_targets_bop19.json").write_text(json.dumps(listed))
+    assert "not counted" not in caplog.text
+    BopSource(scene.root, [block(2)], "test", targets="auto")
+    assert "bop/test: 3 listed instances have no annotation or no model" in caplog.text
     every = BopSource(scene.root, [block(2)], "test")
     assert [one.wanted for one in every.sample(0).instances] == [None] * 4
     assert len(every) == 2

@@ -8,9 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.check import check_dataset
+from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
@@ -86,7 +88,7 @@ def write_models(root: Path) -> None:
     (root / "models").mkdir(parents=True)
     (root / "models" / "models_info.json").write_text(json.dumps(models()))
     for number in (1, 2):
-        (root / "models" / f"obj_{number:06d}.ply").write_bytes(b"ply\n")
+        trimesh.creation.box(SIDES).export(root / "models" / f"obj_{number:06d}.ply")
 
 
 @pytest.fixture
@@ -211,7 +213,12 @@ DAMAGES = {
         "models:1.symmetries_discrete.0", times(2), "1.symmetries_discrete[0]: no rotation"
     ),
     "axis": ("models:2.symmetries_continuous.0.axis", times(0), "continuous[0].axis: zero"),
-    "model missing": ("models/obj_000002.ply", None, "models/obj_000002.ply: file: missing"),
+    "model cut": ("models/obj_000002.ply", b"ply\n", "models/obj_000002.ply: mesh: with no PLY"),
+    "model in m": (
+        "models/obj_000001.ply", trimesh.creation.box(SIDES / 1000).export(file_type="ply"),
+        "models/obj_000001.ply: mesh: part 'obj_000001' with a diameter of 7.6e-05",
+    ),
+    "picture of 16 bits": ("rgb/000001.png", depth(), "000001.png: image: pixels of type I;16"),
     "image without records": ("rgb/000009.png", picture(9), "scene_camera.json: 9: missing"),
 }  # fmt: skip
 
@@ -241,7 +248,7 @@ def test_every_damage_is_found_with_file_and_field(bop, name, spoilt, assert_fou
 
 INDEPENDENT = [
     "rgb cut", "depth missing", "mask cut", "rotation scaled", "behind", "metres", "no camera",
-    "diameter and box", "model missing", "K short", "fraction",
+    "diameter and box", "model cut", "K short", "fraction",
 ]  # fmt: skip
 
 
@@ -271,6 +278,8 @@ NOTED = {
     "a rotation to a hundredth": ("gt:0.0.cam_R_m2c", times(1.004), "1 rotations are orthogonal"),
     "an image without info": ("gt_info:1", None, "1 images without scene_gt_info.json"),
     "no info at all": ("gt_info", None, "3 images without scene_gt_info.json"),
+    "an image of null info": ("gt_info:1", [], "1 images without scene_gt_info.json"),
+    "a model missing": ("models/obj_000002.ply", None, "no file of object 2, left out"),
     "an object without a model": ("gt:0.0.obj_id", 9, "object 9 is annotated 1 times and has no"),
 }
 
@@ -282,6 +291,37 @@ def test_what_every_reader_copes_with_is_a_note(bop, name, spoilt):
     report = check_dataset(bop)
     assert report.ok, report.lines()
     assert any(expected in note for note in report.notes), report.notes
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        ("gt_info:0.0.visib_fract", None),
+        ("gt_info:0.1.visib_fract", 1.0000001),
+        ("models:1.symmetries_discrete.0.0", times(1.004)),
+    ],
+)
+def test_what_is_optional_or_rounded_is_taken_by_check_and_reader(bop, damage, spoilt):
+    spoil(bop, spoilt, *damage)
+    assert check_dataset(bop).lines()[:-1] == []
+    parts = bop_parts(bop)
+    source = BopSource(bop, parts, "train_pbr")
+    fractions = [one.visible_fraction for one in source.sample(0).instances]
+    assert all(0 < fraction <= 1 for fraction in fractions)
+    turn = parts[0].symmetries_discrete[0, :3, :3]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+
+
+def test_an_empty_folder_of_depth_is_none(bop):
+    for path in (bop / SCENE / "depth").iterdir():
+        path.unlink()
+    assert check_dataset(bop).ok
+    assert BopSource(bop, bop_parts(bop), "train_pbr").sample(0).depth is None
+
+
+def test_a_scene_that_no_reader_finds_is_a_defect(bop, assert_found):
+    (bop / SCENE).rename(bop / "train_pbr" / "kitchen")
+    assert_found(bop, "train_pbr/kitchen: name: no scene's number")
 
 
 def runs(mask: np.ndarray) -> dict[str, Any]:
