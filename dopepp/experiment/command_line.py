@@ -262,12 +262,15 @@ def _explain(error: Exception, config_dir: Path | None) -> UserError:
 
 
 def _nearest(key: str, config_dir: Path | None) -> str:
-    """Name the option that was probably meant."""
+    """Name the option that was probably meant, or the program that has this one."""
     if config_dir is None:
         return ""
     with initialize_config_dir(str(config_dir.resolve()), version_base="1.3"):
-        names = [*_flat(compose("train")), *_flat(compose("evaluate"))]
-    close = difflib.get_close_matches(key, names, n=1)
+        options = {name: set(_flat(compose(name))) for name in ("train", "evaluate")}
+    for name, known in options.items():
+        if key in known:
+            return f"; it is one of {name}.py"
+    close = difflib.get_close_matches(key, sorted(set().union(*options.values())), n=1)
     return f", nearest {close[0]}" if close else ""
 
 

@@ -32,6 +32,8 @@ def train(call, tiny, tmp_path):
     [
         (["data.bach_size=4"], "override 'data.bach_size', which names no option; allowed: the "
                                "options of `--cfg job`, nearest data.batch_size"),
+        (["bop_csv=true"], "'bop_csv', which names no option; allowed: the options of `--cfg job`; "
+                           "it is one of evaluate.py"),
         (["modl=dope"], "override 'modl', which names no option"),
         (["model=dopeppp"], "model=dopeppp; allowed: dope dopepp"),
         (["model/attention=cbm"], "model/attention=cbm; allowed: cbam none se"),

@@ -297,6 +297,7 @@ def _split_dir(root: Path, split: str) -> Path:
         raise UserError(
             f"{folder}, which is no folder",
             f"one of {sorted(set(found))}" if found else "a BOP data set's folder with its splits",
-            "correct data.root or data.image_sets",
+            "correct data.root or data.image_sets; without labelled images to learn from, "
+            "data=bop_renders learns renders of the models",
         )
     return folder
