@@ -1,7 +1,8 @@
 """The one way from maps to poses: peaks, association, PnP."""
 
+from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import RecoveryOptions, explain, recover, recover_batch
+from dopepp.recovery.recover import explain, recover, recover_batch
 from dopepp.recovery.silence import Reason
 
 __all__ = ["Detection", "Reason", "RecoveryOptions", "explain", "recover", "recover_batch"]

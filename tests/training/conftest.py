@@ -18,7 +18,7 @@ from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.spec import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
-from dopepp.recovery.recover import RecoveryOptions
+from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem

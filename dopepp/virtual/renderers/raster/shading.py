@@ -292,9 +292,9 @@ def reflect_light(
     """Add one point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
 
     ``lit``, of shape (n,), is the share of the light that reaches each point, ``light`` comes from
-    :func:`light_row`, ``specular`` is the reflectance of the dielectric part at normal incidence,
-    ``metallic`` 1 for a metal, whose reflectance is its albedo; ``radiance``, linear RGB of shape
-    (3, n), is updated in place.
+    :func:`~dopepp.virtual.renderers.raster.shadow.light_row`, ``specular`` is the reflectance of
+    the dielectric part at normal incidence, ``metallic`` 1 for a metal, whose reflectance is its
+    albedo; ``radiance``, linear RGB of shape (3, n), is updated in place.
     """
     base, metal = np.float32(specular), np.float32(metallic)
     matt = _ONE - metal
