@@ -129,7 +129,7 @@ def _colours(vertex: Table, elements: Sequence[Element]) -> NDArray[np.uint8] | 
     most = 255.0
     if kinds <= {"float", "float32", "double", "float64"}:
         most = 1.0
-    elif kinds <= {"ushort", "uint16"}:
+    elif kinds <= {"ushort", "uint16"} and values.max() > most:
         most = 65_535.0
     if not (np.abs(values / most - 0.5) <= 0.5 + _ROUNDING).all():
         raise ValueError(f"a vertex colour that is not from 0 to {most:g}")

@@ -278,7 +278,9 @@ SHADES = np.arange(24).reshape(8, 3) * 10
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize(("kind", "scale"), [("uchar", 1), ("ushort", 257), ("float", 1 / 255)])
+@pytest.mark.parametrize(
+    ("kind", "scale"), [("uchar", 1), ("ushort", 1), ("ushort", 257), ("float", 1 / 255)]
+)
 def test_vertices_keep_colours_and_normals(form, kind, scale, tmp_path):
     path = tmp_path / "box.ply"
     path.write_bytes(coloured(form, kind, SHADES * scale, normals=True))

@@ -2,7 +2,7 @@
 
 What is optional in BOP (depth, masks) must be there for every image of a scene as soon as it is
 there for one. Noted are a scene without ``scene_gt.json`` (data sets keep the ground truth of
-their tests private), images without ``scene_gt_info.json``, objects without a model and inexact
+their tests private), objects without ``visib_fract``, objects without a model and inexact
 rotations.
 """
 
@@ -106,7 +106,6 @@ class _Scene:
             one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)
         truths = records.truths.get(image, [])
         infos = records.infos.get(image, [None] * len(truths))
-        self._oddities.without_info += bool(infos) and all(info is None for info in infos)
 
         def places(what: str, number: int) -> Place:
             place = Place(report, folder / f"scene_{what}.json")[f"{image}"]

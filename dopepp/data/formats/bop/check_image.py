@@ -71,12 +71,13 @@ class Oddities:
     """What is no defect, because every reader copes with it, and worth a line: counts."""
 
     inexact: int = 0
-    without_info: int = 0
+    without_fraction: int = 0
     without_model: Counter[int] = field(default_factory=Counter)
 
     def count(self, poses: BopPoses, models: Models | None) -> None:
         """Count what an image's annotation has of it."""
         self.inexact += int(poses.inexact.sum())
+        self.without_fraction += int(np.isnan(poses.visible_fractions).sum())
         self.without_model += objects_without_model(poses, models or ())
 
     def note(self, report: CheckReport, where: Path | str) -> None:
@@ -86,10 +87,10 @@ class Oddities:
                 f"{where}: {self.inexact:,} rotations are orthogonal to {INEXACT:g} only; the "
                 "nearest rotation is taken"
             )
-        if self.without_info:
+        if self.without_fraction:
             report.note(
-                f"{where}: {self.without_info:,} images without scene_gt_info.json; how much of "
-                "their objects is visible is estimated"
+                f"{where}: {self.without_fraction:,} objects without visib_fract; how much of them "
+                "is visible is estimated"
             )
         for number, count in sorted(self.without_model.items()):
             report.note(

@@ -117,8 +117,9 @@ def part_of(info: ModelInfo) -> Part:
             symmetries_continuous=info.symmetries_continuous,
             unit="mm",
         )
-    except UserError as error:  # of its size: BOP's files have one unit
-        allowed, fix = "a model in millimetres, as all of BOP's", "scale the model"
+    except UserError as error:  # of its size or its triangles; BOP's files have one unit
+        allowed = f"{error.allowed}, from a file in millimetres as all of BOP's"
+        fix = "correct the model, or convert its file to millimetres"
         raise UserError(f"{info.path}: {error.got}", allowed, fix) from error
     if abs(info.diameter - part.diameter) > _DIAMETER_TOLERANCE * part.diameter:
         _log.warning(

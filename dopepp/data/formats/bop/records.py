@@ -103,10 +103,17 @@ def read_cameras(
     return K, scales
 
 
-def pair_infos(
-    truths: Sequence[Record], infos: Sequence[Record], place: Place
-) -> list[Record | None]:
-    """Return one ``gt_info`` record for each of an image's objects, None where there is none."""
+def pair_infos(truths: Sequence[Record], stated: object, place: Place) -> list[Record | None]:
+    """Return one ``gt_info`` record for each of an image's objects, None where there is none.
+
+    ``stated`` is what its entry holds; null and an empty list state nothing, null in a list nothing
+    of one object.
+    """
+    if stated is None or stated == []:
+        return [None] * len(truths)
+    if isinstance(stated, list):
+        stated = [{} if one is None else one for one in stated]
+    infos = place.entries(stated)
     if len(infos) != len(truths):
         place.report(f"{len(infos)} objects", f"{len(truths)}, as many as have a pose")
     return [*infos[: len(truths)], *[None] * (len(truths) - len(infos))]
@@ -225,18 +232,19 @@ class SceneFolder:
 
     Attributes:
         files: File of every image, relative to the folder; empty where it is not on disk.
+        depth_files: File of every depth image likewise.
         depth_scales: Millimetres a unit of its depth image; NaN where not stated.
         first: Objects ``first[i] … first[i + 1] − 1`` are on image i.
         gt_ids: Each object's place in its image's list, which names its masks.
         num_other: Objects that are not of interest and have a model.
         without_model: How many objects of each number, not of interest, have no model.
         num_behind: Objects of interest behind the camera, left out like the others.
-        has_depth: Whether there are depth images.
     """
 
     folder: Path
     image_ids: Int[np.ndarray, " images"]
     files: list[str]
+    depth_files: list[str]
     K: Float[np.ndarray, "images 3 3"]
     depth_scales: Float[np.ndarray, " images"]
     first: Int[np.ndarray, " bounds"]
@@ -245,7 +253,6 @@ class SceneFolder:
     num_other: int
     without_model: Counter[int]
     num_behind: int
-    has_depth: bool
 
     def objects(self, image: int) -> range:
         """Return which objects are on an image."""
@@ -290,12 +297,12 @@ def read_scene(folder: Path, wanted: set[int], modelled: Collection[int] = ()) -
     is_wanted = np.isin(poses.obj_ids, sorted(wanted))
     is_behind = poses.T_cam_obj[:, 2, 3] <= 0
     keep = is_wanted & ~is_behind
-    files = image_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
     without_model = objects_without_model(poses.of(~is_wanted), modelled)
     return SceneFolder(
         folder,
         np.array(images, np.int64),
-        [files[i].relative_to(folder).as_posix() if i in files else "" for i in images],
+        _relative_files(folder, IMAGE_FOLDERS, IMAGE_SUFFIXES, images),
+        _relative_files(folder, ("depth",), DEPTH_SUFFIXES, images),
         K,
         scales,
         np.searchsorted(table[keep, 0], np.arange(len(images) + 1)),
@@ -304,8 +311,15 @@ def read_scene(folder: Path, wanted: set[int], modelled: Collection[int] = ()) -
         int((~is_wanted).sum()) - without_model.total(),
         without_model,
         int((is_wanted & is_behind).sum()),
-        bool(image_files(folder, ("depth",), DEPTH_SUFFIXES)),
     )
+
+
+def _relative_files(
+    folder: Path, folders: tuple[str, ...], suffixes: tuple[str, ...], images: Sequence[int]
+) -> list[str]:
+    """Return the file of every image, relative to the scene; empty where there is none."""
+    files = image_files(folder, folders, suffixes)
+    return [files[i].relative_to(folder).as_posix() if i in files else "" for i in images]
 
 
 def objects_without_model(poses: BopPoses, modelled: Collection[int]) -> Counter[int]:
@@ -319,28 +333,17 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     camera, gt, gt_info = (
         Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
     )
-    cameras, truths, infos = _by_image(camera), _objects(gt), _objects(gt_info, may_lack=True)
-    paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - truths.keys()}
-    for image, objects in truths.items():
-        stated = image in infos
-        place = gt_info[f"{image}"]
-        paired[image] = (
-            pair_infos(objects, infos[image], place) if stated else [None] * len(objects)
-        )
-    return SceneRecords(cameras, truths, paired)
+    cameras, truths, infos = _by_image(camera), _if_there(gt), _if_there(gt_info)
+    objects = {image: gt[f"{image}"].entries(rows) for image, rows in truths.items()}
+    paired: dict[int, list[Record | None]] = {image: [] for image in infos.keys() - objects.keys()}
+    for image, records in objects.items():
+        paired[image] = pair_infos(records, infos.get(image), gt_info[f"{image}"])
+    return SceneRecords(cameras, objects, paired)
 
 
-def _objects(place: Place, may_lack: bool = False) -> dict[int, list[Any]]:
-    """Return each image's list of records; nothing where there is no such file.
-
-    An image that ``may_lack`` them has none where its list is empty or null.
-    """
-    by_image = _by_image(place) if Path(place.path).exists() else {}
-    return {
-        image: place[f"{image}"].entries(rows)
-        for image, rows in by_image.items()
-        if not (may_lack and rows in (None, []))
-    }
+def _if_there(place: Place) -> dict[int, Any]:
+    """Return each image's entry; nothing where there is no such file."""
+    return _by_image(place) if Path(place.path).exists() else {}
 
 
 def _by_image(place: Place) -> dict[int, Any]:

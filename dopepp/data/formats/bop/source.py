@@ -202,7 +202,7 @@ class BopSource:
         instances = [self._instance(scene, k, path.stem, K, shape) for k in scene.objects(int(row))]
         if self._targets is not None:
             self._mark_wanted(instances, self._asked(scene, int(row)))
-        depth = self._depth(scene, int(row), path.stem, shape) if self._read_depth else None
+        depth = self._depth(scene, int(row), shape) if self._read_depth else None
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
 
@@ -228,12 +228,12 @@ class BopSource:
         fraction = float(poses.visible_fractions[k])
         return bop.make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
 
-    def _depth(self, scene: bop.SceneFolder, row: int, stem: str, shape: Shape) -> DepthMap | None:
+    def _depth(self, scene: bop.SceneFolder, row: int, shape: Shape) -> DepthMap | None:
         """Read the depth image; None in a scene without any."""
-        if not scene.has_depth:
+        if not any(scene.depth_files):
             return None
-        paths = [scene.folder / "depth" / f"{stem}{suffix}" for suffix in bop.DEPTH_SUFFIXES]
-        path = next((path for path in paths if path.exists()), paths[0])
+        missing = f"depth/{scene.image_ids[row]:06d}.png"
+        path = scene.folder / (scene.depth_files[row] or missing)
         scale = float(scene.depth_scales[row])
         return decode_depth(read_content(path), str(path), scale, shape)
 

@@ -184,9 +184,7 @@ class ShardRecords:
     @cached_property
     def infos(self) -> list[bop.Record | None]:
         """The ``gt_info`` record of each object, None where there is none."""
-        if self.json("gt_info") is None:
-            return [None] * len(self.truths)
-        return bop.pair_infos(self.truths, self._entries("gt_info"), self._member("gt_info"))
+        return bop.pair_infos(self.truths, self.json("gt_info"), self._member("gt_info"))
 
     def poses(self) -> bop.BopPoses:
         """Return the ground truth; empty where there is none."""

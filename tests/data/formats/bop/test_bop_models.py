@@ -201,3 +201,22 @@ def test_models_without_a_file_are_left_out_unless_they_are_asked_for(tmp_path, 
     (tmp_path / "models" / "obj_000002.ply").unlink()
     with pytest.raises(UserError, match=r"obj_000001.ply, no such file"):
         bop_parts(tmp_path)
+
+
+def test_a_model_in_another_unit_or_of_too_many_triangles_is_told_apart(tmp_path, monkeypatch):
+    write_models(tmp_path, [servoholder()])
+    path = tmp_path / "models" / "obj_000001.ply"
+    solid: Any = trimesh.creation.box((0.06, 0.04, 0.024))
+    solid.export(path)
+    with pytest.raises(UserError, match=r"5 mm – 5 m, from a file in millimetres") as error:
+        bop_parts(tmp_path)
+    assert "unit=" not in error.value.fix
+    solid.apply_scale(1000).export(path)
+    monkeypatch.setattr("dopepp.parts.part.MAX_FACES", 5)
+    monkeypatch.setattr("dopepp.parts.part.decimate", refuse)
+    with pytest.raises(UserError, match="allowed: up to 5 triangles"):
+        bop_parts(tmp_path)
+
+
+def refuse(*_: object) -> None:
+    raise ValueError("no larger triangles")

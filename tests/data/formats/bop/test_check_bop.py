@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from dopepp.data.check import check_dataset
 from dopepp.data.formats.bop.models import bop_parts
 from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.webdataset.source import WebdatasetSource
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
 
@@ -274,11 +275,17 @@ def test_private_ground_truth_and_missing_models_are_notes(bop):
     assert any("models_info.json" in note for note in report.notes)
 
 
+def first_null(infos: list[Any]) -> list[Any]:
+    return [None, *infos[1:]]
+
+
 NOTED = {
     "a rotation to a hundredth": ("gt:0.0.cam_R_m2c", times(1.004), "1 rotations are orthogonal"),
-    "an image without info": ("gt_info:1", None, "1 images without scene_gt_info.json"),
-    "no info at all": ("gt_info", None, "3 images without scene_gt_info.json"),
-    "an image of null info": ("gt_info:1", [], "1 images without scene_gt_info.json"),
+    "an image without info": ("gt_info:1", None, "2 objects without visib_fract"),
+    "no info at all": ("gt_info", None, "6 objects without visib_fract"),
+    "an image of empty info": ("gt_info:1", [], "2 objects without visib_fract"),
+    "an object of null info": ("gt_info:1", first_null, "1 objects without visib_fract"),
+    "an object of a box only": ("gt_info:0.0.visib_fract", None, "1 objects without visib_fract"),
     "a model missing": ("models/obj_000002.ply", None, "no file of object 2, left out"),
     "an object without a model": ("gt:0.0.obj_id", 9, "object 9 is annotated 1 times and has no"),
 }
@@ -296,7 +303,6 @@ def test_what_every_reader_copes_with_is_a_note(bop, name, spoilt):
 @pytest.mark.parametrize(
     "damage",
     [
-        ("gt_info:0.0.visib_fract", None),
         ("gt_info:0.1.visib_fract", 1.0000001),
         ("models:1.symmetries_discrete.0.0", times(1.004)),
     ],
@@ -310,6 +316,12 @@ def test_what_is_optional_or_rounded_is_taken_by_check_and_reader(bop, damage, s
     assert all(0 < fraction <= 1 for fraction in fractions)
     turn = parts[0].symmetries_discrete[0, :3, :3]
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+
+
+def test_pictures_and_depth_are_one_image_by_their_number(bop):
+    (bop / SCENE / "rgb" / "000001.png").rename(bop / SCENE / "rgb" / "1.png")
+    assert check_dataset(bop).ok
+    np.testing.assert_allclose(BopSource(bop, bop_parts(bop), "train_pbr").sample(1).depth, 0.4)
 
 
 def test_an_empty_folder_of_depth_is_none(bop):
@@ -385,6 +397,18 @@ LISTS = {
         *m, *((name.replace(FIRST, "9_9"), data) for name, data in shard_members(0).items())
     ],
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("stated", [[], [None, None]])
+def test_shards_may_state_no_visible_fraction(shards, stated, spoilt, write_shard):
+    write_shard(
+        shards / SHARD, in_first(spoilt, "gt_info.json", json.dumps(stated).encode()).items()
+    )
+    report = check_dataset(shards)
+    assert report.ok, report.lines()
+    assert any("2 objects without visib_fract" in note for note in report.notes)
+    source = WebdatasetSource(shards, bop_parts(shards), "train_pbr")
+    assert all(0 < one.visible_fraction <= 1 for one in source.sample(0).instances)
 
 
 def test_good_shards_are_clean(shards):
