@@ -14,7 +14,7 @@ from dopepp.experiment.build.parts import build_parts
 from dopepp.experiment.build.sources import share_in_words
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
-from dopepp.experiment.measurement import measure_and_record, refining
+from dopepp.experiment.measurement import measure_and_record, of_networks, refining
 from dopepp.experiment.reports.report import Report
 from dopepp.experiment.runs import display, record
 from dopepp.experiment.runs.images import warn_of_other_images
@@ -99,20 +99,20 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     if file is not None:  # BOP's file names begin with the method's
         others = [file.stem.partition("_")[0] if asked.method is None else str(asked.method)]
     names = _names(loaded, others)
+    files = {} if file is None else {names[-1]: file}
     reports = measure_and_record(
         dict(zip(names, loaded, strict=False)),
         parts,
         data,
         run_dir,
         asked.num_pictures,
-        results={} if file is None else {names[-1]: file},
+        results=files,
         bop_csv=asked.bop_csv,
         all_measures=asked.all_measures,
         protocols=asked.protocols,
         refine=asked.refine,
     )
-    own_reports = reports if file is None or not loaded else reports[:-1]
-    write_job_readme(run_dir, f"Evaluation of {measured}", own_reports[-1])
+    write_job_readme(run_dir, f"Evaluation of {measured}", of_networks(reports, len(files))[-1])
     return reports
 
 

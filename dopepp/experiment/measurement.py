@@ -84,7 +84,7 @@ def measure_and_record(
             display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
     _show_silence(methods, measured.silent, source)
     # What is compared later is the network's own result, unrefined; a file's where no network is.
-    own = measured.reports[: len(measured.reports) - len(files)] or measured.reports
+    own = of_networks(measured.reports, len(files))
     refines = refine is not None and bool(estimators)
     main = own[-2 if refines else -1]
     main.details.update(details or {})
@@ -111,6 +111,11 @@ def measure_and_record(
         conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
     display.show_files(run_dir)
     return measured.reports
+
+
+def of_networks(reports: list[Report], num_files: int) -> list[Report]:
+    """Return the estimators' reports of a measurement; the files' where there is no estimator."""
+    return reports[: len(reports) - num_files] or reports
 
 
 def with_refined(

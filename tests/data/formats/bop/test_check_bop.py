@@ -307,7 +307,7 @@ def test_what_every_reader_copes_with_is_a_note(bop, name, spoilt):
         ("models:1.symmetries_discrete.0.0", times(1.004)),
     ],
 )
-def test_what_is_optional_or_rounded_is_taken_by_check_and_reader(bop, damage, spoilt):
+def test_what_is_rounded_is_taken_by_check_and_reader(bop, damage, spoilt):
     spoil(bop, spoilt, *damage)
     assert check_dataset(bop).lines()[:-1] == []
     parts = bop_parts(bop)
