@@ -27,7 +27,7 @@ from pathlib import Path
 
 import torch
 
-import dopepp.experiment.train  # noqa: F401 -- the libraries, once
+import dopepp.experiment.run.train  # noqa: F401 -- the libraries, once
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets.preset import PRESETS

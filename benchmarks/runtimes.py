@@ -80,8 +80,8 @@ def untrained(model: str):
     """Return an untrained network in its full width."""
     import torch
 
-    from dopepp.experiment.build.parts import build_parts
-    from dopepp.experiment.build.system import build_untrained
+    from dopepp.experiment.assembly.parts import build_parts
+    from dopepp.experiment.assembly.system import build_untrained
 
     config = config_of(model)
     torch.manual_seed(0)

@@ -8,9 +8,9 @@ and is left out under one. In a process all take turns, frame by frame of the sa
 
 ``pivconnector`` is the released network of 128×128. The others are untrained, at 416×416, where a
 frame of 640×480 is 416×320: their maps are made, timed and put aside, and poses are recovered from
-the true maps with a trained network's noise (:mod:`dopepp.experiment.cost`); int8 is calibrated on
-random pixels. ``tracker`` follows a part through a rendered sequence (``benchmarks/track.py``) with
-the released ``pivconnector_wide``. Milliseconds; *CPU*, the process's time on all its threads, and
+the true maps with a trained network's noise (:mod:`dopepp.experiment.results.cost`); int8 is
+calibrated on random pixels. ``tracker`` follows a part through a rendered sequence
+(``benchmarks/track.py``) with the released ``pivconnector_wide``. Milliseconds; *CPU*, the process's time on all its threads, and
 the parts are 10th percentiles, which neighbours disturb least: with one thread they are about what
 an idle core takes.
 """
@@ -51,8 +51,8 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     import numpy as np
     import torch
 
-    from dopepp.experiment.build.parts import build_parts
-    from dopepp.experiment.build.system import build_untrained
+    from dopepp.experiment.assembly.parts import build_parts
+    from dopepp.experiment.assembly.system import build_untrained
     from dopepp.inference.export import EXPORTERS
     from dopepp.inference.runtimes.description import Export
     from dopepp.models.checkpoint.schema import load_network
@@ -85,7 +85,7 @@ class Side:
     def __init__(self, path: Path, tracked: bool) -> None:
         import torch
 
-        from dopepp.experiment.cost import RehearsedEstimator
+        from dopepp.experiment.results.cost import RehearsedEstimator
         from dopepp.inference import runtimes
         from dopepp.inference.estimator import PoseEstimator
         from dopepp.parts.catalogue import with_meshes
@@ -128,7 +128,7 @@ class Side:
         """Yield a prediction on one rendered scene after the other."""
         import torch
 
-        from dopepp.experiment.cost import likely_maps
+        from dopepp.experiment.results.cost import likely_maps
         from dopepp.maps.encode import MapGeometry
 
         own, generator = self.estimator, torch.Generator().manual_seed(0)

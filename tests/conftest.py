@@ -109,7 +109,7 @@ def call():
     def run(script: str, *arguments: str, code: int | None = None) -> Done:
         path, out, err, ended = str(ROOT / script), io.StringIO(), io.StringIO(), 0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("dopepp.experiment.train.PAPER_INPUT_SIZE", (64, 64))
+            patch.setattr("dopepp.experiment.run.train.PAPER_INPUT_SIZE", (64, 64))
             patch.setattr(sys, "argv", [path, *arguments])
             patch.setenv("HYDRA_FULL_ERROR", "1")  # the entry point sets it: undone here
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -65,7 +65,7 @@ def _pictures(
 ) -> list[tuple[Picture, CameraMatrix]]:
     """Return the pictures to look at, with their camera matrices."""
     from dopepp.drawing.pictures import read_photo
-    from dopepp.experiment.build.renders import validation_renders
+    from dopepp.experiment.assembly.renders import validation_renders
     from dopepp.geometry.camera import camera_matrix
 
     if image is not None and intrinsics is not None:

@@ -33,7 +33,7 @@ def compare(
 
     Runs that differ in their seed only are one method. Failed and unfinished runs are rows.
     """
-    from dopepp.experiment.reports.compare import compare_paths
+    from dopepp.experiment.results.compare import compare_paths
 
     with report_errors():
         typer.echo(compare_paths(runs, out, baseline, pictures, table))

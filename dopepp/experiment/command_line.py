@@ -27,8 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 import dopepp
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
-from dopepp.experiment.launch import remote
-from dopepp.experiment.runs import program
+from dopepp.experiment import program
+from dopepp.experiment.sweep import remote
 
 # The modules that load PyTorch are imported inside functions: a typo is told before.
 
@@ -76,7 +76,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
             # Hydra's own file may be cut in the middle; a resumed run's are kept once accepted.
             resumed = any(text.startswith("resume=") for text in hydra.overrides.task)
             if not resumed:
-                from dopepp.experiment.runs.resume import remember_overrides
+                from dopepp.experiment.run.resume import remember_overrides
 
                 remember_overrides(run_dir)
                 remote.remember_run(sys.argv[1:], run_dir)
@@ -104,7 +104,7 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 def _remove_unused(run_dir: Path) -> None:
     """Remove the folder of a refused run, unless it holds more than how it was started."""
-    from dopepp.experiment.runs import record
+    from dopepp.experiment.results import record
 
     names = {path.name for path in run_dir.iterdir()}
     if all(one in record.OF_THE_START or one.startswith(record.DIFFERENCE) for one in names):
@@ -115,9 +115,9 @@ def _remove_unused(run_dir: Path) -> None:
 
 def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
     """Run a job of a multirun, whose end stands in its folder."""
-    from dopepp.experiment.reports.report import Report
-    from dopepp.experiment.runs import display, record
-    from dopepp.experiment.runs.sweep import compare_jobs
+    from dopepp.experiment.results import display, record
+    from dopepp.experiment.results.report import Report
+    from dopepp.experiment.sweep.sweep import compare_jobs
     from dopepp.training.callbacks.trial import PrunedError
 
     for name in (record.FAILURE_FILE, record.PRUNED_FILE):  # of an attempt before this one
@@ -219,7 +219,7 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
     folder = words.get("hydra.run.dir", "")
     if not folder or words.get("resume", "null") not in ("", "null"):
         return
-    from dopepp.experiment.runs import record
+    from dopepp.experiment.results import record
 
     if Path(folder, record.VERSIONS_FILE).is_file() and remote.is_first_process():
         raise UserError(
@@ -234,7 +234,7 @@ def _resumed(arguments: list[str]) -> list[str]:
     runs = [text.partition("=")[2] for text in arguments if text.startswith("resume=")]
     if not runs or runs[-1] in ("", "null"):
         return arguments
-    from dopepp.experiment.runs.resume import read_overrides
+    from dopepp.experiment.run.resume import read_overrides
 
     run = Path(runs[-1])
     overrides = read_overrides(run)

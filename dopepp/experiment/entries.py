@@ -17,7 +17,7 @@ from hydra._internal.utils import _run_hydra, get_args_parser
 from omegaconf import DictConfig
 
 from dopepp.experiment.command_line import CONF, EVALUATION_SHORT_NAMES, SHORT_NAMES, entry, run_job
-from dopepp.experiment.launch import remote
+from dopepp.experiment.sweep import remote
 
 
 def train(config: DictConfig) -> float | None:
@@ -31,14 +31,14 @@ def evaluate(config: DictConfig) -> None:
 
 
 def _train(config: Mapping[str, Any], run_dir: Path) -> object:
-    from dopepp.experiment.train import do_job
+    from dopepp.experiment.run.train import do_job
 
     remote.quiet_lightning()
     return do_job(config, run_dir)
 
 
 def _evaluate(config: Mapping[str, Any], run_dir: Path) -> object:
-    from dopepp.experiment.evaluate import evaluate as measure
+    from dopepp.experiment.run.evaluate import evaluate as measure
 
     remote.quiet_lightning()
     return measure(config, run_dir)

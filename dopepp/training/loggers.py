@@ -1,6 +1,7 @@
 """Loggers that cannot end a run: a CSV table that is always on, and a guard around the others.
 
-To add a logger, a line in ``dopepp/experiment/build/registries.py`` and a file in ``conf/logger``.
+To add a logger: a line in ``dopepp/experiment/assembly/registries.py`` and a file in
+``conf/logger``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The network knows nothing of training and this module knows nothing of backbones or files: what can
 be swapped is handed in, built. To add a callback, one class in :mod:`dopepp.training.callbacks`, a
-line in ``dopepp/experiment/build/registries.py`` and an entry in ``conf/callbacks``.
+line in ``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/callbacks``.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class _RemoteLauncher(Launcher):
-    """Hands jobs to :mod:`dopepp.experiment.launch.jobs`, whose ``function`` gives the runner."""
+    """Hands jobs to :mod:`dopepp.experiment.sweep.jobs`, whose ``function`` gives the runner."""
 
     def __init__(self, function: str, *options: object) -> None:
         self.function, self.options = function, options
@@ -27,7 +27,7 @@ class _RemoteLauncher(Launcher):
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         """Run the jobs, numbered from ``initial_job_idx``, and wait for all."""
-        from dopepp.experiment.launch import jobs
+        from dopepp.experiment.sweep import jobs
 
         common = jobs.Jobs.of(self.hydra_context, self.config, self.task_function)
         runner = getattr(jobs, self.function)(*self.options)

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.reports.tables import read_csv
-from dopepp.experiment.runs.resume import read_overrides
+from dopepp.experiment.results.tables import read_csv
+from dopepp.experiment.run.resume import read_overrides
 from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.system import PoseSystem
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dopepp.experiment.runs import record
+from dopepp.experiment.results import record
 
 
 def test_the_same_command_twice_makes_two_folders(call, tiny, tmp_path):

@@ -42,9 +42,9 @@ import math, os, signal, time
 from pathlib import Path
 from types import SimpleNamespace
 import hydra, torch
-from dopepp.experiment.runs import record
+from dopepp.experiment.results import record
 from dopepp.experiment.command_line import entry, run_job
-from dopepp.experiment.build.registries import CALLBACKS
+from dopepp.experiment.assembly.registries import CALLBACKS
 from dopepp.training.callbacks.trial import raise_if_pruned
 
 EPOCHS = 4

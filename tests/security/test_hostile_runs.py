@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from dopepp.cli import app
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.runs.resume import read_overrides
+from dopepp.experiment.run.resume import read_overrides
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -12,8 +12,8 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.data import DataConfig, with_lens
 from dopepp.experiment.config.parse import Node, Range, Seed, parse, with_present_names
-from dopepp.experiment.reports.protocols import Protocols
-from dopepp.experiment.tuning import FalsePositiveTarget
+from dopepp.experiment.results.protocols import Protocols
+from dopepp.experiment.run.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.symmetry import SymmetryOptions
 
@@ -182,8 +182,8 @@ class RunConfig(MeasurementConfig):
         cost: Of ``job=cost``.
         lr_finder: Of ``job=lr_finder``.
         table: Of a multirun, how its table is laid out
-            (:class:`~dopepp.experiment.reports.paper_table.PaperTable`).
-        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.search`).
+            (:class:`~dopepp.experiment.results.paper_table.PaperTable`).
+        search: Of a multirun, what a search varies (:mod:`dopepp.experiment.sweep.search`).
         recipe: Name of the loss, optimiser and schedule that were chosen together.
         seed: Of initial weights, order and training images.
         compile: Whether to compile the network with torch.

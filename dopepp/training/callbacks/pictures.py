@@ -1,7 +1,8 @@
 """Pictures of every validation, as files in the run folder and in the loggers that take pictures.
 
 To draw another sheet of the first validation images, a subclass of :class:`ValidationSheet` with a
-``name`` and :meth:`~ValidationSheet.tiles`, a line in ``dopepp/experiment/build/registries.py`` and
+``name`` and :meth:`~ValidationSheet.tiles`, a line in
+``dopepp/experiment/assembly/registries.py`` and
 an entry in ``conf/callbacks``.
 """
 

@@ -11,13 +11,13 @@ from hydra.experimental.callback import Callback
 from hydra.utils import get_class
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build import registries
-from dopepp.experiment.build.parts import build_parts
-from dopepp.experiment.build.registries import SCHEDULERS, optimizer_factory, scheduler_factory
-from dopepp.experiment.build.sources import build_datamodule
-from dopepp.experiment.build.system import build_system, build_trainer
+from dopepp.experiment.assembly import registries
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.registries import SCHEDULERS, optimizer_factory, scheduler_factory
+from dopepp.experiment.assembly.sources import build_datamodule
+from dopepp.experiment.assembly.system import build_system, build_trainer
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.runs.tracking import tracked
+from dopepp.experiment.run.tracking import tracked
 from dopepp.models.registry import Registry
 from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
@@ -143,7 +143,7 @@ HOSTILE = (
     "os.system",
     "subprocess.Popen",
     "builtins.eval",
-    "dopepp.experiment.build.system.torch.hub.load",
+    "dopepp.experiment.assembly.system.torch.hub.load",
     "dopepp.models.spec.build_network",
     "dopepp.training.system.PoseSystem",
     "not_a_module.Thing",

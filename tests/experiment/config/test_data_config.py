@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build.sources import share_of
+from dopepp.experiment.assembly.sources import share_of
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
 from dopepp.models.checkpoint.schema import read

@@ -9,13 +9,13 @@ import pytest
 from hydra.utils import get_class
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.build.registries import AUGMENTATIONS, CALLBACKS, MASKINGS
+from dopepp.experiment.assembly.registries import AUGMENTATIONS, CALLBACKS, MASKINGS
 from dopepp.experiment.config.parse import FORMER_TARGETS, flat, with_present_names
 from dopepp.experiment.config.run import EvaluationConfig, RunConfig
-from dopepp.experiment.launch.remote import goes_on
-from dopepp.experiment.runs import record
-from dopepp.experiment.runs.resume import config_differences
-from dopepp.experiment.runs.sweep import CompareJobs
+from dopepp.experiment.results import record
+from dopepp.experiment.run.resume import config_differences
+from dopepp.experiment.sweep.remote import goes_on
+from dopepp.experiment.sweep.sweep import CompareJobs
 
 
 @pytest.mark.parametrize(

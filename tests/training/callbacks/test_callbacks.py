@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.reports.tables import read_csv
+from dopepp.experiment.results.tables import read_csv
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
 from dopepp.training.callbacks import throughput

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 from dopepp.core.errors import RunError, UserError
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.reports.tables import read_csv
+from dopepp.experiment.results.tables import read_csv
 from dopepp.training.callbacks.finite import FOLDER, FiniteSteps, check_state
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem

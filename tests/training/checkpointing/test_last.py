@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
-from dopepp.experiment.reports.tables import read_csv
+from dopepp.experiment.results.tables import read_csv
 from dopepp.training.callbacks.averaging import TRAINED, AveragedWeights
 from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import Throughput

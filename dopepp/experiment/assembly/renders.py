@@ -1,0 +1,130 @@
+"""From the ``data`` config to renders: those to learn, those held out, and their presets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import cache_folder
+from dopepp.data.sample import DescribedSource
+from dopepp.data.sources.rendered import CachedSource, RenderedSource, Split
+from dopepp.drawing.pictures import Size
+from dopepp.experiment.assembly.parts import build_negatives
+from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
+from dopepp.geometry.camera import Letterbox
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.parts.catalogue import with_meshes
+from dopepp.parts.part import Parts
+from dopepp.virtual.backgrounds import find_backgrounds
+from dopepp.virtual.factory import Factory, code_hash
+from dopepp.virtual.presets.preset import Preset, customised_preset
+
+
+def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
+    """Render at the size the network sees, which costs a fraction of the native one."""
+    factory = _factory(data, parts, seen_preset(data), seed, data.virtual.renderer)
+    source = RenderedSource(factory, data.samples_per_epoch)
+    return kept(source, data, data.cache, data.network_input)
+
+
+def validation_windows(data: DataConfig, parts: Parts) -> DescribedSource:
+    """Render the validation images of a camera of the user's own as training sees them."""
+    factory = _factory(data, parts, seen_preset(data), data.eval_seed, data.virtual.renderer)
+    return RenderedSource(factory, data.num_val, "val")
+
+
+def held_out_renders(
+    data: DataConfig, parts: Parts, split: Split, scale: float = 1.0
+) -> DescribedSource:
+    """Render a range that no other split uses, at its native size, with parts of any scale."""
+    renderer, count = data.virtual.renderer, data.num_val
+    cache: Cache = "none"
+    if split == "test":
+        renderer, count, cache = data.test.renderer or renderer, data.num_test, data.test.cache
+    factory = _factory(data, parts, choose_preset(data), data.eval_seed, renderer)
+    name = "virtual" if renderer == "raster" else renderer
+    return kept(RenderedSource(factory, count, split, name, scale), data, cache, None)
+
+
+def scaled_test_renders(data: DataConfig, parts: Parts, scale: float) -> DescribedSource:
+    """Build the test scenes, which must be renders, with a camera so many times as near."""
+    if not data.is_rendered("test"):
+        raise UserError(
+            f"scale={scale:g} on the images in data.root={data.root}",
+            "renders, whose camera can be moved",
+            "leave out scale, or test on renders of these objects with data.test.renderer=raster",
+        )
+    return held_out_renders(data, parts, "test", scale)
+
+
+def empty_renders(data: DataConfig, parts: Parts, split: Split, num_images: int) -> DescribedSource:
+    """Render a held-out range without the objects: what the network must be silent on."""
+    scene = {**(data.virtual.scene or {}), "targets_per_image": [0, 0]}
+    virtual = replace(data.virtual, scene=scene)
+    empty = replace(data, virtual=virtual, num_val=num_images, num_test=num_images)
+    return held_out_renders(empty, parts, split)
+
+
+def validation_renders(
+    checkpoint: Checkpoint, path: Path, count: int, size: Size | None = None
+) -> DescribedSource:
+    """Render a checkpoint's parts, by the meshes in it, as its validation images are rendered.
+
+    The other models of the data set it was trained for are not shown: that may be on another
+    machine. The path is for messages. ``size`` is the pictures' (width, height), pixels, instead of
+    their own; those of a camera that the checkpoint was trained for keep theirs.
+    """
+    data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
+    virtual = replace(data.virtual, preset=_preset_name(data))
+    data = replace(data, root=None, objects=None, virtual=virtual, num_val=count)
+    if size is not None and data.virtual.view is None:
+        scene = {**(data.virtual.scene or {}), "width": size[0], "height": size[1]}
+        data = replace(data, virtual=replace(data.virtual, scene=scene))
+    return held_out_renders(data, with_meshes(checkpoint.parts), "val")
+
+
+def kept(
+    source: DescribedSource, data: DataConfig, cache: Cache, input_size: tuple[int, int] | None
+) -> DescribedSource:
+    """Put the chosen cache around a source; a :class:`UserError` where there is no room."""
+    if cache == "none":
+        return source
+    folder = None
+    if cache == "disk":
+        folder = cache_folder() / "renders" if data.cache_dir is None else Path(data.cache_dir)
+    return CachedSource(source, input_size, folder, identity=code_hash())
+
+
+def choose_preset(data: DataConfig) -> Preset:
+    """Return the preset with the config's changes, at the size of a camera's whole pictures."""
+    preset, view = _customised(data), data.virtual.view
+    return preset if view is None else view.whole(preset, data.virtual.camera_scale or 1.0)
+
+
+def seen_preset(data: DataConfig) -> Preset:
+    """Return the same scenes as the network sees them: resized, or in windows of such pictures."""
+    preset, view = _customised(data), data.virtual.view
+    if view is not None:
+        return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
+    box = Letterbox.fit((preset.width, preset.height), data.network_input)
+    return preset.resized(box.width, box.height)
+
+
+def _customised(data: DataConfig) -> Preset:
+    return customised_preset(_preset_name(data), data.virtual.scene or {})
+
+
+def _preset_name(data: DataConfig) -> str:
+    return data.virtual.preset or ("paper" if data.root is None else "ycb")
+
+
+def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:
+    return Factory(
+        parts,
+        preset,
+        seed,
+        find_backgrounds(data.virtual.backgrounds),
+        renderer=renderer,
+        negatives=build_negatives(data, parts),
+    )

@@ -1,0 +1,221 @@
+"""From the ``data`` config to the DataModule, and to what each split shows.
+
+A split's images are labelled ones in a format of the field, or renders. To add a format, write a
+source and an entry in :data:`FORMATS`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from dopepp.core.errors import UserError
+from dopepp.core.futures import available_cores
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.ycb_video.frame import read_image_set
+from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.sample import DescribedSource
+from dopepp.data.sources.hybrid import HybridSource
+from dopepp.data.sources.rendered import RenderedSource, Split
+from dopepp.data.sources.windowed import WindowedSource
+from dopepp.experiment.assembly.registries import AUGMENTATIONS, JITTERS, MASKINGS, build_optional
+from dopepp.experiment.assembly.renders import (
+    held_out_renders,
+    kept,
+    training_renders,
+    validation_windows,
+)
+from dopepp.experiment.config.data import DataConfig
+from dopepp.geometry.camera import Letterbox
+from dopepp.parts.part import Parts
+from dopepp.virtual.backgrounds import Backgrounds, find_backgrounds
+
+_log = logging.getLogger(__name__)
+
+_TRAINING_SHARE: Final = 0.8
+"""Of the images of a folder that training shares with validation or test."""
+
+
+def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModule:
+    """Build training, validation and test data and say in one line where real frames are missing.
+
+    The seed is that of the training images; the others have ``data.eval_seed``. A
+    :class:`UserError` tells which option or file is wrong.
+    """
+    backgrounds = find_backgrounds(data.virtual.backgrounds)
+    return PoseDataModule(
+        train=_train_source(data, parts, seed, backgrounds),
+        val=_validation_source(data, parts),
+        test=held_out_source(data, parts, "test"),
+        object_names=[part.name for part in parts],
+        input_size=data.network_input,
+        batch_size=data.batch_size,
+        num_workers=available_cores() if data.num_workers is None else data.num_workers,
+        seed=seed,
+        jitter=build_optional(JITTERS, data.jitter),
+        masking=build_optional(MASKINGS, data.masking),
+        augment=build_optional(AUGMENTATIONS, data.augment),
+        backgrounds=backgrounds,
+    )
+
+
+def _validation_source(data: DataConfig, parts: Parts) -> DescribedSource:
+    """Build the validation images as the network sees them while it trains.
+
+    In a camera of its own, these are windows; all others who measure take the whole pictures.
+    """
+    source = held_out_source(data, parts, "val")
+    if data.virtual.view is None or not isinstance(source, RenderedSource):
+        return source
+    return validation_windows(data, parts)
+
+
+def held_out_source(data: DataConfig, parts: Parts, split: Split) -> DescribedSource:
+    """Build the validation or the test images alone, at their native resolution.
+
+    They are labelled ones where there is a root, else a range of renders that no other uses; so
+    is validation where the labelled images show no object and all can be rendered, which the log
+    says.
+    """
+    if data.is_rendered(split):
+        return held_out_renders(data, parts, split)
+    labelled = labelled_images(data, parts, data.eval_seed, split)
+    seen = split == "test" or any(labelled.contains(part.name) for part in parts)
+    if seen or any(part.mesh is None for part in parts):
+        return labelled
+    _log.warning(
+        "%s shows none of %s: validation is on renders, as with data.image_sets.val=null",
+        labelled.name, ", ".join(part.name for part in parts),
+    )  # fmt: skip
+    return held_out_renders(data, parts, split)
+
+
+def _train_source(
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
+) -> DescribedSource:
+    """Mix real frames, their synthetic companions and renders."""
+    real, synthetic = None, None
+    if data.root is not None and data.real_fraction > 0:
+        real = _real_frames(data, parts, seed)
+    elif data.real_fraction > 0:
+        if data.real_fraction == 1:
+            raise UserError(
+                f"data={data.name} without data.root",
+                f"a folder of {data.format}: only labelled images were asked for",
+                "set data.root, or train on renders with data=virtual",
+            )
+        _log.warning(
+            "no real images were given (data.root is not set): the real share is 0, "
+            "training on renders of %s",
+            ", ".join(part.name for part in parts),
+        )
+    if data.root is not None and data.synthetic_fraction > 0 and data.real_fraction < 1:
+        synthetic = synthetic_companions(data, parts, seed, backgrounds)
+    virtual = None if data.real_fraction == 1 else training_renders(data, parts, seed)
+    return HybridSource(
+        real,
+        virtual,
+        data.real_fraction if real is not None else 0.0,
+        data.samples_per_epoch,
+        seed,
+        synthetic,
+        data.synthetic_fraction,
+        name=data.name,
+    )
+
+
+def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
+    """Open the labelled images as the network sees them: in a camera of its own, windows."""
+    frames, view = labelled_images(data, parts, seed, "train"), data.virtual.view
+    if view is None:
+        return kept(frames, data, data.cache, data.network_input)
+    box = Letterbox.scaled(view.size, data.virtual.camera_scale or 1.0)
+    picture = box.width, box.height
+    whole = kept(frames, data, data.cache, picture)
+    return WindowedSource(whole, picture, data.network_input, seed)
+
+
+def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
+    """Open a split's labelled images; a :class:`UserError` if ``data.root`` does not hold them."""
+    assert data.root is not None
+    if data.format not in FORMATS:
+        formats = ", ".join(FORMATS)
+        raise UserError(f"data.format={data.format}", formats, "choose the images' format")
+    return FORMATS[data.format](data, data.root, parts, seed, split)
+
+
+def synthetic_companions(
+    data: DataConfig, parts: Parts, seed: int, backgrounds: Backgrounds
+) -> DescribedSource | None:
+    """Open YCB-Video's own synthetic frames where its training list names any."""
+    if data.root is None or data.format != "ycb_video":
+        return None
+    image_set = data.image_sets["train"]
+    if image_set is None or not read_image_set(data.root, image_set, "synthetic"):
+        return None
+    return YcbVideoSource(
+        data.root, parts, image_set, "synthetic",
+        backgrounds=backgrounds, seed=seed, read_depth=False,
+    )  # fmt: skip
+
+
+def share_of(image_sets: Mapping[str, str | None], split: Split) -> tuple[float, float]:
+    """Return the range of its folder's images that a split takes, as fractions.
+
+    A folder that several splits name is divided in order (training, validation, test): 80 % to
+    training if it is among them, the rest equally.
+    """
+    sharing = [name for name in ("train", "val", "test") if image_sets[name] == image_sets[split]]
+    first = _TRAINING_SHARE if sharing[0] == "train" and len(sharing) > 1 else 1 / len(sharing)
+    borders = [0.0, first]
+    for number in range(1, len(sharing)):
+        borders.append(first + (1 - first) * number / (len(sharing) - 1))
+    place = sharing.index(split)
+    return borders[place], borders[place + 1]
+
+
+Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
+"""From data, root, parts, seed and split to the split's images."""
+
+FORMATS: Final[dict[str, Opener]] = {
+    # An image set of real frames, or the listed frames, the same for every split.
+    "ycb_video": lambda data, root, parts, seed, split: YcbVideoSource(
+        root, parts, data.image_set(split) if data.frames is None else None,
+        frames=data.frames, seed=seed, read_depth=split == "test",
+    ),
+    "bop": lambda data, root, parts, seed, split: BopSource(
+        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
+        targets=data.targets if split == "test" else None, read_depth=split == "test",
+    ),
+    "ndds": lambda data, root, parts, seed, split: NddsSource(
+        root / data.image_set(split), parts, part_of=share_of(data.image_sets, split),
+        classes=data.classes, read_depth=split == "test",
+    ),
+    "webdataset": lambda data, root, parts, seed, split: WebdatasetSource(
+        root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
+        download_dir=data.download_dir, read_depth=split == "test",
+    ),
+}  # fmt: skip
+"""How the images of each format are opened."""
+
+
+def share_in_words(data: DataConfig) -> str | None:
+    """Say it where the test is only a share of the images in its folder; None where it is all."""
+    if data.is_rendered("test") or data.format == "ycb_video":
+        return None
+    first, last = share_of(data.image_sets, "test")
+    if last - first == 1:
+        return None
+    folder = data.image_sets["test"]
+    sharing = [name for name in ("train", "val") if data.image_sets[name] == folder]
+    all_of_it = " ".join(f"data.image_sets.{name}=none" for name in sharing)
+    return (
+        f"measured is the last {last - first:.0%} of the images in {folder}, because "
+        f"data.image_sets names it for {' and '.join(sharing)} as well: {all_of_it} measures all "
+        "of it, training images included, and data.image_sets.test=FOLDER another one"
+    )

@@ -1,0 +1,358 @@
+"""Conditions that make a test set harder or easier, level by level: shading and scale.
+
+Shading (paper Table 3) covers more and more of every object, scale (paper Fig. 11) moves the camera
+nearer or farther. A condition leaves a table, a CSV file, curves and examples.
+
+To add one, describe it as a :class:`Condition` and write a function that measures a list of
+:class:`Level`; :func:`record_condition` writes it down.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import compress
+from operator import attrgetter
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_csv, write_png, write_whole
+from dopepp.data.sample import Sample, Source
+from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
+from dopepp.drawing.curves import figure_image, rates_figure
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.experiment.results import display, tables
+from dopepp.experiment.results.evaluators import FileMethod, Method, image_id
+from dopepp.experiment.results.report import Measured, Report, accumulators, measure
+from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
+from dopepp.metrics.row import PoseRow
+
+_log = logging.getLogger(__name__)
+
+MAX_EXAMPLES: Final = 4
+"""Images on the sheet of examples; each is shown once per level."""
+
+_FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
+"""Measures that stand beside the pass rates."""
+
+_MARGIN: Final = 0.3
+"""Around shaded objects on the sheet, as a share of their extent."""
+
+_NOTABLE: Final = 0.05
+"""A change of the mean visible fraction that is worth a line."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What changes from level to level, and how its levels are shown.
+
+    Attributes:
+        name: The option's name; the files are called after it.
+        axis: What is changed, with the unit in which levels are shown.
+        level: Name of the CSV file's column of levels.
+        form: How a level is written in that unit.
+        images: What the images of its levels are, of which a file has no poses.
+        per_unit: By what a level is multiplied to have that unit.
+        ratio: Whether levels are ratios, which a logarithmic axis spaces evenly.
+    """
+
+    name: str
+    axis: str
+    level: str
+    form: str
+    introduction: str
+    images: str
+    per_unit: float = 1.0
+    ratio: bool = False
+
+    @property
+    def table_file(self) -> str:
+        """Name of the CSV file."""
+        return f"{self.name}.csv"
+
+    def heading(self, level: float) -> str:
+        """Return what stands above a level's column."""
+        return self.form.format(self.per_unit * level)
+
+    def check_methods(self, methods: Mapping[str, Method]) -> None:
+        """Refuse files of poses: a method must be able to run on other images."""
+        for name, method in methods.items():
+            if isinstance(method, FileMethod):
+                raise UserError(
+                    f"{self.name} with results of {name}, which has no poses on {self.images}",
+                    "checkpoints (ckpt_path, baseline)", f"leave out {self.name} or results",
+                )  # fmt: skip
+
+
+SHADING: Final = Condition(
+    name="shading",
+    axis="share of the visible area covered (%)",
+    level="share",
+    form="{:g} %",
+    introduction="""# Shading
+
+Columns: the share of every object's visible pixels that patches of the image's own background
+cover (paper Table 3). What counts is decided before the shading.""",
+    images="images with patches",
+    per_unit=100,
+)
+
+SCALE: Final = Condition(
+    name="scale",
+    axis="how many times as large the parts appear",
+    level="scale",
+    form="×{:g}",
+    introduction="""# Scale
+
+Columns: how many times as large the parts appear as in the test set (paper Fig. 11). The scenes are
+those of the test set; the camera moves along its ray to the parts and divides their distance by so
+much. An instance counts by what is visible of it from there, at least 10 %.""",
+    images="images from elsewhere",
+    ratio=True,
+)
+
+
+@dataclass(frozen=True)
+class Level:
+    """What was measured at one level: a row per object and their mean, by method.
+
+    Facts are further columns of the CSV file, over all objects; ``note`` is what a reader must know
+    of this level, empty for nothing.
+    """
+
+    value: float
+    rows: Mapping[str, Mapping[str, PoseRow]]
+    facts: Mapping[str, float | None] = field(default_factory=dict)
+    note: str = ""
+
+
+def record_condition(
+    run_dir: Path,
+    condition: Condition,
+    levels: Sequence[Level],
+    tiles: Sequence[Tile],
+    rates: Sequence[tables.PassRate],
+) -> None:
+    """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
+
+    Levels ascend; tiles are the examples, image by image, each at all levels.
+    """
+    rows = [row for rows in levels[0].rows.values() for row in rows.values()]
+    extra = ["median_rotation_s_deg"] if any(row.num_symmetries > 1 for row in rows) else []
+    fields = [*(rate.field for rate in rates), *_FIELDS, *extra]
+    table = list(_figures(levels, fields, rates))
+
+    def cells(one: tables.Figure) -> tables.Row:
+        return {**one.names, condition.heading(one.condition): one.text}
+
+    shown, sections = [], []
+    for name in fields:
+        rows_of_it = tables.pivot(
+            tables.select(table, measure=name), attrgetter("method", "object"), cells
+        )
+        shown += [{"measure": tables.heading(name), **row} for row in rows_of_it]
+        sections.append(f"## {tables.heading(name)}\n\n{tables.markdown_text(rows_of_it)}")
+    display.show_table(f"{condition.name}: {condition.axis}", shown, num_labels=3)
+    notes = [level.note for level in levels if level.note]
+    for line in notes:
+        _log.warning("%s", line)
+    records = tables.pivot(
+        table,
+        attrgetter("method", "object", "condition"),
+        lambda one: {**one.names, condition.level: one.condition, one.measure: one.value},
+    )
+    write_csv(run_dir / condition.table_file, records)
+    text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
+    write_whole(run_dir / f"{condition.name}.md", text.encode())
+    _draw(run_dir / f"{condition.name}.png", condition, table, rates)
+    if tiles:
+        sheet = contact_sheet(tiles, columns=len(levels))
+        write_png(run_dir / f"{condition.name}_examples.png", sheet)
+
+
+def _figures(
+    levels: Sequence[Level], fields: Sequence[str], rates: Sequence[tables.PassRate]
+) -> Iterator[tables.Figure]:
+    """Return what was measured, by method, object and level."""
+    rated = [rate.field for rate in rates]
+    for method, rows in levels[0].rows.items():
+        for name in tables.shown_rows(rows):
+            for level in levels:
+                row = level.rows[method][name]
+                for fact, known in level.facts.items():
+                    yield tables.Figure(method, name, fact, known, level.value)
+                for column in ("num_instances", *fields):
+                    num = row.num_instances if column in rated else 0
+                    value = getattr(row, column)
+                    yield tables.Figure(method, name, column, value, level.value, num_instances=num)
+
+
+def _draw(
+    path: Path,
+    condition: Condition,
+    table: Sequence[tables.Figure],
+    rates: Sequence[tables.PassRate],
+) -> None:
+    """Draw a panel per object and rate, in each every method that was measured on it."""
+    panels = {}
+    for name in dict.fromkeys(one.object for one in table if one.object != MEAN):
+        for rate in rates:
+            measured = tables.select(table, object=name, measure=rate.field)
+            curves = tables.rate_curves(measured, condition.per_unit)
+            shown = {method: curve for method, curve in curves.items() if len(curve.x)}
+            panels[f"{name}: {rate.title}"] = shown
+    figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
+    write_png(path, figure_image(figure))
+
+
+def check_masks(source: Source) -> None:
+    """Read images until one has an instance mask; a :class:`UserError` if none has.
+
+    So it shows before anything takes time whether there is something to shade.
+    """
+    for index in range(len(source)):
+        if any(one.mask is not None and one.mask.any() for one in source.sample(index).instances):
+            return
+    raise UserError(
+        f"shading on {source.name}, {len(source):,} images without an instance mask",
+        "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
+        "choose such data, or leave out shading",
+    )
+
+
+def measure_shading(
+    methods: Mapping[str, Method],
+    source: Source,
+    shares: Sequence[float],
+    seed: int,
+    unmasked: Sequence[Report],
+    num_examples: int = MAX_EXAMPLES,
+) -> tuple[list[Level], list[Tile]]:
+    """Measure every method at every share of the visible area of every instance, without 0.
+
+    The ground truth is that of the image as it came: an instance counts by what is visible of it
+    before the shading, or heavy shading would drop out of the measurement. ``seed`` is of the
+    patches, ``unmasked`` what was measured at 0.
+
+    Returns what was measured at 0 and at every share, and the examples, image by image.
+    """
+    metrics = {share: accumulators(methods) for share in shares}
+    reached: dict[float, list[float]] = {share: [] for share in shares}
+    tiles: list[Tile] = []
+    for index in range(len(source)):
+        sample = source.sample(index)
+        counts = [one.visible_fraction >= MIN_VISIBLE_FRACTION for one in sample.instances]
+        shaded = shade(sample, shares, seed, index)
+        for one in shaded:
+            known = [np.nan if share is None else share for share in one.reached]
+            reached[one.share] += compress(known, counts)
+            for name, method in methods.items():
+                poses, _ = method.detect(one.sample, image_id(sample, index))
+                metrics[one.share][name].update(poses, sample.instances, sample.K, sample.size[0])
+        num_shown = len(tiles) // (len(shares) + 1)
+        if num_shown < min(num_examples, MAX_EXAMPLES) and any(counts):
+            tiles += _examples(sample, shaded)
+    rows = {report.name: report.rows for report in unmasked}
+    unshaded = Level(0.0, rows, {"share_reached": 0.0, "num_outside_tolerance": 0})
+    return [unshaded, *(_shaded(share, metrics[share], reached[share]) for share in shares)], tiles
+
+
+def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[float]) -> Level:
+    """Sum up, and say how many instances are not shaded as much as they should be."""
+    # A share that is not known (NaN) is near no other.
+    outside = [one for one in reached if not abs(one - share) <= TOLERANCE]
+    known = [one for one in reached if np.isfinite(one)]
+    facts = {
+        "share_reached": float(np.mean(known)) if known else None,
+        "num_outside_tolerance": len(outside),
+    }
+    note = (
+        f"At {SHADING.heading(share)}, {len(outside)} of {len(reached)} instances are not within "
+        f"{100 * TOLERANCE:g} points of it: no mask, or no background to cover them with."
+    )
+    rows = {name: one.compute() for name, one in metrics.items()}
+    return Level(share, rows, facts, note if outside else "")
+
+
+def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
+    """Return the objects as they came and at every share, captioned with the shares reached."""
+    place = _around_masks(sample)
+    tiles = [Tile(sample.image[place], f"{sample.key}: unmasked")]
+    for one in shaded:
+        known = [f"{100 * r:.1f}" for r in sorted(r for r in one.reached if r is not None)]
+        covered = " … ".join(dict.fromkeys([*known[:1], *known[-1:]])) or "nothing"
+        caption = f"{SHADING.heading(one.share)} (reached {covered})"
+        tiles.append(Tile(one.sample.image[place], caption))
+    return tiles
+
+
+def _around_masks(sample: Sample) -> tuple[slice, slice]:
+    """Return the image's rows and columns around all masks, with a margin."""
+    masks = [one.mask for one in sample.instances if one.mask is not None]
+    shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
+    ranges = []
+    for places in np.nonzero(shown if shown.any() else ~shown):
+        first, end = int(places.min()), int(places.max()) + 1
+        margin = round(_MARGIN * (end - first))
+        ranges.append(slice(max(0, first - margin), end + margin))
+    return ranges[0], ranges[1]
+
+
+def measure_scales(
+    methods: Mapping[str, Method],
+    sources: Mapping[float, Source],
+    unmoved: Measured,
+    num_examples: int = MAX_EXAMPLES,
+) -> tuple[list[Level], list[Tile]]:
+    """Measure every method at every scale; sources are the test set at every scale but 1.
+
+    Returns what was measured, by ascending scale, and the examples, image by image.
+    """
+    num_examples = min(num_examples, MAX_EXAMPLES)
+    measured = {1.0: unmoved}
+    for scale, source in sources.items():
+        samples = (source.sample(index) for index in range(len(source)))
+        measured[scale] = measure(methods, samples, num_examples)
+    in_order = dict(sorted(measured.items()))
+    levels = [_scale_level(scale, one, unmoved) for scale, one in in_order.items()]
+    pictures = zip(*(one.tiles[:num_examples] for one in in_order.values()), strict=True)
+    tiles = [
+        replace(tile, caption=f"{tile.caption}, {SCALE.heading(scale)}")
+        for same_scene in pictures
+        for scale, tile in zip(in_order, same_scene, strict=True)
+    ]
+    return levels, tiles
+
+
+def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
+    """Sum up, and say where the instances are not those of the test set or less is in sight."""
+    rows = {report.name: report.rows for report in measured.reports}
+    visible, usual = _visible_fractions(measured), _visible_fractions(unmoved)
+    mean = float(visible.mean()) if len(visible) else None
+    others = len(visible) != len(usual)
+    note = (
+        f"Instances that count at {SCALE.heading(scale)}: {_in_words(visible)}; "
+        f"at {SCALE.heading(1)}: {_in_words(usual)}."
+        if others or (mean is not None and abs(mean - usual.mean()) > _NOTABLE)
+        else ""
+    )
+    return Level(scale, rows, {"visible_fraction": mean}, note)
+
+
+def _in_words(visible_fractions: Float[np.ndarray, "n"]) -> str:
+    number = len(visible_fractions)
+    if not number:
+        return "none"
+    return f"{number}, of which {100 * visible_fractions.mean():.0f} % is in sight on average"
+
+
+def _visible_fractions(measured: Measured) -> Float[np.ndarray, "n"]:
+    """Return those of all instances that count; the last method scores all objects."""
+    metrics = next(reversed(measured.metrics.values()))
+    gathered = [metrics.instances(name).visible_fractions for name in metrics.parts]
+    return np.concatenate([fractions.numpy() for fractions in gathered])

@@ -1,0 +1,281 @@
+"""``job=cost``: what a network costs in parameters, operations and time (paper Tables 4 and 8).
+
+Nothing is trained. A frame goes the whole way of
+:meth:`~dopepp.inference.estimator.PoseEstimator.predict`, from a picture of the configured data's
+test set at its own resolution to poses. An untrained network finds nothing, and nothing would take
+no time. So the network's own maps are made, timed and put aside, and poses are recovered from what
+a trained network would answer: the true maps of the picture's objects, with noise
+(:data:`BELIEF_NOISE`).
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import nn
+
+from dopepp.core.files import write_csv, write_png
+from dopepp.data.batch import collate
+from dopepp.data.sample import Sample, pad_sample, resize_sample
+from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
+from dopepp.experiment.assembly.camera import fitted_to_camera
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.experiment.assembly.system import build_untrained, map_geometry
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.results import display, record
+from dopepp.experiment.results.readme import write_job_readme
+from dopepp.experiment.results.tables import read_csv
+from dopepp.geometry.camera import Letterbox
+from dopepp.inference.estimator import Maps, PoseEstimator
+from dopepp.inference.picture import letterboxed
+from dopepp.maps.encode import MapGeometry
+from dopepp.models.network import network_cost
+from dopepp.training.targets import draw_maps
+
+COST_FILE: Final = "cost.json"
+FRAMES_FILE: Final = "frames.csv"
+
+NOTE: Final = (
+    "ms/frame: the whole way from a test picture to poses. The network is untrained and would find "
+    "nothing, so poses are recovered from the picture's true maps with a trained network's noise."
+)
+"""What a reader of the times must know."""
+
+BELIEF_NOISE: Final = 0.005
+FIELD_NOISE: Final = 0.05
+"""Standard deviations, cell by cell, of what is added to true maps. Recovery then takes as long as
+on the maps of the three released networks, within about a tenth: 7 to 8 peaks an image, there 9
+(``benchmarks/decode.py``). The 0.02 of the crowds in ``benchmarks/recovery.py`` is no trained
+network's: it fills every channel with peaks, 144 an image, and takes nearly twice as long."""
+
+WARM_UP: Final = 3
+"""Passes that allocate memory, choose kernels and compile; they are not timed."""
+
+_NUM_PICTURES: Final = 8
+_BATCHES: Final = 3
+
+
+@dataclass(frozen=True)
+class NetworkCost:
+    """What a network costs on this machine; sizes are (width, height), pixels.
+
+    Attributes:
+        backbone_weights: Weights of the backbone's convolutions, as the paper counts: no biases.
+        gmacs: Multiply-accumulates of one image of the input size, 10⁹.
+        picture_size: The timed pictures'; they are scaled into the input and padded no further than
+            the network needs.
+        threads: CPU threads.
+        ms_per_frame: Median time from one picture to its poses, milliseconds; in it
+            ``network_ms`` and, from maps to poses, ``recovery_ms``.
+        frames_per_s: Images of the input size that the network alone turns into maps in a second
+            in batches of ``batch_size``, the fastest of a few.
+    """
+
+    name: str
+    backbone_weights: int
+    parameters: int
+    gmacs: float
+    input_size: tuple[int, int]
+    picture_size: tuple[int, int]
+    device: str
+    threads: int
+    ms_per_frame: float
+    network_ms: float
+    recovery_ms: float
+    batch_size: int
+    frames_per_s: float
+
+    def texts(self) -> dict[str, str]:
+        """Return what tables print, heading to text."""
+        (width, height), (columns, rows) = self.picture_size, self.input_size
+        return {
+            "picture": f"{width}×{height}",
+            "input": f"{columns}×{rows}",
+            "CPU threads": str(self.threads),
+            "backbone weights": f"{self.backbone_weights:,}",
+            "parameters": f"{self.parameters:,}",
+            "GMACs": f"{self.gmacs:.3f}",
+            "ms/frame": f"{self.ms_per_frame:.1f}",
+            "of these, the network": f"{self.network_ms:.1f}",
+            "of these, maps to poses": f"{self.recovery_ms:.1f}",
+            f"network alone, frames/s in batches of {self.batch_size}": f"{self.frames_per_s:.1f}",
+        }
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """Seconds that frames took, in their order, from picture to poses.
+
+    In them are those of the network, from the resized picture to maps, and those from maps to
+    poses; the rest resizes and pads.
+    """
+
+    seconds: Float[np.ndarray, "frames"]
+    network_seconds: Float[np.ndarray, "frames"]
+    recovery_seconds: Float[np.ndarray, "frames"]
+
+
+class RehearsedEstimator(PoseEstimator):
+    """An estimator that runs its network and then goes on with maps that it was given.
+
+    ``answer`` is what the next prediction recovers poses from, on the estimator's device. The
+    network was last given a picture, and its maps were there, at these seconds of ``perf_counter``.
+    """
+
+    answer: Maps
+    network_began: float
+    network_ended: float
+
+    def maps(self, image: UInt8[np.ndarray, "height width 3"]) -> Maps:
+        """Run the network on the image and return the answer in place of its maps."""
+        self.network_began = time.perf_counter()
+        super().maps(image)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # else the network would still be at work
+        self.network_ended = time.perf_counter()
+        return self.answer
+
+
+def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
+    """Count and time the chosen network, untrained; write ``cost.json`` and the frames' times."""
+    torch.manual_seed(config.seed)
+    has_gpu = torch.cuda.is_available() and config.trainer.accelerator != "cpu"
+    parts = build_parts(config.data)
+    config = fitted_to_camera(config, parts)
+    network, description = build_untrained(config, parts)
+    parameters, gmacs = network_cost(network, description.input_size)
+    source = held_out_source(config.data, parts, "test")
+    # Read or rendered now, so that no frame's time has that in it.
+    samples = [source.sample(index) for index in range(min(_NUM_PICTURES, len(source)))]
+    estimator = RehearsedEstimator(network, description, "cuda" if has_gpu else "cpu")
+    geometry = map_geometry(config.maps, network.stride)
+    frames = time_frames(estimator, samples, geometry, config.cost.num_frames, config.seed)
+    convolutions = [one for one in network.backbone.modules() if isinstance(one, nn.Conv2d)]
+    cost = NetworkCost(
+        name=config.model.name,
+        backbone_weights=sum(one.weight.numel() for one in convolutions),
+        parameters=parameters,
+        gmacs=gmacs,
+        input_size=description.input_size,
+        picture_size=samples[0].size,
+        device=torch.cuda.get_device_name() if has_gpu else platform.machine(),
+        threads=torch.get_num_threads(),
+        ms_per_frame=1000 * float(np.median(frames.seconds)),
+        network_ms=1000 * float(np.median(frames.network_seconds)),
+        recovery_ms=1000 * float(np.median(frames.recovery_seconds)),
+        batch_size=config.cost.batch_size,
+        frames_per_s=_frames_per_s(estimator, config.cost.batch_size, description.input_size),
+    )
+    record.write_config(run_dir, config.plain)
+    record.write_json(run_dir / COST_FILE, asdict(cost))
+    record.write_json(run_dir / record.VERSIONS_FILE, record.environment(config.seed, ""))
+    rows = [
+        {
+            "frame": number,
+            **{name: f"{values[number]:.6f}" for name, values in vars(frames).items()},
+        }
+        for number in range(len(frames.seconds))
+    ]
+    write_csv(run_dir / FRAMES_FILE, rows)
+    save_frame_rates(run_dir / "frame_rate.png", {cost.name: frames})
+    write_job_readme(run_dir, f"Cost of {cost.name}")
+    display.show_table(
+        f"{cost.name}, untrained, on {cost.device}",
+        [{"measure": measure, "": text} for measure, text in cost.texts().items()],
+    )
+    display.console.print(NOTE)
+    return cost
+
+
+def time_frames(
+    estimator: RehearsedEstimator,
+    samples: Sequence[Sample],
+    geometry: MapGeometry,
+    num_frames: int,
+    seed: int,
+) -> FrameTimes:
+    """Time frames from picture to poses, after :data:`WARM_UP` that are not timed.
+
+    Pictures are taken in turn. Geometry and seed are of the maps that a trained network would
+    answer and of their noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    rehearsed = [(one, likely_maps(one, estimator, geometry, generator)) for one in samples]
+    rows = []
+    for sample, estimator.answer in islice(cycle(rehearsed), WARM_UP + num_frames):
+        began = time.perf_counter()
+        estimator.predict(sample.image, sample.K, cropped=True)
+        ended = time.perf_counter()
+        network = estimator.network_ended - estimator.network_began
+        rows.append((ended - began, network, ended - estimator.network_ended))
+    return FrameTimes(*np.array(rows[WARM_UP:]).T)
+
+
+def likely_maps(
+    sample: Sample, estimator: PoseEstimator, geometry: MapGeometry, generator: torch.Generator
+) -> Maps:
+    """Return the maps that a trained network would answer to a picture: the true ones, with noise.
+
+    They are those of the estimator's input, and on its device.
+    """
+    size = estimator.checkpoint.input_size
+    letterbox = Letterbox.fit(sample.size, size)
+    rows, columns, _ = letterboxed(sample.image, letterbox, estimator.network.size_multiple).shape
+    seen = pad_sample(resize_sample(sample, size), (columns, rows))
+    batch = collate([seen], {part.name: number for number, part in enumerate(estimator.parts)})
+    true = draw_maps(batch, batch.keypoints, len(estimator.parts), geometry)
+    belief, field = (
+        (one[0] + noise * torch.randn(one[0].shape, generator=generator)).to(estimator.device)
+        for one, noise in zip(true, (BELIEF_NOISE, FIELD_NOISE), strict=True)
+    )
+    return belief, field
+
+
+def read_frames(path: Path) -> FrameTimes:
+    """Return what each frame of a cost job took; earlier versions timed the network alone."""
+    rows = read_csv(path)
+    whole = np.array([float(row["seconds"]) for row in rows])
+    network = np.array([float(row.get("network_seconds", row["seconds"])) for row in rows])
+    recovery = np.array([float(row.get("recovery_seconds", 0)) for row in rows])
+    return FrameTimes(whole, network, recovery)
+
+
+def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
+    """Draw frames a second over time into a PNG, two curves per network (paper Fig. 13).
+
+    One is from picture to poses, the dashed one what the network alone would reach.
+    """
+    lines = []
+    for number, (name, times) in enumerate(frames.items()):
+        at, colour = np.cumsum(times.seconds), f"C{number}"
+        whole, alone = 1 / times.seconds[None], 1 / times.network_seconds[None]
+        lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
+        lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
+    write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
+
+
+@torch.inference_mode()
+def _frames_per_s(estimator: PoseEstimator, batch_size: int, size: tuple[int, int]) -> float:
+    """Return what the network alone reaches in the fastest of some passes over random images."""
+    device = estimator.device
+    shape = (batch_size, 3, size[1], size[0])
+    images = torch.randint(0, 256, shape, dtype=torch.uint8, device=device)
+    images = images.contiguous(memory_format=torch.channels_last)
+    times = []
+    for _ in range(WARM_UP + _BATCHES):
+        start = time.perf_counter()
+        estimator.network.maps(images)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        times.append(time.perf_counter() - start)
+    return batch_size / min(times[WARM_UP:])

@@ -1,0 +1,110 @@
+"""What a person sees in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, JustifyMethod
+from rich.table import Table
+from rich.text import Text
+from rich.tree import Tree
+
+from dopepp.data.sample import SourceInfo
+from dopepp.experiment.results.report import Report
+from dopepp.experiment.results.tables import header_of
+from dopepp.experiment.run.tuning import Tuning
+from dopepp.metrics.row import shown_columns
+
+# Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
+# overrides, paths and messages hold square brackets of their own.
+console = Console(highlight=False, markup=False, width=None if Console().is_terminal else 180)
+
+
+def show_config(config: Mapping[str, Any]) -> None:
+    """Print the composed config as a tree."""
+    tree = Tree(Text("config", style="bold"))
+    _branch(tree, config)
+    console.print(tree)
+
+
+def _branch(tree: Tree, config: Mapping[str, Any]) -> None:
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            _branch(tree.add(Text(str(key), style="bold")), value)
+        else:
+            tree.add(f"{key}: {value!r}", style="default")
+
+
+def show_sources(sources: Sequence[tuple[str, SourceInfo]]) -> None:
+    """Print where the images of each split come from and how many each source gives."""
+    table = Table("split", "source", "images", "per epoch", "instances", title="data")
+    for split, info in sources:
+        instances = ", ".join(f"{name} {count:,}" for name, count in info.num_instances.items())
+        per_epoch = info.num_images if info.num_per_epoch is None else info.num_per_epoch
+        counts = (f"{info.num_images:,}", f"{per_epoch:,}")
+        table.add_row(split, info.name, *counts, instances or "in every render")
+    console.print(table)
+
+
+def show_report(report: Report, all_measures: bool = False) -> None:
+    """Print a table per object: a line per measure, the reference rows beside the estimate.
+
+    ``all_measures`` adds the symmetric measures of a part without symmetries.
+    """
+    for name, (row, *references) in report.tables.items():
+        if row.num_instances == 0:
+            absent = "n/a, no ground truth in the test set"
+            console.print(f"{name}: {absent}; {row.false_positives} false positives")
+            continue
+        table = Table("", title=f"{name}: {report.num_images} test images")
+        for one in (row, *references):
+            table.add_column(one.method, justify="right", style="bold" if one is row else "dim")
+        for _, columns in groupby(shown_columns(row, all_measures), attrgetter("group")):
+            for column in columns:
+                table.add_row(column.heading, *map(column.text, (row, *references)))
+            table.add_section()
+        console.print(table)
+
+
+def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 1) -> None:
+    """Print rows by heading, the first columns of words, the others of numbers.
+
+    The columns are those of the fullest row; a row may lack some.
+    """
+    table = Table(title=title)
+    header = header_of(rows)
+    for number, heading in enumerate(header):
+        justify: JustifyMethod = "left" if number < num_labels else "right"
+        table.add_column(heading, justify=justify, overflow="fold")
+    for row in rows:
+        table.add_row(*(row.get(heading, "") for heading in header))
+    console.print(table)
+
+
+def show_tuning(tuning: Tuning, path: Path) -> None:
+    """Print what tuning changed, measured on test images, and where the checkpoint is."""
+    shown, empty = tuning.num_images
+    title = f"tuned; measured on {shown} test images and {empty} without objects"
+    table = Table("", "before", "after", title=title)
+    for name, before in vars(tuning.before).items():
+        after = getattr(tuning.after, name)
+        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
+    console.print(table)
+    for name, value in tuning.options.items():
+        console.print(f"recovery.{name}: {value:.4g}")
+    console.print(f"tuned checkpoint {path}")
+
+
+def show_files(run_dir: Path) -> None:
+    """Print what a run folder holds."""
+    table = Table("file", "bytes")
+    for path in sorted(run_dir.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(run_dir).parts)
+        if path.is_file() and not hidden:
+            table.add_row(str(path.relative_to(run_dir)), f"{path.stat().st_size:,}")
+    console.print(f"run folder {run_dir}", soft_wrap=True)
+    console.print(table)

@@ -1,0 +1,286 @@
+"""What an evaluation measures beside the test set as it is: shading, scale, and rates per bin.
+
+Rates per bin of a quantity, such as the distance, tell where a method fails. To add a quantity,
+write a function of the instances of one object and name it in :data:`QUANTITIES`. To add a
+protocol, give :class:`Protocols` its option, write a module that measures and records it, and call
+that in :func:`dopepp.experiment.results.measurement.measure_and_record`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from dopepp.core.checks import check_integer
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_csv, write_png
+from dopepp.drawing.curves import figure_image, rates_figure
+from dopepp.experiment.results import display, tables
+from dopepp.geometry.camera import project_keypoints
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
+from dopepp.metrics.row import finite_median
+
+_log = logging.getLogger(__name__)
+
+_MAX_SCALE: Final = 20.0
+"""Twenty times as near or as far."""
+
+Values = Float[np.ndarray, "n"]
+"""A number of each of n instances."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What instances are sorted by: its name and unit, its value of each, digits in tables."""
+
+    heading: str
+    of: Callable[[Gathered], Values]
+    decimals: int
+
+
+def distances(instances: Gathered) -> Values:
+    """Return the distance from the camera to the centre of the cuboid, metres."""
+    return np.asarray(np.linalg.norm(_centres(instances), axis=1))
+
+
+def visible_fractions(instances: Gathered) -> Values:
+    """Return the visible share of the silhouette, in [0, 1]."""
+    return np.asarray(instances.visible_fractions.numpy())
+
+
+def sizes(instances: Gathered) -> Values:
+    """Return the root of the area of the projected cuboid, pixels of the image as it came.
+
+    The whole cuboid counts, with what is hidden or outside the image; unlike the distance it says
+    when a flat part is seen from its edge.
+    """
+    areas = []
+    for T, K in zip(instances.T_gt.numpy(), instances.K.numpy(), strict=True):
+        corners = project_keypoints(instances.part.cuboid, T, K)[:CENTROID]
+        # A corner behind the camera has no projection.
+        corners = corners[np.isfinite(corners).all(axis=1)].astype(np.float32)
+        areas.append(cv2.contourArea(cv2.convexHull(corners)) if len(corners) > 2 else 0.0)
+    return np.sqrt(np.array(areas, np.float64))
+
+
+def view_angles(instances: Gathered) -> Values:
+    """Return the angle between the object's +z axis and the way from it to the camera, degrees.
+
+    At 0° the +z face of the cuboid looks at the camera, at 90° it is seen from its edge.
+    """
+    towards_camera, axes = -_centres(instances), instances.T_gt.numpy()[:, :3, 2]
+    across = np.linalg.norm(np.cross(axes, towards_camera), axis=1)
+    return np.asarray(np.degrees(np.arctan2(across, (axes * towards_camera).sum(axis=1))))
+
+
+def _centres(instances: Gathered) -> Float[np.ndarray, "n 3"]:
+    """Return the centres of the cuboids in the camera frame, metres."""
+    T = instances.T_gt.numpy()
+    return np.asarray(T[:, :3, :3] @ instances.part.cuboid[CENTROID] + T[:, :3, 3])
+
+
+QUANTITIES: Final[dict[str, Quantity]] = {
+    "distance": Quantity("distance (m)", distances, 3),
+    "visibility": Quantity("visible fraction", visible_fractions, 3),
+    "size": Quantity("apparent size (px)", sizes, 1),
+    "rotation": Quantity("view angle (°)", view_angles, 1),
+}
+"""What rates can be broken down by."""
+
+
+def bin_numbers(values: Values, num_bins: int) -> Int[np.ndarray, "n"]:
+    """Return each value's bin, counted from 0; bins have equal counts, equal values share one.
+
+    A value falls where the middle of its ranks does, so that a bin of many equal values (objects
+    that nothing hides) draws no others in. Bins that stay empty are left out.
+    """
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    middles = np.cumsum(counts) - counts / 2
+    bins = np.floor(middles * num_bins / max(len(values), 1)).astype(int)
+    return np.asarray(np.unique(bins, return_inverse=True)[1][place])
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The instances between two values of a quantity, over the whole test set.
+
+    ``middle`` is their median, which no other bin has.
+    """
+
+    low: float
+    high: float
+    middle: float
+
+
+def break_down(
+    metrics: Mapping[str, PoseMetrics],
+    quantity: str,
+    num_bins: int,
+    rates: Sequence[tables.PassRate],
+) -> tuple[list[Bin], list[tables.Figure]]:
+    """Measure rates per bin, over the instances of all objects together.
+
+    Of the accumulators of the methods on one test set, the last one scores all objects, and its
+    instances decide the bins.
+
+    Returns:
+        The bins, in ascending order, and bin by bin what each method reaches in them: how many
+        instances, the rates, the median rotation of those that were matched (degrees, to the
+        nearest symmetry) and the share that was missed. A figure's condition is its bin's middle.
+    """
+    gathered = {name: [one.instances(part) for part in one.parts] for name, one in metrics.items()}
+    values = {
+        name: np.concatenate([QUANTITIES[quantity].of(one) for one in own])
+        for name, own in gathered.items()
+    }
+    everything = next(reversed(values.values()))
+    numbers = bin_numbers(everything, num_bins)
+    groups = [everything[numbers == number] for number in range(int(numbers.max(initial=-1)) + 1)]
+    bins = [Bin(float(one.min()), float(one.max()), float(np.median(one))) for one in groups]
+    table = [
+        figure
+        for one in bins
+        for name, own in gathered.items()
+        for figure in _in_bin(one, name, values[name], own, rates)
+    ]
+    return bins, table
+
+
+def _in_bin(
+    one: Bin,
+    method: str,
+    values: Values,
+    gathered: Sequence[Gathered],
+    rates: Sequence[tables.PassRate],
+) -> Iterator[tables.Figure]:
+    """Measure one method in one bin; a rate of no instance does not exist."""
+    chosen = torch.from_numpy((values >= one.low) & (values <= one.high))
+    num = int(chosen.sum())
+    rotations = torch.cat([own.errors.rotation_s_deg for own in gathered])[chosen]
+    yield tables.Figure(method, MEAN, "num_instances", num, one.middle)
+    for rate in rates:
+        passed = torch.cat([rate.passed(own) for own in gathered])[chosen]
+        value = int(passed.sum()) / num if num else None
+        yield tables.Figure(method, MEAN, rate.field, value, one.middle, num_instances=num)
+    yield tables.Figure(method, MEAN, "median_rotation_deg", finite_median(rotations), one.middle)
+    missed = float((~rotations.isfinite()).double().mean()) if num else None
+    yield tables.Figure(method, MEAN, "miss_rate", missed, one.middle)
+
+
+def record_breakdown(
+    run_dir: Path,
+    metrics: Mapping[str, PoseMetrics],
+    quantity: str,
+    num_bins: int,
+    rates: Sequence[tables.PassRate],
+) -> None:
+    """Print a table and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``; see :func:`break_down`.
+
+    A test set without an instance that counts gives a warning instead.
+    """
+    bins, table = break_down(metrics, quantity, num_bins, rates)
+    if not bins:
+        _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
+        return
+    what = QUANTITIES[quantity]
+    by_middle = {one.middle: one for one in bins}
+
+    def shown(one: tables.Figure) -> tables.Row:
+        own = by_middle[one.condition]
+        ends = dict.fromkeys(f"{end:.{what.decimals}f}" for end in (own.low, own.high))
+        row = {what.heading: " … ".join(ends)}
+        if one.measure == "num_instances":
+            return {**row, one.heading: one.text}
+        if one.measure == "miss_rate":
+            return row
+        prefix = f"{one.method} " if len(metrics) > 1 else ""
+        interval = [f"{100 * end:.0f}" for end in one.interval or ()]
+        text = f"{one.text} [{', '.join(interval)}]" if interval else one.text
+        return {**row, f"{prefix}{one.heading}": text}
+
+    def record(one: tables.Figure) -> dict[str, object]:
+        own = by_middle[one.condition]
+        row = {"method": one.method, "from": own.low, "to": own.high, "median": own.middle}
+        ends = (f"{one.measure}_low", f"{one.measure}_high")
+        return {**row, one.measure: one.value, **dict(zip(ends, one.interval or (), strict=False))}
+
+    rows = tables.pivot(table, attrgetter("condition"), shown)
+    display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
+    records = tables.pivot(table, attrgetter("condition", "method"), record)
+    path = run_dir / f"by_{quantity}"
+    write_csv(path.with_suffix(".csv"), records)
+    panels = {
+        rate.title: tables.rate_curves(tables.select(table, measure=rate.field)) for rate in rates
+    }
+    # Between two bins lie no instances; the line stands in the middle of the gap.
+    gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]
+    edges = np.array([bins[0].low, *gaps, bins[-1].high])
+    figure = rates_figure(panels, what.heading, len(rates), edges)
+    write_png(path.with_suffix(".png"), figure_image(figure))
+
+
+@dataclass(frozen=True)
+class Protocols:
+    """The protocols asked for.
+
+    Attributes:
+        shading: Shares of every object's visible area to cover, ascending, without 0.
+        scales: How many times as large the parts are to appear, ascending, without 1.
+        by: Quantities over which rates are broken down.
+        num_bins: Bins of each.
+    """
+
+    shading: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()
+    by: tuple[str, ...] = ()
+    num_bins: int = 5
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Protocols:
+        """Read the options, of which a training has no scales; one may be a :class:`UserError`."""
+        shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
+        bounds = (1 / _MAX_SCALE, _MAX_SCALE)
+        factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
+        return cls(
+            shading=_levels("shading", config["shading"], (0, 1), 0, shares),
+            scales=_levels("scale", config.get("scale_factors"), bounds, 1, factors),
+            by=_quantities(config["by"]),
+            num_bins=check_integer("num_bins", config["num_bins"], 1, 1000),
+        )
+
+    def __bool__(self) -> bool:
+        """Tell whether there is any."""
+        return bool(self.shading or self.scales or self.by)
+
+
+def _levels(
+    option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
+) -> tuple[float, ...]:
+    """Read one level or several; the usual one, the images as they are, is measured anyway."""
+    levels = [] if given is None else given if isinstance(given, list) else [given]
+    numbers = [one for one in levels if isinstance(one, int | float) and not isinstance(one, bool)]
+    wrong = len(numbers) < len(levels) or not all(bounds[0] <= one <= bounds[1] for one in numbers)
+    if wrong or (given is not None and all(one == usual for one in numbers)):
+        raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
+    return tuple(sorted({float(one) for one in numbers if one != usual}))
+
+
+def _quantities(given: object) -> tuple[str, ...]:
+    """Read ``by``: one quantity or several."""
+    names = [] if given is None else given if isinstance(given, list) else [given]
+    wrong = [name for name in names if not isinstance(name, str) or name not in QUANTITIES]
+    if wrong or (given is not None and not names):
+        allowed = f"one or more of {', '.join(QUANTITIES)}"
+        raise UserError(f"by={given!r:.100}", allowed, "change by")
+    return tuple(dict.fromkeys(str(name) for name in names))

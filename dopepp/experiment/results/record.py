@@ -1,0 +1,165 @@
+"""What a run leaves behind so that it can be understood and repeated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+import yaml
+
+import dopepp
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_whole
+from dopepp.core.futures import cpu_fact
+from dopepp.core.json import read_json as read_strict_json
+from dopepp.experiment import program
+from dopepp.training.checkpointing.files import BEST, FOLDER, LAST
+from dopepp.virtual.factory import code_hash
+
+CONFIG_FILE: Final = "config.yaml"
+VERSIONS_FILE: Final = "versions.json"
+METRICS_FILE: Final = "metrics.json"
+FAILURE_FILE: Final = "failed.json"
+PRUNED_FILE: Final = "pruned.json"
+OBJECTIVE: Final = "objective"
+"""Key of ``metrics.json``: the validation value that the best checkpoint was chosen by."""
+OVERRIDES_FILE: Final = Path(".hydra", "resume.json")
+OF_THE_START: Final = frozenset({".hydra", CONFIG_FILE, VERSIONS_FILE, "README.md"})
+"""What a run folder holds before anything is done, but for the working tree's difference."""
+DIFFERENCE: Final = "working_tree_"
+"""How the name of that file begins."""
+BEST_CHECKPOINT: Final = Path(FOLDER, BEST)
+LAST_CHECKPOINT: Final = Path(FOLDER, LAST)
+
+_MAX_DIFF_BYTES: Final = 10_000_000
+"""Of a larger difference to the last commit only the hash is kept."""
+_MAX_UNTRACKED: Final = 100
+
+
+def write_config(run_dir: Path, config: Mapping[str, Any]) -> None:
+    """Write the resolved config."""
+    text = yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
+    write_whole(run_dir / CONFIG_FILE, text.encode())
+
+
+def write_json(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record as JSON, whole; values JSON has no word for are an error."""
+    write_whole(path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON record of a run folder.
+
+    A :class:`UserError`: the file is missing or no JSON object.
+    """
+    try:
+        record = read_strict_json(path)
+    except UserError as error:
+        allowed = "a file written by a run"
+        raise UserError(f"{error.got}, unreadable", allowed, "check the run folder") from error
+    if not isinstance(record, dict):
+        raise UserError(f"{path} with a {type(record).__name__}", "a JSON object", "check the file")
+    return record
+
+
+def write_environment(
+    run_dir: Path, seed: int, data_fingerprint: str, changes: Sequence[str] = ()
+) -> None:
+    """Write what a run is made with; a run that goes on keeps what it was made with before.
+
+    ``changes`` are those of its config since it was begun or last resumed.
+    """
+    path = run_dir / VERSIONS_FILE
+    earlier: list[object] = []
+    if path.is_file():
+        before = read_json(path)
+        past = before.pop("earlier", [])
+        earlier = [*(past if isinstance(past, list) else []), before]
+    present = environment(seed, data_fingerprint)
+    diff = _git("diff", "--binary", "HEAD")
+    if present["git"] is not None and diff:
+        digest = hashlib.sha256(diff).hexdigest()
+        present["git"]["diff_sha256"] = digest
+        if len(diff) <= _MAX_DIFF_BYTES:
+            present["git"]["diff"] = f"{DIFFERENCE}{digest[:8]}.diff"
+            write_whole(run_dir / present["git"]["diff"], diff)
+    write_json(path, {**present, "changes": list(changes), "earlier": earlier})
+
+
+def environment(seed: int, data_fingerprint: str) -> dict[str, Any]:
+    """Describe program, packages, working tree, hardware, seed, data and the moment."""
+    return {
+        "dopepp": dopepp.__version__,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {
+            name: one.version
+            for one in sorted(distributions(), key=lambda one: str(one.name).lower())
+            if isinstance(name := one.name, str)
+        },
+        "git": _git_state(),
+        "hardware": _hardware(),
+        "command": program.command(),
+        "seed": seed,
+        "data_fingerprint": data_fingerprint,
+        "rendering_code": code_hash(),
+    }
+
+
+def _hardware() -> dict[str, Any]:
+    return {
+        "processor": cpu_fact("model name") or platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_bytes": _memory_bytes(),
+        "gpus": [
+            {"name": gpu.name, "memory_bytes": gpu.total_memory}
+            for gpu in map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
+        ],
+        "cuda": torch.version.cuda,
+    }
+
+
+def _memory_bytes() -> int | None:
+    """Return the machine's memory, where the system tells."""
+    names = getattr(os, "sysconf_names", {})
+    if "SC_PHYS_PAGES" not in names or "SC_PAGE_SIZE" not in names:
+        return None
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _git(*arguments: str) -> bytes | None:
+    """Return what git says where the package is; None where it refuses, or is not installed."""
+    command = ["git", "-C", str(Path(dopepp.__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, check=True, capture_output=True, timeout=10).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git_state() -> dict[str, Any] | None:
+    """Return the commit the package was run from and how its files differ; None outside git.
+
+    A package that is installed below somebody's own repository is not part of it.
+    """
+    is_part = _git("ls-files", "--error-unmatch", "__init__.py") is not None
+    commit, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    if not is_part or commit is None or status is None:
+        return None
+    lines = status.decode(errors="replace").splitlines()
+    untracked = [line[3:] for line in lines if line.startswith("??")]
+    return {
+        "commit": commit.decode().strip(),
+        "dirty": bool(lines),
+        "untracked": untracked[:_MAX_UNTRACKED],
+    }

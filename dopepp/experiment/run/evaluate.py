@@ -1,0 +1,148 @@
+"""What ``evaluate.py`` does: measure checkpoints and files of poses, or tune a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.sources import share_in_words
+from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
+from dopepp.experiment.config.run import EvaluationConfig
+from dopepp.experiment.results import display, record
+from dopepp.experiment.results.measurement import measure_and_record, of_networks, refining
+from dopepp.experiment.results.readme import write_job_readme
+from dopepp.experiment.results.report import Report
+from dopepp.experiment.run.images import warn_of_other_images
+from dopepp.experiment.run.tuning import FalsePositiveTarget, tune, write_tuned
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.runtimes import is_export
+from dopepp.models.network import PoseNetwork
+from dopepp.parts.part import Part, Parts
+
+
+def tune_and_record(
+    estimator: PoseEstimator,
+    path: Path,
+    parts: Parts,
+    data: DataConfig,
+    run_dir: Path,
+    target: FalsePositiveTarget,
+) -> Path:
+    """Tune a checkpoint (:func:`tune`), write it beside the old one, tell; return its path."""
+    tuning = tune(estimator, data, parts, target)
+    tuned = write_tuned(estimator.checkpoint, path, tuning.options)
+    record.write_json(run_dir / "tuning.json", asdict(tuning))
+    display.show_tuning(tuning, tuned)
+    return tuned
+
+
+def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:
+    """Return the last estimator's parts as the test data have them; without one, all of these."""
+    if not estimators:
+        return build_parts(data)
+    names = [part.name for part in estimators[-1].parts]
+    if data.root is not None and data.objects is None:
+        data = replace(data, objects=tuple(names))
+    available = {part.name: part for part in build_parts(data)}
+    missing = [name for name in names if name not in available]
+    if missing:
+        raise UserError(
+            f"test data without {', '.join(missing)}, which the checkpoint was trained on",
+            ", ".join(names),
+            "point data.root or data.parts to data of these objects",
+        )
+    return [available[name] for name in names]
+
+
+def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
+    """Parse ``evaluate.py``'s composed config and measure what it names on a test set.
+
+    That is a checkpoint, a file of another method's poses, or both; the test set is the
+    checkpoint's own one or another one. A :class:`UserError` tells what of it is wrong.
+    """
+    asked = EvaluationConfig.of(config)
+    if asked.ckpt_path is None and asked.results is None:
+        allowed = "ckpt_path=… or results=… on the command line"
+        raise UserError("no ckpt_path", allowed, "add what is to be measured")
+    paths = [path for path in (asked.baseline, asked.ckpt_path) if path is not None]
+    if asked.refine is not None and not paths:
+        allowed = "refine=… of a checkpoint: a file's poses are measured as they are"
+        raise UserError(f"refine={asked.refine} without ckpt_path", allowed, "leave refine out")
+    device = asked.device
+    if device == "auto":
+        exported = any(is_export(Path(path)) for path in paths)
+        device = "cuda" if torch.cuda.is_available() and not exported else "cpu"
+    loaded = [PoseEstimator.load(path, device) for path in paths]
+    own = loaded[-1].checkpoint if loaded else None
+    measured = str(asked.results if own is None else paths[-1])
+    stored = None if own is None else trained_on(own.data)
+    data = chosen_data(asked.data, asked.virtual, stored, measured)
+    record.write_config(run_dir, asked.plain)
+    record.write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
+    parts = parts_of(loaded, data)
+    share = share_in_words(data)
+    if share is not None:
+        display.console.print(share)
+    if own is not None:
+        warn_of_other_images(own, data, parts)
+    if asked.tune:
+        _tune_only(asked, loaded, parts, data, run_dir)
+        return []
+    file = None if asked.results is None else Path(asked.results)
+    others = []
+    if file is not None:  # BOP's file names begin with the method's
+        others = [file.stem.partition("_")[0] if asked.method is None else str(asked.method)]
+    names = _names(loaded, others)
+    files = {} if file is None else {names[-1]: file}
+    reports = measure_and_record(
+        dict(zip(names, loaded, strict=False)),
+        parts,
+        data,
+        run_dir,
+        asked.num_pictures,
+        results=files,
+        bop_csv=asked.bop_csv,
+        all_measures=asked.all_measures,
+        protocols=asked.protocols,
+        refine=asked.refine,
+    )
+    write_job_readme(run_dir, f"Evaluation of {measured}", of_networks(reports, len(files))[-1])
+    return reports
+
+
+def _tune_only(
+    asked: EvaluationConfig,
+    loaded: Sequence[PoseEstimator],
+    parts: Parts,
+    data: DataConfig,
+    run_dir: Path,
+) -> None:
+    """Tune the one checkpoint and measure nothing else."""
+    if asked.protocols:
+        raise UserError(
+            "tune=true with shading, scale or by", "one of the two", "tune first, then measure"
+        )
+    if asked.ckpt_path is None or len(loaded) > 1:
+        allowed = "one ckpt_path, and no baseline"
+        raise UserError("tune=true", allowed, "tune one checkpoint at a time")
+    if not isinstance(loaded[0].network, PoseNetwork):
+        fix = "tune the checkpoint, then export the tuned one"
+        raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)
+    estimator = refining(loaded[0], asked.refine, parts)
+    tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
+    display.show_files(run_dir)
+
+
+def _names(loaded: Sequence[PoseEstimator], others: Sequence[str]) -> list[str]:
+    """Return the methods' names; of two with one name, the first is called the baseline."""
+    names = [str(one.checkpoint.data.get("name", "estimate")) for one in loaded] + list(others)
+    for number, name in enumerate(names[:-1]):
+        if name in names[number + 1 :]:
+            names[number] += " (baseline)" if number == 0 else " (checkpoint)"
+    return names

@@ -1,0 +1,174 @@
+"""Exporting a checkpoint: made, quantised on renders, measured, checked, and only then written."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import draft
+from dopepp.data.sample import Sample, Source
+from dopepp.experiment.assembly.renders import validation_renders
+from dopepp.experiment.config.data import trained_on
+from dopepp.experiment.program import typed
+from dopepp.experiment.results.evaluators import EstimatorMethod
+from dopepp.experiment.results.report import measure
+from dopepp.inference import runtimes
+from dopepp.inference.agreement import Agreement, compare
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.export import EXPORTERS, PRECISIONS, check_possible
+from dopepp.inference.picture import letterboxed
+from dopepp.inference.runtimes.description import Export
+from dopepp.inference.runtimes.runtime import Pixels
+from dopepp.inference.scales import letterboxes
+from dopepp.models.checkpoint.released import FOLDER
+from dopepp.models.checkpoint.schema import Checkpoint, load_network
+from dopepp.models.network import network_cost
+
+_log = logging.getLogger(__name__)
+
+NUM_CHECKED: Final = 20
+"""Rendered pictures on which the export is compared with PyTorch."""
+
+NUM_IMAGES: Final = 100
+"""Of each, scenes to calibrate on and others to measure on."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written, how near it is to the checkpoint, and what to type next."""
+
+    path: Path
+    export: Export
+    agreement: Agreement
+    commands: tuple[str, str]
+
+
+def export(
+    path: Path,
+    layout: str = "onnx",
+    precision: str = "fp32",
+    out: Path | None = None,
+    num_images: int = NUM_IMAGES,
+) -> Exported:
+    """Write a checkpoint's network as one file (OpenVINO: a folder) and return what it is.
+
+    ``layout`` is one of :data:`~dopepp.inference.export.EXPORTERS`; without ``out`` the file
+    stands beside the checkpoint, of a released one in this folder. Scenes are rendered as those of
+    the checkpoint's validation: to compare the two, and for int8 ``num_images`` to calibrate and
+    as many others to measure ADD-0.1d before and after.
+
+    A :class:`UserError`: the checkpoint, an option or the place is wrong, or an extra is missing. A
+    :class:`RunError`: the export does not answer what the checkpoint does; nothing was written.
+    """
+    target = _target(path, layout, precision, out)
+    if runtimes.is_export(path):
+        raise UserError(f"{path}, which is an export", "a checkpoint", "export the checkpoint")
+    check_possible(layout, precision)
+    network, checkpoint = load_network(path)
+    cost = network_cost(network, checkpoint.input_size)
+    source = validation_renders(checkpoint, path, 2 * num_images)
+    original = PoseEstimator.load(path)
+    images: list[Pixels] = []
+    if precision == "int8":
+        _log.info("rendering %d validation scenes to calibrate on", num_images)
+        for index in range(num_images, 2 * num_images):
+            images += _seen(original, source.sample(index))
+    save = EXPORTERS[layout][0](network, precision, images)
+    described = Export(layout, precision, network.size_multiple, *cost)
+    with _written(target) as place:
+        save(place, checkpoint, described)
+        if precision == "int8":
+            described = replace(
+                described, num_images=num_images,
+                add_01d=_accuracy(original, PoseEstimator.load(place), source, num_images),
+            )  # fmt: skip
+            save(place, checkpoint, described)
+        agreement = _compared(PoseEstimator.load(place), original, source)
+        if not (agreement.is_exact if precision == "fp32" else np.isfinite(agreement.maps)):
+            raise RunError(f"{target} was not written: it differs from {path}: {agreement}")
+    return Exported(target, described, agreement, _commands(target, checkpoint))
+
+
+@contextmanager
+def _written(target: Path) -> Iterator[Path]:
+    """Yield a place beside the target that becomes the target; a :class:`RunError` if it cannot."""
+    try:
+        with draft(target) as place:
+            yield place
+    except OSError as error:
+        raise RunError(f"cannot write {target}: {error.strerror}; free or repair it") from error
+
+
+def _target(path: Path, layout: str, precision: str, out: Path | None) -> Path:
+    """Return where the export goes; a :class:`UserError` where an option or the place is wrong."""
+    for name, value, allowed in (
+        ("format", layout, EXPORTERS),
+        ("precision", precision, PRECISIONS),
+    ):
+        if value not in allowed:
+            raise UserError(f"--{name} {value}", ", ".join(allowed), "choose one of them")
+    ending = EXPORTERS[layout][1]
+    if out is None:
+        folder = Path() if path.parent == Path(FOLDER) and not path.exists() else path.parent
+        short = "" if precision == "fp32" else f"_{precision}"
+        out = folder / f"{path.stem}{short}{ending}"
+    is_file = ending.startswith(".")
+    if (is_file and out.suffix != ending) or (not is_file and out.suffix in (".xml", ".onnx")):
+        what = f"a file NAME{ending}" if is_file else "a folder"
+        raise UserError(f"--out {out} for --format {layout}", what, "name it so")
+    others = (
+        [one for one in out.iterdir() if one.suffix not in (".xml", ".bin")] if out.is_dir() else []
+    )
+    if (is_file and out.is_dir()) or (not is_file and out.is_file()) or others:
+        got = f"--out {out}, where there is something else"
+        raise UserError(got, "a new place, or one of an earlier export", "choose another place")
+    if out.exists() and path.exists() and out.samefile(path):
+        raise UserError(f"--out {out}, which is the checkpoint", "another place", "choose one")
+    return out
+
+
+def _seen(estimator: PoseEstimator, sample: Sample) -> list[Pixels]:
+    """Return a picture in the sizes in which the network sees it."""
+    boxes = letterboxes(estimator.checkpoint, sample.K, sample.image)
+    pictures = [letterboxed(sample.image, one, estimator.network.size_multiple) for one in boxes]
+    return [np.ascontiguousarray(one.transpose(2, 0, 1)[None]) for one in pictures]
+
+
+def _accuracy(
+    original: PoseEstimator, exported: PoseEstimator, source: Source, count: int
+) -> dict[str, float]:
+    """Measure ADD-0.1d of both on the same scenes."""
+    _log.info("measuring both on %d other validation scenes", count)
+    estimators = {"fp32": original, "int8": exported}
+    methods = {name: EstimatorMethod(one, one.parts) for name, one in estimators.items()}
+    measured = measure(methods, (source.sample(index) for index in range(count)), 0)
+    return {report.name: report.mean.add_01d or 0.0 for report in measured.reports}
+
+
+def _compared(exported: PoseEstimator, original: PoseEstimator, source: Source) -> Agreement:
+    samples: Sequence[Sample] = [source.sample(index) for index in range(NUM_CHECKED)]
+    return compare(exported, original, [(one.image, one.K) for one in samples])
+
+
+def _commands(path: Path, checkpoint: Checkpoint) -> tuple[str, str]:
+    """Return the lines that predict with an export and that measure it.
+
+    The export names no folder of this machine, so the second one does where the data need it.
+    """
+    config = trained_on(checkpoint.data) or {}
+    words = [f"ckpt_path={path}"]
+    if config.get("root"):
+        words.append(f"data.root={config['root']}")
+    parts = [str(one) for one in config.get("parts") or ()]
+    if not config.get("root") and any(Path(one).suffix for one in parts):
+        words.append(f"data.parts=[{','.join(parts)}]")
+    predict = f"dopepp predict {shlex.quote(str(path))} PICTURE --K FX FY CX CY"
+    return predict, " ".join([typed("evaluate"), *map(shlex.quote, words)])

@@ -1,0 +1,132 @@
+"""What experiment trackers are told of a run: Weights & Biases and TensorBoard.
+
+Each run is one run there: named after what was chosen, grouped with the others of its multirun,
+with its config, its curves and pictures while it trains, its test result at the end, and ended with
+it. A multirun ends with a run of its own that holds the comparison. Nothing a tracker does or fails
+to do changes a run; see :class:`~dopepp.training.loggers.GuardedLogger`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from lightning.pytorch.loggers import WandbLogger
+
+from dopepp.core.errors import UserError
+from dopepp.drawing.pictures import read_rgb
+from dopepp.experiment.assembly.registries import LOGGERS
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.results.compare import CURVES_FILE, LOSS_FILE, PICTURES_FILE, TABLE_FILE
+from dopepp.experiment.results.entries import overrides_of
+from dopepp.experiment.results.paper_table import TABLE_FILE as PAPER_TABLE_FILE
+from dopepp.experiment.results.report import Report
+from dopepp.experiment.results.tables import read_csv, shown_rows
+from dopepp.metrics.row import COLUMNS, PoseRow
+from dopepp.models.registry import TARGET
+from dopepp.training.loggers import GuardedLogger
+
+_PICTURES: Final = ("overlay", "auc", "shading", "shading_examples")
+"""A run's pictures of its test images, without ``.png``."""
+_COMPARISON: Final = "comparison"
+
+_UNSAID: Final = ("experiment=", "scale=", "logger", "model=", "data=", "resume", "table")
+"""Overrides that a run's name has no need of: they are the group's, or said by its first words."""
+
+
+@contextmanager
+def tracked(config: RunConfig, run_dir: Path) -> Iterator[list[GuardedLogger]]:
+    """Give a training's trackers, and end the run with each of them however the training ends.
+
+    A job's folder is in its multirun's. A ``logger`` that names no logger is a :class:`UserError`.
+    """
+    chosen = [one for one in overrides_of(run_dir) if not one.startswith(_UNSAID)]
+    name = " ".join([config.model.name, config.data.name, *chosen])
+    group = run_dir.resolve().parent.name if run_dir.name.isdigit() else None
+    begun = _begun_id(run_dir) if config.resume is not None else None
+    with _open(config.logger, run_dir, name, group, "train", begun) as trackers:
+        yield trackers
+
+
+@contextmanager
+def _open(
+    nodes: Mapping[str, Any] | None,
+    folder: Path,
+    name: str,
+    group: str | None,
+    kind: str,
+    begun: str | None = None,
+) -> Iterator[list[GuardedLogger]]:
+    """Build trackers and close them; what a node says itself comes first."""
+    trackers = []
+    for node in (nodes or {}).values():
+        target = LOGGERS.resolve(node.get(TARGET))  # a wrong name is no failure of a logger
+        own: dict[str, Any] = {"save_dir": str(folder)}
+        if issubclass(target, WandbLogger):
+            own |= {"name": name, "group": group, "job_type": kind, "version": begun}
+        given = {key: value for key, value in own.items() if key not in node}
+        trackers.append(GuardedLogger(partial(LOGGERS.build, node, **given)))
+    failed = True
+    try:
+        yield trackers
+        failed = False
+    finally:
+        for tracker in trackers:
+            tracker.close(failed)
+
+
+def _begun_id(run_dir: Path) -> str | None:
+    """Return the id that Weights & Biases gave a run before it was interrupted."""
+    folders = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda path: path.stat().st_mtime)
+    found = re.fullmatch(r"(?:offline-)?run-\d+_\d+-(\w+)", folders[-1].name) if folders else None
+    return found.group(1) if found else None
+
+
+def log_report(trackers: Sequence[GuardedLogger], report: Report, run_dir: Path) -> None:
+    """Tell trackers what a run was measured at: test figures, reference rows, curves, pictures."""
+    figures = _figures("test", report.rows)
+    for reference, rows in report.references.items():
+        figures |= _figures(f"reference/{reference}", rows)
+    for tracker in trackers:
+        tracker.log_summary(figures)
+        _send_pictures(tracker, {f"test/{one}": run_dir / f"{one}.png" for one in _PICTURES})
+
+
+def _figures(prefix: str, rows: Mapping[str, PoseRow]) -> dict[str, float]:
+    """Return every measure there is by a name with slashes; of one object, no mean beside it."""
+    return {
+        f"{prefix}/{name}/{column.field}": value
+        for name, row in shown_rows(rows).items()
+        for column in COLUMNS
+        if (value := getattr(row, column.field)) is not None
+    }
+
+
+def log_comparison(nodes: Mapping[str, Any] | None, folder: Path) -> None:
+    """Tell trackers how a multirun's jobs compare, in a run of its own in their group.
+
+    The multirun's folder holds the comparison's files.
+    """
+    with _open(nodes, folder, _COMPARISON, folder.resolve().name, _COMPARISON) as trackers:
+        for tracker in trackers:
+            for file in (TABLE_FILE, PAPER_TABLE_FILE):
+                rows = read_csv(folder / file)
+                if rows:
+                    text = (folder / file).with_suffix(".md").read_text()
+                    tracker.log_table(Path(file).stem, rows, text)
+            names = (CURVES_FILE, PICTURES_FILE, LOSS_FILE, "table_shading.png", "frame_rate.png")
+            _send_pictures(tracker, {Path(one).stem: folder / one for one in names})
+
+
+def _send_pictures(tracker: GuardedLogger, paths: Mapping[str, Path]) -> None:
+    for name, path in paths.items():
+        try:
+            picture = read_rgb(path) if path.is_file() else None
+        except UserError:  # cut short where the disk was full
+            picture = None
+        if picture is not None:
+            tracker.log_picture(name, picture)

@@ -1,0 +1,293 @@
+"""What ``train.py`` does: a training, from its config to a run folder with a measured checkpoint.
+
+To add another ``job=``, write a function of config and run folder, give it a line in :data:`JOBS`
+and its name to :class:`~dopepp.experiment.config.run.RunConfig`.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.utilities import rank_zero_only
+
+from dopepp.core.errors import RunError, UserError
+from dopepp.core.interrupts import Interruption
+from dopepp.data.datamodule import PoseDataModule
+from dopepp.experiment import program
+from dopepp.experiment.assembly.camera import fitted_to_camera
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.sources import build_datamodule
+from dopepp.experiment.assembly.system import (
+    build_system,
+    build_trainer,
+    estimate_training_s,
+    keep_freed_memory,
+)
+from dopepp.experiment.config.run import RunConfig, TrainerConfig
+from dopepp.experiment.results import display, readme, record
+from dopepp.experiment.results.conditions import check_masks
+from dopepp.experiment.results.cost import measure_cost
+from dopepp.experiment.results.measurement import measure_and_record, refining
+from dopepp.experiment.results.paper_table import PaperTable
+from dopepp.experiment.results.report import FULL_SIZE_COST, Report, full_size_cost
+from dopepp.experiment.run.evaluate import tune_and_record
+from dopepp.experiment.run.images import describe_images
+from dopepp.experiment.run.lr_finder import find_learning_rate
+from dopepp.experiment.run.resume import ConfigDifference, check_resume, remember_overrides
+from dopepp.experiment.run.tracking import log_report, tracked
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.parts.part import Parts
+from dopepp.training.callbacks.pose_metrics import EarlyStop
+from dopepp.training.callbacks.throughput import FOLDER as PROFILE
+from dopepp.training.callbacks.throughput import profile_rows
+from dopepp.training.callbacks.trial import PrunedError, raise_if_pruned
+from dopepp.training.checkpointing.files import FOLDER, check_room, newest_checkpoint, saved_step
+from dopepp.training.loggers import GuardedLogger
+from dopepp.training.processes import ProcessDiedError
+from dopepp.training.system import PoseSystem
+
+_log = logging.getLogger(__name__)
+
+PAPER_INPUT_SIZE: Final = (416, 416)
+QUICKSTART: Final = "experiment=quickstart"
+
+
+def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
+    """Parse ``train.py``'s composed config and do the job that it names.
+
+    A :class:`UserError` tells which option is wrong.
+    """
+    parsed = RunConfig.of(config)
+    if parsed.table is not None:
+        PaperTable.of(parsed.table)  # a mistake in it shows before the work, not after
+    _refuse_parallel_multirun(parsed.trainer)
+    return JOBS[parsed.job](parsed, run_dir)
+
+
+def _refuse_parallel_multirun(trainer: TrainerConfig) -> None:
+    """Refuse jobs of several processes, of which each would start as the first one did."""
+    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        return
+    if trainer.num_processes > 1:
+        nodes = "" if trainer.num_nodes == 1 else f" trainer.num_nodes={trainer.num_nodes}"
+        raise UserError(
+            f"trainer.devices={trainer.devices}{nodes} in a multirun",
+            "one process per job: each further process would run the whole sweep again",
+            "set trainer.devices=1 and start one process, or run the jobs one by one",
+        )
+
+
+def train(config: RunConfig, run_dir: Path) -> Report:
+    """Train, then measure the best checkpoint on the test set.
+
+    A choice, a file or an option that is wrong is a :class:`UserError`; a search that stops this
+    training a ``PrunedError``; what cannot be written a ``SavingFailedError``; a signal that ends
+    it an :class:`Interruption`, whose message names the last checkpoint.
+    """
+    explanation = readme.RunReadme(config, run_dir)
+    try:
+        with tracked(config, run_dir) as trackers:
+            report = _train(config, run_dir, explanation, trackers)
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signal.SIGINT)
+        advice = _advice(run_dir)
+        explanation.end(readme.INTERRUPTED, advice)
+        raise Interruption(number, advice) from interrupt
+    except PrunedError as pruned:
+        explanation.end(readme.PRUNED, str(pruned))
+        raise
+    except Exception as error:
+        explanation.end(readme.FAILED, " ".join(str(error).split()) or repr(error))
+        raise
+    explanation.end(readme.FINISHED, report=report)
+    return report
+
+
+def _train(
+    config: RunConfig,
+    run_dir: Path,
+    explanation: readme.RunReadme,
+    trackers: Sequence[GuardedLogger],
+) -> Report:
+    if not config.keep_checkpoints and config.resume is not None:
+        raise UserError(
+            f"resume={config.resume} with keep_checkpoints=false",
+            "a run whose checkpoints are kept",
+            "set keep_checkpoints=true, or start anew without resume",
+        )
+    seed_everything(config.seed, verbose=False)
+    keep_freed_memory()
+    display.console.quiet = bool(getattr(rank_zero_only, "rank", 0))  # the first process reports
+    parts = build_parts(config.data)
+    config = fitted_to_camera(config, parts)
+    datamodule = build_datamodule(config.data, parts, config.seed)
+    datamodule.check_objects()
+    if config.protocols.shading:
+        check_masks(datamodule.test_source)
+    fingerprint = datamodule.fingerprint()
+    sources = {"train": datamodule.train_source, "val": datamodule.val_source}
+    sources["test"] = datamodule.test_source
+    images = {split: describe_images(source) for split, source in sources.items()}
+    system = build_system(config, parts, fingerprint, images, datamodule.seen(parts))
+    resume_from, changes = _resume_path(config, system)
+    # Whatever it refuses, nothing is written yet.
+    trainer = build_trainer(config, run_dir, trackers=trackers)
+    weights = system.network.state_dict().values()
+    check_room(run_dir, sum(value.numel() * value.element_size() for value in weights))
+    display.show_config(config.plain)
+    for change in changes:
+        display.console.print(f"changed since the run began: {change}")
+    if not getattr(rank_zero_only, "rank", 0):
+        record.write_config(run_dir, config.plain)
+        record.write_environment(run_dir, config.seed, fingerprint, [str(one) for one in changes])
+        if config.resume is not None:
+            remember_overrides(run_dir)
+        explanation.begin()
+        for tracker in trackers:
+            tracker.log_hyperparams(dict(config.plain))
+    display.show_sources(datamodule.summary())
+    _announce_duration(config.trainer, system, datamodule, trainer)
+    _fit(trainer, system, datamodule, resume_from, run_dir)
+    raise_if_pruned(trainer)
+    if not trainer.is_global_zero:
+        raise SystemExit(0)  # the first process alone measures and reports
+    _say_how_it_ended(trainer, run_dir)
+    report = _measure_run(config, parts, run_dir, trainer)
+    log_report(trackers, report, run_dir)
+    if not config.keep_checkpoints:
+        shutil.rmtree(run_dir / FOLDER)
+        display.console.print("everything has run; the checkpoints are removed")
+    return report
+
+
+def _fit(
+    trainer: Trainer,
+    system: PoseSystem,
+    datamodule: PoseDataModule,
+    resume_from: Path | None,
+    run_dir: Path,
+) -> None:
+    """Train; what ends it early says how it can go on."""
+    try:
+        trainer.fit(system, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+    except SystemExit as end:
+        if isinstance(end.__context__, KeyboardInterrupt):
+            raise end.__context__ from end
+        raise
+    except RunError as error:
+        if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
+            raise SystemExit(1) from error  # all end for one reason, and the first says it
+        kept = (run_dir / record.LAST_CHECKPOINT).is_file()
+        advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
+        raise RunError(f"{error}; {advice}") from error
+
+
+def _say_how_it_ended(trainer: Trainer, run_dir: Path) -> None:
+    """Say where training stopped early, and where its time went."""
+    for stopping in trainer.early_stopping_callbacks:
+        if isinstance(stopping, EarlyStop) and stopping.impatient:
+            display.console.print(
+                f"stopped early after epoch {stopping.stopped_epoch}: {stopping.monitor} has not "
+                f"improved in {stopping.wait_count} validations, best {stopping.best_score:.4g}"
+            )
+    rows = profile_rows(trainer.profiler)  # type: ignore[attr-defined]
+    if rows:
+        display.show_table(f"where the time went; all of it in {run_dir / PROFILE}", rows)
+
+
+def _announce_duration(
+    options: TrainerConfig, system: PoseSystem, datamodule: PoseDataModule, trainer: Trainer
+) -> None:
+    """Without an accelerator, say how long the run will take and what takes less."""
+    if trainer.accelerator.__class__.__name__ != "CPUAccelerator" or not trainer.is_global_zero:
+        return
+    seconds = estimate_training_s(system.network, datamodule, options, str(trainer.precision))
+    hours = seconds / 3600
+    duration = f"{hours:,.1f} hours" if hours >= 1 else f"{max(1, round(seconds / 60))} min"
+    quick = f"; for a first result in minutes: {program.typed('train')} {QUICKSTART}"
+    advice = quick if hours >= 1 else ""
+    display.console.print(f"no accelerator: about {duration} to finish{advice}")
+
+
+def _resume_path(
+    config: RunConfig, system: PoseSystem
+) -> tuple[Path | None, list[ConfigDifference]]:
+    """Return the interrupted run's checkpoint, and what has changed since and may have."""
+    resume = config.resume
+    if resume is None:
+        if config.resume_anyway:
+            raise UserError("resume_anyway=true without resume", "resume=RUN beside it", "add it")
+        return None, []
+    run_dir = Path(resume)
+    found = newest_checkpoint(run_dir)
+    if found is None and not (run_dir / record.OVERRIDES_FILE).is_file():
+        raise UserError(
+            f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
+            "the folder of an interrupted run",
+            "pass that run's folder, or start anew without resume",
+        )
+    if found is None:
+        display.console.print(f"no checkpoint yet in {resume}: the run starts from its beginning")
+        return None, []
+    path, checkpoint = found
+    return path, check_resume(run_dir, config, checkpoint, system.payload)
+
+
+def _advice(run_dir: Path) -> str:
+    """Say what an interrupted run has saved and how it goes on."""
+    step = saved_step(run_dir / record.LAST_CHECKPOINT)
+    saved = f"saved up to step {step} in {record.LAST_CHECKPOINT}" if step else "nothing saved yet"
+    return f"{saved}; go on with resume={run_dir}"
+
+
+def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Trainer) -> Report:
+    """Measure the best checkpoint of a finished run and write everything down."""
+    checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
+    path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
+    if not path.is_file():
+        path = run_dir / record.LAST_CHECKPOINT
+        _log.warning("the run ended before its first validation: measuring %s", path.name)
+    device = trainer.strategy.root_device
+    estimator = PoseEstimator.load(path, device)
+    if config.tune:
+        target = config.false_positives
+        try:
+            tuned = refining(estimator, config.refine, parts)
+            path = tune_and_record(tuned, path, parts, config.data, run_dir, target)
+        except UserError as error:  # a network that learned little is measured as it is
+            display.console.print(f"not tuned: {error}")
+        else:
+            estimator = PoseEstimator.load(path, device)
+    details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
+    score = checkpoints[0].best_model_score if checkpoints else None
+    if score is not None and score.isfinite():
+        details[record.OBJECTIVE] = float(score)
+    if config.model.width != 1.0:
+        cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
+        details[FULL_SIZE_COST] = vars(cost)
+    return measure_and_record(
+        {config.model.name: estimator},
+        parts,
+        config.data,
+        run_dir,
+        num_pictures=12,
+        details=details,
+        protocols=config.protocols,
+        refine=config.refine,
+    )[0]
+
+
+JOBS: Final[Mapping[str, Callable[[RunConfig, Path], object]]] = {
+    "train": train,
+    "cost": measure_cost,
+    "lr_finder": find_learning_rate,
+}

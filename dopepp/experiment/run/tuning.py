@@ -1,0 +1,330 @@
+"""Distance factor, score and threshold of a checkpoint, from validation images, checked on others.
+
+The factor is the median ratio of true to estimated distances. The score's weights are fitted to
+"ADD below a tenth of the diameter"; the threshold is the lowest at which the network keeps silent
+on images without its objects. All go into a new checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Instance, Sample, Source
+from dopepp.data.transforms.shading import shade
+from dopepp.experiment.assembly.renders import empty_renders
+from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.experiment.config.data import Count, DataConfig
+from dopepp.experiment.config.parse import Share
+from dopepp.experiment.run.memory import Memory
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
+from dopepp.metrics.pose import assign, counted
+from dopepp.metrics.row import symmetries
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint.storage import write_atomic
+from dopepp.parts.part import Part, Parts
+from dopepp.recovery import calibration
+from dopepp.recovery.calibration import RecoveryOptions
+from dopepp.recovery.detection import Detection
+
+HIDDEN: Final = 0.4
+"""Share of each object that is hidden on the validation images that refined poses' scores learn
+from a second time: a network names a part that is hidden with little belief, and the picture may
+agree all the same."""
+
+
+@dataclass(frozen=True)
+class FalsePositiveTarget:
+    """How silent a network must be where its objects are not.
+
+    Attributes:
+        num_empty: Images without objects, for choosing the threshold and again for checking it.
+        false_positive_rate: Share of them on which the threshold may let a detection pass; 1 sets
+            no threshold.
+    """
+
+    num_empty: Count = 500
+    false_positive_rate: Share = 0.005
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The detections on a set of images.
+
+    Of every detection its features, what the estimator said, whether it is right, and the number of
+    its image; then images in all, and instances that were to be found.
+    """
+
+    features: Float[np.ndarray, "n features"]
+    scores: Float[np.ndarray, "n"]
+    correct: Bool[np.ndarray, "n"]
+    image: np.ndarray
+    num_images: int
+    num_instances: int
+
+    def loudest(self, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "images"]:
+        """Return the best score on every image; 0 where nothing was found."""
+        best = np.zeros(self.num_images)
+        np.maximum.at(best, self.image, scores)
+        return best
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How good scores and a threshold are.
+
+    The scores' expected calibration error, the share of images without objects on which something
+    is found, and the share of instances with a right pose above the threshold.
+    """
+
+    calibration_error: float
+    false_positive_rate: float
+    recall: float
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What tuning chose: recovery options to change, and how good it is on other images.
+
+    Figures are of the checkpoint as it was and with the new options; ``num_images`` counts the test
+    images with objects, and without.
+    """
+
+    options: dict[str, float]
+    before: Figures
+    after: Figures
+    num_images: tuple[int, int]
+
+
+def tune(
+    estimator: PoseEstimator, data: DataConfig, parts: Parts, target: FalsePositiveTarget
+) -> Tuning:
+    """Choose factor, weights and threshold on validation images; measure them on test images.
+
+    Of an estimator that refines, first those of the network alone and then, on the refined poses,
+    those of theirs; ``before`` are the figures of the network as it was.
+
+    A :class:`UserError`: the network finds nothing, or all that it finds is right or wrong.
+    """
+    old, refiner, memory = estimator.recovery, estimator.refiner, Memory()
+    estimator = memory.behind(estimator)
+    validation = memory.of(held_out_source(data, parts, "val"))
+    test = memory.of(held_out_source(data, parts, "test"))
+    count, rate = target.num_empty, target.false_positive_rate
+    empty = memory.of(empty_renders(data, parts, "val", count))
+    empty_test = memory.of(empty_renders(data, parts, "test", count))
+
+    def scored(options: RecoveryOptions, source: Source) -> Scored:
+        estimator.recovery = options
+        return score_images(estimator, parts, source)
+
+    estimator.refiner = None
+    # Every detection counts here, whatever its score.
+    heard = replace(old, min_score=0.0, covariance_factor=1.0)
+    before = _figures(scored(heard, test), scored(heard, empty_test), old.min_score)
+    estimator.recovery = replace(heard, distance_factor=1.0)
+    factors = fit_factors(matched_poses(estimator, parts, validation))
+    heard = replace(heard, distance_factor=factors["distance_factor"])
+    chosen = choose(scored(heard, validation), scored(heard, empty), rate)
+    new = replace(old, **factors, **chosen)  # type: ignore[arg-type]
+    threshold = new.min_score
+    heard = replace(new, min_score=0.0)
+    if refiner is not None:
+        estimator.refiner = refiner
+        # Features are of the network's score, which an earlier tuning's would hide.
+        candidate = min(new.min_score, calibration.CANDIDATE)
+        heard = replace(new.unrefined(), min_score=candidate)
+        shown = joined(scored(heard, validation), scored(heard, Hidden(validation)))
+        refined = choose(shown, scored(heard, empty), rate, refined=True)
+        chosen |= refined
+        threshold = refined.pop("refined_min_score")
+        heard = replace(new, **refined)  # type: ignore[arg-type]
+    after = _figures(scored(heard, test), scored(heard, empty_test), threshold)
+    return Tuning(factors | chosen, before, after, (len(test), count))
+
+
+def fit_factors(
+    pairs: Sequence[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]],
+) -> dict[str, float]:
+    """Fit the factors on distances and covariances to poses that were found with factors of 1."""
+    estimated = np.reshape([one.T_cam_obj for one, _ in pairs], (-1, 4, 4))
+    true = np.reshape([equivalents[0] for _, equivalents in pairs], (-1, 4, 4))
+    distance = calibration.fit_distance_factor(estimated, true)
+    surprises = []
+    for one, equivalents in pairs:
+        stated = np.broadcast_to(one.covariance, (len(equivalents), 6, 6)).copy()
+        T_est = np.broadcast_to(one.T_cam_obj, equivalents.shape).copy()
+        T_est[:, :3, 3] *= distance
+        poses = T_est[:, :3, :3], T_est[:, :3, 3], equivalents[:, :3, :3], equivalents[:, :3, 3]
+        away = mahalanobis(*map(torch.from_numpy, (*poses, stated)))
+        surprises.append(float(away.min()) ** 2)
+    covariance = calibration.fit_covariance_factor(np.array(surprises))
+    return {"distance_factor": distance, "covariance_factor": covariance}
+
+
+def choose(
+    shown: Scored,
+    empty: Scored,
+    false_positive_rate: float = FalsePositiveTarget.false_positive_rate,
+    *,
+    refined: bool = False,
+) -> dict[str, float]:
+    """Choose the weights and the threshold from detections on images with objects and without.
+
+    ``false_positive_rate`` is as in :class:`FalsePositiveTarget`; ``refined`` tells that the poses
+    are. A :class:`UserError`: there is nothing to learn from.
+    """
+    features = np.concatenate([shown.features, empty.features])
+    correct = np.concatenate([shown.correct, empty.correct])
+    if not correct.any() or correct.all():
+        what = "right" if correct.any() else "wrong"
+        raise UserError(
+            f"{len(correct)} validation detections, all of them {what}"
+            if len(correct)
+            else "no detection on any validation image",
+            "right and wrong ones to learn from",
+            "train longer, or raise data.num_val and num_empty",
+        )
+    weights = calibration.fit_weights(features, correct)
+    loudest = np.sort(empty.loudest(calibration.score(empty.features, weights)))[::-1]
+    allowed = int(false_positive_rate * empty.num_images)
+    # A detection passes from the threshold on, so it lies just above the first that must not.
+    threshold = float(np.nextafter(loudest[allowed], 1.0)) if allowed < len(loudest) else 0.0
+    if refined:
+        names = ["refined_min_score", *(f"refined_{one}" for one in calibration.REFINED_FEATURES)]
+    else:
+        names = ["min_score", *(f"score_{one}" for one in calibration.FEATURES)]
+    return dict(zip(names, [threshold, *map(float, weights)], strict=True))
+
+
+def score_images(estimator: PoseEstimator, parts: Parts, source: Source) -> Scored:
+    """Run an estimator over a source and judge every detection; features are of what it does."""
+    refined = estimator.refiner is not None
+    names = calibration.REFINED_FEATURES if refined else calibration.FEATURES
+    rows: list[tuple[np.ndarray, float, bool, int]] = []
+    num_instances = 0
+    for number, sample, part, own, true in _by_object(estimator, parts, source):
+        num_instances += sum(map(counted, true))
+        right, judged = _judge(part, own, true)
+        for one, is_right in zip(compress(own, judged), right[judged], strict=True):
+            known = (
+                calibration.refined_features(one)
+                if refined
+                else calibration.detection_features(one, part.cuboid, sample.K)
+            )
+            rows.append((known, one.score, bool(is_right), number))
+    return Scored(
+        np.array([row[0] for row in rows]).reshape(-1, len(names)),
+        np.array([row[1] for row in rows], np.float64),
+        np.array([row[2] for row in rows], bool),
+        np.array([row[3] for row in rows], np.int64),
+        len(source),
+        num_instances,
+    )
+
+
+def matched_poses(
+    estimator: PoseEstimator, parts: Parts, source: Source
+) -> list[tuple[Detection, Float[np.ndarray, "equivalents 4 4"]]]:
+    """Return the detections on a source and the true poses of the instance each has found.
+
+    A symmetric part's are all that look alike.
+    """
+    found = []
+    for _, _, part, own, instances in _by_object(estimator, parts, source):
+        group = symmetries(part).numpy()
+        for one, number in zip(own, assign(part.cuboid[CENTROID], own, instances), strict=True):
+            if number >= 0 and counted(instances[number]):
+                found.append((one, instances[number].T_cam_obj @ group))
+    return found
+
+
+def _by_object(
+    estimator: PoseEstimator, parts: Parts, source: Source
+) -> Iterator[tuple[int, Sample, Part, list[Detection], list[Instance]]]:
+    """Run an estimator over a source; for every image and part what was found and what is there."""
+    for number in range(len(source)):
+        sample = source.sample(number, 0)
+        found = estimator.predict(sample.image, sample.K, cropped=True)
+        for part in parts:
+            own = [one for one in found if one.object == part.name]
+            true = [one for one in sample.instances if one.label == part.name]
+            yield number, sample, part, own, true
+
+
+class Hidden:
+    """Images of a source with :data:`HIDDEN` of every object's visible pixels covered.
+
+    Objects without a mask stay as they are.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source, self.name = source, f"{source.name}, hidden"
+
+    def __len__(self) -> int:
+        """Return how many images there are."""
+        return len(self._source)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Return an image."""
+        return shade(self._source.sample(index, epoch), [HIDDEN], 0, index)[0].sample
+
+
+def joined(one: Scored, other: Scored) -> Scored:
+    """Return the detections on two sets of images together."""
+    return Scored(
+        np.concatenate([one.features, other.features]),
+        np.concatenate([one.scores, other.scores]),
+        np.concatenate([one.correct, other.correct]),
+        np.concatenate([one.image, other.image + one.num_images]),
+        one.num_images + other.num_images,
+        one.num_instances + other.num_instances,
+    )
+
+
+def write_tuned(checkpoint: Checkpoint, path: Path, options: Mapping[str, float]) -> Path:
+    """Write a checkpoint with other recovery options beside the old one; returns its path."""
+    tuned = replace(checkpoint, recovery={**checkpoint.recovery, **options})
+    target = path.with_name(f"{path.stem}_tuned.ckpt")
+    write_atomic(tuned.to_file(), target)
+    return target
+
+
+def _judge(
+    part: Part, found: Sequence[Detection], true: Sequence[Instance]
+) -> tuple[Bool[np.ndarray, "found"], Bool[np.ndarray, "found"]]:
+    """Tell which detections of one object on one image are right, and which are judged at all.
+
+    As in every evaluation, one that finds an instance too hidden to count is neither right nor
+    wrong. Right is ADD below 0.1 d, for a part with symmetries ADD-S.
+    """
+    numbers = assign(part.cuboid[CENTROID], found, true)
+    counts = np.array([number < 0 or counted(true[number]) for number in numbers], bool)
+    matched = np.flatnonzero(counts & (numbers >= 0)).tolist()
+    right = np.zeros(len(found), bool)
+    if matched:
+        T_est = torch.from_numpy(np.array([found[k].T_cam_obj for k in matched]))
+        T_gt = torch.from_numpy(np.array([true[numbers[k]].T_cam_obj for k in matched]))
+        points = torch.from_numpy(np.asarray(part.points, np.float64))
+        error = add_s if len(symmetries(part)) > 1 else add
+        errors = error(T_est[:, :3, :3], T_est[:, :3, 3], T_gt[:, :3, :3], T_gt[:, :3, 3], points)
+        right[matched] = (errors < calibration.PASSING * part.diameter).numpy()
+    return right, counts
+
+
+def _figures(test: Scored, empty: Scored, threshold: float) -> Figures:
+    scores, correct = torch.from_numpy(test.scores), torch.from_numpy(test.correct)
+    error = expected_calibration_error(scores, correct)
+    loud = empty.loudest(np.where(empty.scores >= threshold, 1.0, 0.0))
+    right = test.correct & (test.scores >= threshold)
+    return Figures(error, float(loud.mean()), float(right.sum()) / max(test.num_instances, 1))

@@ -1,0 +1,223 @@
+"""Jobs in other processes: of this machine, of a Ray cluster, or of SLURM as one job array.
+
+To add a launcher, write a :data:`Runner`, a class in ``hydra_plugins.dopepp_plugins.launchers`` and
+a file in ``conf/hydra/launcher``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, open_dict
+
+from dopepp.core.checks import check_integer
+from dopepp.core.errors import UserError, require
+from dopepp.core.futures import THREAD_LIMITS, available_cores, completed, connect, spread
+from dopepp.experiment.results import display, record
+
+_MOST: Final = 1024
+_IDLE_S: Final = 300
+"""How long a process waits for its next job."""
+
+_ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
+                    "mem_gb", "name")  # fmt: skip
+"""What submitit calls by these names on every kind of cluster; the rest is SLURM's own."""
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """What the jobs of a multirun have in common; travels to the processes that run them.
+
+    That is Hydra's config loader and callbacks, the config of the multirun, the entry point's
+    function, and Hydra's global state.
+    """
+
+    context: HydraContext
+    config: DictConfig
+    task: TaskFunction
+    state: dict[Any, Any]
+
+    @classmethod
+    def of(cls, context: HydraContext, config: DictConfig, task: TaskFunction) -> Jobs:
+        """Gather it in the process that launches."""
+        return cls(context, config, task, Singleton.get_state())
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the multirun; a job's is its number in it."""
+        return Path(str(self.config.hydra.sweep.dir))
+
+    def run(self, number: int, overrides: list[str]) -> JobReturn:
+        """Run one job in this process."""
+        setup_globals()
+        Singleton.set_state(self.state)
+        config = self.context.config_loader.load_sweep_config(self.config, overrides)
+        with open_dict(config):
+            config.hydra.job.id = config.hydra.job.num = number
+        return run_job(
+            task_function=self.task,
+            config=config,
+            job_dir_key="hydra.sweep.dir",
+            job_subdir_key="hydra.sweep.subdir",
+            hydra_context=self.context,
+        )
+
+
+Ended = Iterator[tuple[int, JobReturn | Exception]]
+"""Jobs by number as they end: an exception in place of one whose process was lost."""
+
+Runner = Callable[[Jobs, Mapping[int, list[str]]], Ended]
+"""Runs jobs, given as overrides by number."""
+
+
+def launch(
+    jobs: Jobs, overrides: Sequence[Sequence[str]], first: int, run: Runner
+) -> list[JobReturn]:
+    """Run jobs and wait for all of them; a lost one has failed, the others go on.
+
+    ``overrides`` are of each job, ``first`` is the number of the first one. A :class:`UserError`:
+    they cannot be run there.
+    """
+    jobs.folder.mkdir(parents=True, exist_ok=True)
+    numbered = {first + index: list(one) for index, one in enumerate(overrides)}
+    returns: dict[int, JobReturn] = {}
+    for number, result in run(jobs, numbered):
+        if isinstance(result, Exception):
+            result = _lost(jobs.folder / str(number), result)
+        returns[number] = result
+        display.console.print(f"job {number} ended, {len(returns)} of {len(numbered)}")
+    return [returns[number] for number in numbered]
+
+
+def _lost(folder: Path, error: Exception) -> JobReturn:
+    """Write down, in place of the job itself, that it failed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    reason = f"its process was lost: {type(error).__name__}: {' '.join(str(error).split())}"
+    record.write_json(folder / record.FAILURE_FILE, {"reason": reason})
+    # To Hydra, it ended like any failed job: an error here would end the multirun.
+    return JobReturn(status=JobStatus.COMPLETED)
+
+
+def on_joblib(n_jobs: int) -> Runner:
+    """Return a runner that keeps so many jobs going in processes of this machine.
+
+    A :class:`UserError`: the number is out of range, or joblib is not installed.
+    """
+    check_integer("hydra.launcher.n_jobs", n_jobs, 1, _MOST)
+    require("joblib", "hydra/launcher=joblib", "joblib")
+
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        import joblib
+        from joblib.externals.loky import get_reusable_executor
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        # Of concurrent.futures' kind, and it pickles what belongs to a script.
+        share = str(max(joblib.cpu_count() // n_jobs, 1))
+        limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}
+
+        def submit(item: tuple[int, list[str]]) -> Future[JobReturn]:
+            # A new one after a process was lost, which takes those at work beside it along.
+            pool = get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits)
+            future: Future[JobReturn] = pool.submit(jobs.run, *item)
+            return future
+
+        try:
+            for (number, _), future in completed(submit, overrides.items(), lambda: n_jobs):
+                yield number, _result(future, TerminatedWorkerError)
+        except BaseException:
+            get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits).shutdown(kill_workers=True)
+            raise
+
+    return run
+
+
+def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
+    """Return a runner of jobs that occupy so many cores and accelerators of a cluster.
+
+    ``address`` is the cluster's ``host:port``; None starts one on this machine for these jobs. A
+    job sees only its own accelerators.
+    """
+
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        ray = connect(address, available_cores(), "hydra/launcher=ray", "hydra.launcher.address")
+        try:
+            # Not repeated: a job that took its process down once would do so again.
+            submit = spread(ray, Jobs.run, max_retries=0, num_cpus=num_cpus, num_gpus=num_gpus)
+            items = overrides.items()
+            for (number, _), future in completed(
+                lambda item: submit(jobs, *item), items, lambda: len(items)
+            ):
+                yield number, _result(future, ray.exceptions.RayError)
+        finally:
+            ray.shutdown()
+
+    return run
+
+
+def _result(future: Future[JobReturn], lost: type[Exception]) -> JobReturn | Exception:
+    """Return a job's result, or what its process was lost by."""
+    try:
+        return future.result()
+    except lost as error:
+        return error
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A job that submitit can queue again."""
+
+    jobs: Jobs
+
+    def __call__(self, number: int, overrides: list[str]) -> JobReturn:
+        return self.jobs.run(number, overrides)
+
+    def checkpoint(self, number: int, overrides: list[str]) -> Any:
+        """Near the time limit: the same job once more, which goes on in its folder."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, number, overrides)
+
+
+def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
+    """Return a runner that submits an array and waits for it.
+
+    SLURM's own logs go to the folder. The cluster is ``slurm``, or submitit's ``local``: processes
+    of this machine. A job that reaches its time limit is queued again ``max_num_timeout`` times.
+    Of ``sbatch``, options by submitit's names, None leaves one to the cluster. A
+    :class:`UserError`: submitit is not installed.
+    """
+    require("submitit", "hydra/launcher=submitit_slurm", "slurm")
+    given = {key: value for key, value in sbatch.items() if value is not None}
+    named = {key if key in _ANYWHERE else f"slurm_{key}": value for key, value in given.items()}
+
+    def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
+        import submitit
+
+        try:
+            slurm = {"cluster": cluster, "slurm_max_num_timeout": max_num_timeout}
+            executor = submitit.AutoExecutor(folder, **slurm)
+            executor.update_parameters(**named)
+            handles = executor.map_array(_Task(jobs), *zip(*overrides.items(), strict=True))
+        except (RuntimeError, ValueError, NameError, TypeError, OSError) as error:
+            raise UserError(
+                f"hydra/launcher=submitit_slurm, which this machine or SLURM refuses: {error}",
+                "a machine with srun and sbatch, and options of sbatch that the cluster takes",
+                "correct hydra.launcher.…, or try it here with hydra.launcher.cluster=local",
+            ) from error
+        numbers = dict(zip((handle.job_id for handle in handles), overrides, strict=True))
+        for handle in submitit.helpers.as_completed(handles):
+            try:
+                yield numbers[handle.job_id], handle.result()
+            except (submitit.core.utils.UncompletedJobError,
+                    submitit.core.utils.FailedJobError) as error:  # fmt: skip
+                yield numbers[handle.job_id], error
+
+    return run

@@ -1,0 +1,352 @@
+"""Searching: trials are asked from a study, run by Hydra's launcher, and told to it.
+
+A trial's number is its job's. Whatever ends a command in the middle, its trials stay ``RUNNING`` in
+the study: the next command runs those first, each under its number and in its folder, where a
+training goes on from its last checkpoint. A study is opened by one command at a time, and trials of
+different configurations are never mixed in it.
+
+An option is varied by a sweep of Hydra's, ``key=interval(0, 1)``. To vary another one, write it
+into ``search.space`` or on the command line.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Final
+
+import optuna
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep, Override, RangeSweep
+from hydra.core.utils import JobReturn
+from hydra.errors import HydraException
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, OmegaConf
+from optuna import distributions
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from dopepp.core.checks import check_integer
+from dopepp.core.errors import UserError
+from dopepp.experiment.config.parse import FORMER_TARGETS, below, flat
+from dopepp.experiment.results import display, record
+from dopepp.training.callbacks.trial import MOST, open_storage
+
+_FACTS: Final = "configuration"
+_NUM_SHOWN: Final = 3
+_MAX_PARALLEL: Final = 10_000
+_DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
+_NO_PART: Final = (
+    "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
+    "search.space", "callbacks.trial.storage", "data.virtual",
+)  # fmt: skip
+"""What may differ between two commands of one study; of the space, its texts are compared, and
+``data.virtual`` is where earlier versions say again what the node ``virtual`` says."""
+
+
+@dataclass(frozen=True)
+class Space:
+    """What is varied, by option, and from what it is drawn; and what is not.
+
+    ``texts`` are the same as they were written, to be compared with those of an earlier command;
+    ``fixed`` are the overrides that every trial has.
+    """
+
+    varied: dict[str, distributions.BaseDistribution]
+    texts: dict[str, str]
+    fixed: list[str]
+
+
+def search(
+    config: DictConfig,
+    loader: ConfigLoader,
+    launcher: Launcher,
+    arguments: Sequence[str],
+    swept: Sequence[str],
+) -> list[JobReturn]:
+    """Run trials until the study has as many finished ones as ``search.num_trials``.
+
+    ``swept`` are the options that the experiment sweeps over by itself; there must be none. A
+    :class:`UserError`: an option of the search is wrong, or the study does not belong to this
+    command.
+    """
+    if swept:
+        raise UserError(
+            f"search=optuna with an experiment that sweeps over {', '.join(swept)} itself",
+            "an experiment of one training, such as experiment=quickstart",
+            "leave one of the two out",
+        )
+    options: Any = OmegaConf.to_container(config.search, resolve=True)
+    wanted = check_integer("search.num_trials", options["num_trials"], 1, MOST)
+    at_a_time = check_integer("search.num_parallel", options["num_parallel"], 1, _MAX_PARALLEL)
+    space = read_space(loader, options["space"], arguments)
+    for example in examples(space):
+        loader.load_sweep_config(config, example)
+    folder = Path(str(config.hydra.sweep.dir))
+    plain = OmegaConf.to_container(config, resolve=False)
+    # All that decides a trial's result, and what it is varied by.
+    facts = {key: str(value) for key, value in flat(plain) if not below(key, _NO_PART)}
+    facts |= {f"search.space {key}": text for key, text in space.texts.items()}
+    with alone(folder, str(options["study"])):
+        study = open_study(options, facts, int(config.seed))
+        trials = _Trials(study, space, launcher, folder)
+        OmegaConf.save(config, folder / "multirun.yaml")
+        returns = trials.run(wanted, at_a_time)
+        _report(study, options)
+    return returns
+
+
+class _Trials:
+    """The trials of a study, each a job in a folder of its number."""
+
+    def __init__(self, study: optuna.Study, space: Space, launcher: Launcher, folder: Path) -> None:
+        self._study, self._space, self._launcher, self._folder = study, space, launcher, folder
+        known = {trial.number for trial in study.get_trials(deepcopy=False)}
+        names = [path.name for path in folder.iterdir() if path.name.isdigit()]
+        foreign = [name for name in names if int(name) not in known]
+        if foreign:  # a trial must not go on in the folder of another study's
+            raise UserError(
+                f"{folder} with the jobs {', '.join(sorted(foreign))} of another study",
+                f"a folder of the study {study.study_name} alone",
+                "choose another search.study=NAME, or move the folder away",
+            )
+
+    def run(self, wanted: int, at_a_time: int) -> list[JobReturn]:
+        """Finish what an earlier command has left, then run new ones until so many are finished."""
+        returns: list[JobReturn] = []
+        self._tell(self._running())
+        left = self._running()
+        if left:
+            numbers = ", ".join(str(trial.number) for trial in left)
+            display.console.print(f"study {self._study.study_name} goes on with trials {numbers}")
+        for trials in _consecutive(left, at_a_time):
+            returns += self._launch(trials)
+        ended = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
+        while (missing := wanted - len(self._study.get_trials(False, ended))) > 0:
+            asked = range(min(missing, at_a_time))
+            numbers_asked = {self._study.ask(self._space.varied).number for _ in asked}
+            returns += self._launch([one for one in self._running() if one.number in numbers_asked])
+        return returns
+
+    def _launch(self, trials: Sequence[FrozenTrial]) -> Sequence[JobReturn]:
+        """Run trials of consecutive numbers and tell the study how they ended."""
+        jobs = [overrides(self._space, trial.params) for trial in trials]
+        returns = self._launcher.launch(jobs, initial_job_idx=trials[0].number)
+        self._tell(trials)
+        numbers = {trial.number for trial in trials}
+        for trial in self._running():
+            if trial.number in numbers:  # its process died without a word
+                self._study.tell(trial.number, state=TrialState.FAIL)
+        return returns
+
+    def _tell(self, trials: Sequence[FrozenTrial]) -> None:
+        """Tell the study about those trials whose jobs have ended."""
+        for trial in trials:
+            state, value = outcome(self._folder / str(trial.number))
+            if state != TrialState.RUNNING:
+                self._study.tell(trial.number, value, state=state)
+
+    def _running(self) -> list[FrozenTrial]:
+        return self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+
+
+def _consecutive(trials: Sequence[FrozenTrial], at_most: int) -> Iterator[Sequence[FrozenTrial]]:
+    """Yield runs of consecutive numbers: a launcher counts up from the first one's."""
+    for _, run in groupby(enumerate(trials), lambda pair: pair[1].number - pair[0]):
+        left = [trial for _, trial in run]
+        for first in range(0, len(left), at_most):
+            yield left[first : first + at_most]
+
+
+def _report(study: optuna.Study, options: Mapping[str, Any]) -> None:
+    """Print how the trials ended, and the best one as overrides."""
+    states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
+    counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+    display.console.print(f"study {study.study_name}: {counts}; {options['storage']}")
+    if states[TrialState.COMPLETE.name.lower()]:
+        best = study.best_trial
+        options_of = " ".join(chosen(best.params))
+        display.console.print(f"best trial {best.number}, objective {best.value:.4f}: {options_of}")
+
+
+def read_space(loader: ConfigLoader, space: Sequence[str], arguments: Sequence[str]) -> Space:
+    """Read ``search.space`` and the command line, whose overrides win.
+
+    A :class:`UserError`: an entry cannot be read or is no sweep, or nothing is varied.
+    """
+    parser = OverridesParser.create(config_loader=loader)
+    try:
+        entries = parser.parse_overrides([str(text) for text in space])
+    except HydraException as error:
+        raise _bad_entry(f"{list(space)}, unreadable: {error}") from error
+    given = parser.parse_overrides(list(arguments))
+    sweeps: dict[str, Override] = {}
+    for entry in entries:
+        if not entry.is_sweep_override():
+            raise _bad_entry(f"{entry.input_line!r}, which is one value")
+        sweeps[entry.get_key_element()] = entry
+    fixed = []
+    for override in given:
+        key = override.get_key_element()
+        sweeps.pop(key, None)
+        if override.is_sweep_override():
+            sweeps[key] = override
+        else:
+            fixed.append(str(override.input_line))
+    if not sweeps:
+        raise _bad_entry("nothing to vary")
+    texts = {key: str(one.input_line).partition("=")[2] for key, one in sweeps.items()}
+    return Space({key: _distribution(sweep) for key, sweep in sweeps.items()}, texts, fixed)
+
+
+def _distribution(sweep: Override) -> distributions.BaseDistribution:
+    """Return what Optuna draws an option from."""
+    value = sweep.value()
+    try:
+        if isinstance(value, IntervalSweep):
+            low: Any = value.start  # ints where the interval was cast to int
+            high: Any = value.end
+            kind = (
+                distributions.IntDistribution
+                if isinstance(low, int)
+                else distributions.FloatDistribution
+            )
+            return kind(low, high, log="log" in value.tags)
+        if isinstance(value, RangeSweep) and isinstance(value.step, int):
+            numbers = range(int(value.start or 0), int(value.stop or 0), value.step)
+            return distributions.IntDistribution(min(numbers), max(numbers), step=abs(value.step))
+        if sweep.is_discrete_sweep():
+            return distributions.CategoricalDistribution(list(sweep.sweep_string_iterator()))
+    except ValueError as error:
+        raise _bad_entry(f"{sweep.input_line!r}: {error}") from error
+    raise _bad_entry(f"{sweep.input_line!r}")
+
+
+def _bad_entry(got: str) -> UserError:
+    return UserError(
+        f"search.space with {got}",
+        "interval(low, high), int(interval(…)), tag(log, interval(…)), range(…), choice(…)",
+        "correct search.space or the command line",
+    )
+
+
+def examples(space: Space) -> list[list[str]]:
+    """Return overrides that try every option once, to see whether they compose."""
+    first = {key: _ends(one)[0] for key, one in space.varied.items()}
+    tried = [first]
+    for key, distribution in space.varied.items():
+        tried += [{**first, key: end} for end in _ends(distribution)[1:]]
+    return [overrides(space, params) for params in tried]
+
+
+def _ends(distribution: distributions.BaseDistribution) -> list[object]:
+    """Return every choice, or one number of a range: another one composes as well."""
+    if isinstance(distribution, distributions.CategoricalDistribution):
+        return list(distribution.choices)
+    assert isinstance(
+        distribution, (distributions.FloatDistribution, distributions.IntDistribution)
+    )
+    return [distribution.low]
+
+
+def overrides(space: Space, params: dict[str, object]) -> list[str]:
+    """Return the overrides of a trial."""
+    return [*space.fixed, *chosen(params)]
+
+
+def chosen(params: dict[str, object]) -> list[str]:
+    """Return what a trial varies as overrides: as it is run, shown, and run again by hand.
+
+    Four digits of a drawn number are enough, and fit into a table.
+    """
+    return [
+        f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
+        for key, value in params.items()
+    ]
+
+
+@contextmanager
+def alone(folder: Path, study: str) -> Iterator[None]:
+    """Keep a second command from searching in the same folder; ends with the process.
+
+    If there is another one, it is a :class:`UserError`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".search.lock").open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UserError(
+                f"search.study={study}, which another command is searching in {folder}",
+                "one command at a time",
+                "wait for it, raise its search.num_parallel, or choose another search.study",
+            ) from error
+        yield
+
+
+def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) -> optuna.Study:
+    """Open a study, or begin it.
+
+    ``facts`` is what decides about a trial's result besides what is varied, by its name. The seed
+    is of the draws; those of a command that goes on are not those of the first one again. A
+    :class:`UserError`: the study was begun with other facts, or its storage cannot be opened.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    name = str(options["study"])
+    if options["mode"] not in _DIRECTIONS:
+        raise UserError(f"search.mode={options['mode']}", "max or min", "choose one of them")
+    study = optuna.create_study(
+        storage=open_storage(str(options["storage"])),
+        study_name=name,
+        direction=_DIRECTIONS[str(options["mode"])],
+        load_if_exists=True,
+    )
+    begun_with = study.user_attrs.get(_FACTS)
+    if begun_with is None:
+        study.set_user_attr(_FACTS, json.dumps(dict(facts)))
+    else:
+        _check_same(json.loads(begun_with), facts, name)
+    study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.get_trials(deepcopy=False)))
+    return study
+
+
+def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
+    """Refuse to mix trials that cannot be compared."""
+    named = {key: FORMER_TARGETS.get(value, value) for key, value in before.items()}
+    before = {key: value for key, value in named.items() if not below(key, _NO_PART)}
+    keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+    if not keys:
+        return
+    shown = [f"{key}={now.get(key, 'absent')}" for key in keys[:_NUM_SHOWN]]
+    was = [f"{key}={before.get(key, 'absent')}" for key in keys[:_NUM_SHOWN]]
+    more = f" and {len(keys) - _NUM_SHOWN} more" if len(keys) > _NUM_SHOWN else ""
+    raise UserError(
+        f"{', '.join(shown)}{more}, while the study {study} was begun with {', '.join(was)}",
+        "the command that the study was begun with",
+        "choose another search.study=NAME",
+    )
+
+
+def outcome(folder: Path) -> tuple[TrialState, float | None]:
+    """Read from a job's folder how its trial ended; RUNNING where it has not.
+
+    A job without a finite objective has failed as a trial.
+    """
+    if (folder / record.PRUNED_FILE).is_file():
+        return TrialState.PRUNED, None
+    if (folder / record.FAILURE_FILE).is_file():
+        return TrialState.FAIL, None
+    if not (folder / record.METRICS_FILE).is_file():
+        return TrialState.RUNNING, None
+    value = record.read_json(folder / record.METRICS_FILE).get(record.OBJECTIVE)
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        return TrialState.FAIL, None
+    return TrialState.COMPLETE, float(value)

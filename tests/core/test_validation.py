@@ -1,0 +1,84 @@
+"""Plain values become typed objects; every mistake is one line with its name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.core.validation import STRICT, Mistake, Range, mistakes, parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    __pydantic_config__ = STRICT
+    share: Annotated[float, Range(0, 1, "part")] = 0.5
+    count: Annotated[int, Range(1, 9)] = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer:
+    __pydantic_config__ = STRICT
+    number: int
+    path: Path | None = None
+    inner: Inner = field(default_factory=Inner)
+    either: float | tuple[float, ...] = 1.0
+    node: Mapping[str, Any] = field(default_factory=dict)
+    choice: Literal["a", "b"] = "a"
+    many: tuple[Inner, ...] = ()
+
+
+def test_plain_values_become_typed():
+    given = {"number": 1, "path": "x/y", "inner": {"share": 1}, "either": [1, 2.5], "many": [{}]}
+    outer = parse(Outer, given)
+    assert outer == Outer(
+        number=1, path=Path("x/y"), inner=Inner(share=1.0), either=(1.0, 2.5), many=(Inner(),)
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "got", "allowed"),
+    [
+        ({}, "no root.number", "root.number=…"),
+        ({"number": "1"}, "root.number='1'", "an integer"),
+        ({"number": True}, "root.number=True", "an integer"),
+        ({"number": 1, "inner": {"share": 2}}, "root.inner.share=2", "a number from 0 to 1 (part)"),
+        ({"number": 1, "inner": {"share": math.nan}}, "root.inner.share=nan", "a finite number"),
+        ({"number": 1, "inner": {"count": 10}}, "root.inner.count=10", "an integer from 1 to 9"),
+        ({"number": 1, "inner": {"shar": 1}}, "root.inner.shar=1", "share, count"),
+        ({"number": 1, "many": [{}, {"no": 1}]}, "root.many[1].no=1", "share, count"),
+        ({"number": 1, "either": "x"}, "root.either='x'", "a finite number or a list"),
+        ({"number": 1, "choice": "c"}, "root.choice='c'", "a, b"),
+        ({"number": 1, "node": 3}, "root.node=3", "a mapping"),
+        ({"number": 1, "path": 3}, "root.path=3", "text"),
+        (3, "root=3", "a mapping"),
+    ],
+)  # fmt: skip
+def test_a_mistake_names_field_value_and_choices(given, got, allowed):
+    with pytest.raises(UserError) as caught:
+        parse(Outer, given, "root")
+    assert (caught.value.got, caught.value.allowed) == (got, allowed)
+
+
+@pytest.mark.parametrize("value", [{1, 2}, 10**5000, float], ids=["set", "endless", "class"])
+def test_what_no_file_holds_is_refused(value):
+    with pytest.raises(UserError):
+        parse(Outer, {"number": value}, "root")
+
+
+def test_all_mistakes_are_collected():
+    @dataclass
+    class Record:
+        a: int
+        b: list[float]
+
+    assert mistakes(Record, {"a": 1, "b": [0.5]}) == []
+    assert mistakes(Record, {"a": "x", "b": [1, "y"]}) == [
+        Mistake(("a",), "'x'", "an integer"),
+        Mistake(("b", 1), "'y'", "a finite number"),
+    ]

@@ -1,0 +1,195 @@
+"""Renders of a BOP data set's models learned, its own pictures measured: ``data=bop_renders``."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.results import PoseResult, write_results
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.sources.rendered import RenderedSource
+from dopepp.experiment.assembly.camera import fitted_to_camera
+from dopepp.experiment.assembly.parts import build_negatives, build_parts
+from dopepp.experiment.assembly.renders import validation_renders
+from dopepp.experiment.assembly.sources import build_datamodule, held_out_source
+from dopepp.geometry.camera import project_keypoints
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.parts.part import Mesh, make_part
+from dopepp.virtual import Factory
+from dopepp.virtual.presets.preset import customised_preset
+
+SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
+         "placement": {"nearest": 0.42, "farthest": 0.58}, "targets_per_image": [2, 2]}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Two coloured boxes and four pictures with depth, no training images, no masks."""
+    folder = tmp_path_factory.mktemp("bop") / "set"
+    parts = []
+    for name, size in (("red", 0.08), ("blue", 0.09)):
+        box = trimesh.creation.box((size, 0.7 * size, 0.5 * size))
+        shades = np.full((8, 3), (200, 30, 30) if name == "red" else (20, 40, 190), np.uint8)
+        mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32), colours=shades)
+        parts.append(make_part(name, mesh))
+    source = RenderedSource(Factory(parts, customised_preset("upright", SCENE), 3), 4, "test")
+    writer = BopWriter(folder, parts, split="test")
+    writer.prepare()
+    for index in range(4):
+        writer.write(index, source.sample(index))
+    writer.finalize(0, range(4))
+    return folder
+
+
+@pytest.fixture
+def config(parsed, root):
+    """The one option, and images that take no time."""
+
+    def make(*overrides):
+        given = ("data.samples_per_epoch=8", "data.batch_size=4", "data.num_val=2",
+                 "data.num_workers=0", "model.width=0.0625")  # fmt: skip
+        return parsed("data=bop_renders", f"data.root={root}", *given, *overrides)
+
+    return make
+
+
+def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
+    caplog.set_level("INFO")
+    given = config("virtual.preset=upright")
+    parts = build_parts(given.data)
+    chosen = fitted_to_camera(given, parts)
+    assert vars(chosen.data.virtual.camera) == {
+        "width": 96, "height": 64, "fx": 210.0, "fy": 211.0, "cx": 47.0, "cy": 30.0
+    }  # fmt: skip
+    near, far = chosen.data.virtual.working_distance
+    assert 0.40 <= near < far <= 0.60
+    assert chosen.plain["virtual"]["working_distance"] == [near, far]
+    assert "as they are annotated there" in caplog.text
+    module = build_datamodule(chosen.data, parts, 0)
+    names = [(split, info.name) for split, info in module.summary()]
+    assert names == [("train", "virtual"), ("val", "virtual"), ("test", "bop/test")]
+    assert isinstance(module.test_source, BopSource)
+    assert module.test_source.sample(0).K[0, 0] == 210.0
+    said = config("virtual.working_distance=[0.4,0.7]")
+    assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
+
+
+def test_pictures_without_annotation_have_a_camera_all_the_same(config, root, tmp_path):
+    private = shutil.copytree(root, tmp_path / "set")
+    for annotation in private.glob("**/scene_gt*.json"):
+        annotation.unlink()
+    given = config(f"data.root={private}", "virtual.preset=upright")
+    parts = build_parts(given.data)
+    with pytest.raises(UserError, match=r"no annotated object in bop/test.*working_distance="):
+        fitted_to_camera(given, parts)
+    said = config(f"data.root={private}", "virtual.working_distance=[0.4,0.7]")
+    virtual = fitted_to_camera(said, parts).data.virtual
+    assert (virtual.camera.fx, virtual.working_distance) == (210.0, (0.4, 0.7))
+
+
+def test_models_that_are_not_learned_are_shown_all_the_same(config):
+    given = config("virtual.preset=upright", "data.objects=[red]")
+    parts = build_parts(given.data)
+    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    assert [part.name for part in factory.parts] == ["red"]
+    assert factory.negatives[0].name == "blue"
+    assert build_negatives(given.data, parts)[0] is factory.negatives[0]  # read once
+
+
+def test_a_checkpoint_renders_its_own_parts_where_its_data_set_is_not(config, tmp_path):
+    given = config("data.objects=[red]")
+    parts = build_parts(given.data)
+    stored = fitted_to_camera(given, parts).stored_data()
+    elsewhere = {**stored, "root": str(tmp_path / "elsewhere")}
+    checkpoint = Checkpoint({}, {}, parts, (64, 64), 8, 1.0, data={"config": elsewhere})
+    source = validation_renders(checkpoint, tmp_path / "best.ckpt", 3)
+    preset, sample = source.factory.preset, source.sample(2)
+    assert (len(source), preset.name) == (3, "ycb")
+    assert "blue" not in [part.name for part in source.factory.negatives]
+    assert {one.label for one in sample.instances} <= {"red"}
+
+
+def test_a_model_of_the_same_mesh_is_no_other_part(config, root, tmp_path):
+    copy = shutil.copytree(root, tmp_path / "set")
+    models = copy / "models"
+    shutil.copy(models / "obj_000001.ply", models / "obj_000003.ply")
+    info = json.loads((models / "models_info.json").read_text())
+    info["3"] = {**info["1"], "name": "twin"}
+    (models / "models_info.json").write_text(json.dumps(info))
+    given = config(f"data.root={copy}", "virtual.preset=upright", "data.objects=[red]")
+    parts = build_parts(given.data)
+    factory = held_out_source(fitted_to_camera(given, parts).data, parts, "val").factory
+    assert "twin" not in [part.name for part in factory.negatives]
+    assert factory.negatives[0].name == "blue"
+
+
+def test_real_frames_among_renders_are_windows_of_the_same_scale(config, root):
+    given = config(
+        "virtual.preset=upright", "data.real_fraction=0.5", "data.image_sets.train=test",
+        "virtual.camera_scale=0.9",
+    )  # fmt: skip
+    parts = build_parts(given.data)
+    data = fitted_to_camera(given, parts).data
+    width, height = data.network_input
+    module = build_datamodule(data, parts, 0)
+    samples = [module.train_item(0, index) for index in range(8)]
+    by_source = {one.source: one for one in samples}
+    assert set(by_source) == {"bop/test", "virtual"}
+    cuboids = {part.name: part.cuboid for part in parts}
+    for sample in samples:
+        assert sample.size == (width, height)
+        assert sample.K[0, 0] == pytest.approx(0.9 * 210, rel=0.02)
+        for one in sample.instances:
+            shown = project_keypoints(cuboids[one.label], one.T_cam_obj, sample.K)
+            np.testing.assert_allclose(one.keypoints, shown, atol=1e-6)
+
+
+def test_labelled_training_images_must_be_there_where_a_share_of_them_is_asked_for(config):
+    data = config("data.real_fraction=0.5").data
+    with pytest.raises(UserError, match=r"data.image_sets.train=null with data.real_fraction=0.5"):
+        build_datamodule(data, build_parts(data), 0)
+
+
+def test_validation_is_on_renders_where_pictures_show_no_object(config, root, tmp_path, caplog):
+    empty = tmp_path / "set"
+    (empty / "val" / "000000" / "rgb").mkdir(parents=True)
+    (empty / "models").symlink_to(root / "models")
+    (empty / "test").symlink_to(root / "test")
+    (empty / "val" / "000000" / "rgb" / "000000.png").symlink_to(
+        root / "test" / "000000" / "rgb" / "000000.png"
+    )
+    camera = {"0": {"cam_K": [110.0, 0, 47, 0, 111, 30, 0, 0, 1], "depth_scale": 1}}
+    (empty / "val" / "000000" / "scene_camera.json").write_text(json.dumps(camera))
+    data = config(f"data.root={empty}", "data.image_sets.val=val").data
+    parts = build_parts(data)
+    assert held_out_source(data, parts, "val").describe()[0].name == "virtual"
+    assert "bop/val shows none of red, blue: validation is on renders" in caplog.text
+
+
+def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_path):
+    source = BopSource(root, bop_parts(root), "test", targets="auto")
+    numbers = {"red": 1, "blue": 2}
+    rows = [
+        PoseResult(0, index, numbers[one.label], 1.0, one.T_cam_obj)
+        for index in range(len(source))
+        for one in source.sample(index).instances
+    ]
+    path = tmp_path / "truth_set-test.csv"
+    write_results(path, rows)
+    done = call(
+        "evaluate.py", "data=bop_renders", f"data.root={root}", f"results={path}",
+        f"output_dir={tmp_path}", "virtual=default", code=0,
+    )  # fmt: skip
+    said = re.search(r"BOP, (\d+) targets: AR ([\d.]+)% \(VSD ([\d.]+)%", done.out)
+    assert said, done.out[-3000:]
+    assert float(said[2]) > 99
+    (metrics,) = tmp_path.glob("**/metrics.json")
+    scores = json.loads(metrics.read_text())["bop"]
+    assert scores["num_targets"] == sum(len(source.sample(i).instances) for i in range(4))
+    assert scores["ar_mssd"] == scores["ar_mspd"] == scores["add_or_s_01d"] == 1.0

@@ -1,0 +1,179 @@
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.assembly.parts import PAPER_OBJECTS, build_parts
+from dopepp.experiment.assembly.sources import build_datamodule, held_out_source, share_in_words
+from dopepp.experiment.assembly.system import build_untrained
+from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.results.measurement import measure_and_record
+from dopepp.experiment.results.record import METRICS_FILE, read_json
+from dopepp.experiment.run.evaluate import parts_of
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.row import shown_columns
+
+
+def counts(data: DataConfig) -> dict[tuple[str, str], tuple[int, int]]:
+    """(split, source) to (images, images per epoch)."""
+    module = build_datamodule(data, build_parts(data), seed=0)
+    return {
+        (split, info.name): (info.num_images, info.num_per_epoch or info.num_images)
+        for split, info in module.summary()
+    }
+
+
+def test_without_a_root_all_is_rendered_and_that_is_said_once(tiny, caplog):
+    data = tiny("data=hybrid", "data.parts=[servoholder,pivconnector]").data
+    with caplog.at_level(logging.WARNING):
+        assert counts(data) == {
+            ("train", "virtual"): (8, 8),
+            ("val", "virtual"): (2, 2),
+            ("test", "virtual"): (3, 3),
+        }
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == 1
+    assert "no real images were given" in lines[0]
+    assert "servoholder, pivconnector" in lines[0]
+
+
+def test_every_seed_is_measured_on_the_same_images_and_splits_share_none(tiny):
+    data = tiny().data
+    parts = build_parts(data)
+    one, other = (build_datamodule(data, parts, seed) for seed in (1, 2))
+    changed = build_datamodule(replace(data, eval_seed=5), parts, 1)
+    seen = [one.train_source.sample(0, 0).image.mean()]
+    for split in ("val_source", "test_source"):
+        images = [getattr(module, split).sample(0, 0).image for module in (one, other, changed)]
+        np.testing.assert_array_equal(images[0], images[1])
+        assert not np.array_equal(images[0], images[2])
+        seen.append(images[0].mean())
+    assert len(set(seen)) == 3
+
+
+def test_a_real_root_mixes_its_frames_with_renders_of_its_objects(parsed, ycb_root):
+    data = parsed(
+        "data=hybrid", f"data.root={ycb_root}", "data.samples_per_epoch=100", "data.num_workers=0"
+    ).data
+    parts = build_parts(data)
+    assert [part.name for part in parts] == list(PAPER_OBJECTS)
+    assert all(part.mesh is not None for part in parts)
+    # Half real; of the other half a fifth from data_syn, whose frames count as virtual.
+    assert counts(data) == {
+        ("train", "ycb_video/data"): (2, 50),
+        ("train", "virtual"): (100, 40),
+        ("train", "ycb_video/data_syn"): (6, 10),
+        ("val", "ycb_video/data"): (1, 1),
+        ("test", "ycb_video/data"): (1, 1),
+    }
+
+
+def test_an_object_in_no_training_source_is_named(parsed, ycb_root):
+    overrides = ("data=ycb_video", f"data.root={ycb_root}", "data.samples_per_epoch=32")
+    data = parsed(*overrides, "data.objects=[003_cracker_box,019_pitcher_base]").data
+    module = build_datamodule(data, build_parts(data), seed=0)
+    assert {info.name for _, info in module.summary()} == {"ycb_video/data"}
+    with pytest.raises(UserError, match="no instance of 019_pitcher_base in the training data"):
+        module.check_objects()
+
+
+def test_an_object_without_ground_truth_in_the_test_set_is_not_available(tiny, ycb_root, tmp_path):
+    objects = "data.objects=[003_cracker_box,010_potted_meat_can]"
+    config = tiny("data=hybrid", "virtual.preset=null", f"data.root={ycb_root}", objects)
+    data = replace(config.data, frames=("0050/000003",))
+    estimator = PoseEstimator(*build_untrained(config, build_parts(data)))
+    (report,) = measure_and_record(
+        {"dopepp": estimator}, parts_of([estimator], data), data, tmp_path, num_pictures=1
+    )
+    assert report.rows["003_cracker_box"].num_instances == 1
+    absent = read_json(tmp_path / METRICS_FILE)["objects"]["010_potted_meat_can"]
+    assert absent["num_instances"] == 0
+    assert absent["add_01d"] is None
+    row = report.rows["010_potted_meat_can"]
+    assert {one.heading: one.text(row) for one in shown_columns(row)}["ADD-0.1d %"] == "n/a"
+    # The mean is over the object that was there.
+    assert report.mean.add_01d == report.rows["003_cracker_box"].add_01d
+
+
+def test_a_users_mesh_with_its_unit(tiny, tmp_path):
+    path = tmp_path / "bracket.stl"
+    trimesh.creation.box((8.0, 5.0, 3.0)).export(path)
+    data = tiny(f"data.parts=['{path}']", "data.unit=cm").data
+    (part,) = build_parts(data)
+    assert part.name == "bracket"
+    assert part.diameter == pytest.approx(np.sqrt(0.08**2 + 0.05**2 + 0.03**2))
+    sample = held_out_source(data, [part], "test").sample(0, 0)
+    assert sample.instances[0].label == "bracket"
+    assert sample.instances[0].mask.any()
+
+
+@pytest.mark.parametrize(
+    ("override", "got"),
+    [
+        ("data.parts=[gear]", "unknown part 'gear'"),
+        ("data.parts=[gear.stl]", "gear.stl, no such file"),
+        ("data.parts=[]", "parts []"),
+        ("data.parts=[pivconnector,pivconnector]", "pivconnector"),
+        ("data.objects=[003_cracker_box]", "without data.root"),
+        ("data.frames=[0050/000003]", "without data.root"),
+        ("data=ycb_video", "data=ycb_video without data.root"),
+        ("data.root=/nowhere", "data.root=/nowhere, which is no folder"),
+        ("data.batch_size=9", "8 training images for batches of 9"),
+        ("virtual.preset=moon", "preset 'moon'"),
+        ("++virtual.scene.gravity=1", "'gravity' in preset quickstart"),
+        ("++virtual.scene.turning=free", "'free' for turning of preset quickstart"),
+        ("virtual.backgrounds=/nowhere", "/nowhere"),
+        ("data.masking.probability=2", "probability"),
+    ],
+)
+def test_a_mistake_in_the_data_is_one_line(override, got, tiny):
+    with pytest.raises(UserError) as error:
+        counts(tiny(override).data)
+    assert got in error.value.got
+    assert "\n" not in str(error.value)
+
+
+def test_a_mistake_in_the_camera_jitter_is_one_line(tiny):
+    with pytest.raises(UserError, match="shift=2") as error:
+        counts(tiny("data/jitter=camera", "data.jitter.shift=2").data)
+    assert "\n" not in str(error.value)
+
+
+def test_a_unit_matters_to_files_only(tiny):
+    (part,) = build_parts(tiny("data.unit=parsec").data)
+    assert part.name == "pivconnector"
+
+
+def test_preset_changes_reach_the_renders(tiny):
+    plain, changed = tiny(), tiny("++virtual.scene.horizontal_fov_deg=20")
+    fx = [
+        held_out_source(config.data, build_parts(config.data), "test").sample(0, 0).K[0, 0]
+        for config in (plain, changed)
+    ]
+    assert fx[1] == pytest.approx(64 / np.tan(np.radians(10)), rel=1e-6)
+    assert fx[0] < fx[1]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("data=bop",), "the last 10% of the images in train_pbr, because data.image_sets names it "
+         "for train and val as well: data.image_sets.train=none data.image_sets.val=none measures"),
+        (("data=bop", "data.image_sets.val=other"), "the last 20% of the images in train_pbr, "
+         "because data.image_sets names it for train as well: data.image_sets.train=none measures"),
+        (("data=ndds",), "the last 10% of the images in ., because"),
+        (("data=bop", "data.image_sets.test=test"), None),
+        (("data=bop", "data.image_sets.train=none", "data.image_sets.val=none"), None),
+        (("data=bop", "data/test=photoreal"), None),
+        (("data=ycb_video",), None),
+        (("data=virtual",), None),
+    ],
+)  # fmt: skip
+def test_a_share_of_a_folder_is_said_with_what_changes_it(overrides, words, tiny):
+    root = () if "data=virtual" in overrides else ("data.root=somewhere",)
+    said = share_in_words(tiny(*overrides, *root).data)
+    assert (said is None) == (words is None)
+    assert words is None or words in said

@@ -1,0 +1,94 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.assembly import system as built
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.sources import build_datamodule
+from dopepp.experiment.assembly.system import build_system, choose_precision, estimate_training_s
+from dopepp.experiment.config.run import TrainerConfig
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "vendor", "flags", "gpu_is_fast", "expected"),
+    [
+        ("cpu", "AuthenticAMD", "sse2 avx512_bf16", False, "bf16-mixed"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16", False, "32-true"),
+        ("cpu", "GenuineIntel", "sse2 avx512_bf16 amx_bf16", False, "bf16-mixed"),
+        ("cpu", "", "asimd bf16", False, "bf16-mixed"),
+        ("cpu", "AuthenticAMD", "sse2 avx2", True, "32-true"),
+        ("cpu", "", "", True, "32-true"),
+        ("cuda", "", "", True, "bf16-mixed"),
+        ("cuda", "AuthenticAMD", "avx512_bf16", False, "32-true"),
+        ("mps", "AuthenticAMD", "avx512_bf16", True, "32-true"),
+    ],
+)
+def test_bf16_is_taken_only_where_it_is_fast(
+    accelerator, vendor, flags, gpu_is_fast, expected, monkeypatch
+):
+    facts = {("vendor_id",): vendor, ("flags", "Features"): flags}
+    monkeypatch.setattr(built, "cpu_fact", lambda *names: facts[names])
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: gpu_is_fast)
+    assert choose_precision("auto", accelerator)[0] == expected
+    assert choose_precision("16-mixed", accelerator) == ("16-mixed", "as asked")
+
+
+def test_the_estimate_grows_with_the_run_and_leaves_the_network_alone(tiny):
+    config = tiny("model.backbone.batch_norm=true")
+    parts = build_parts(config.data)
+    module, system = build_datamodule(config.data, parts, 0), build_system(config, parts, "")
+    before = {name: value.clone() for name, value in system.network.state_dict().items()}
+    trainer = replace(config.trainer, max_epochs=1000, max_steps=-1)
+    long = estimate_training_s(system.network, module, trainer, "32-true")
+    trainer = replace(trainer, max_steps=2)
+    short = estimate_training_s(system.network, module, trainer, "32-true")
+    assert 0 < short < long
+    assert system.network.training
+    for name, value in system.network.state_dict().items():
+        assert torch.equal(value, before[name]), f"{name} has changed"
+    assert all(parameter.grad is None for parameter in system.network.parameters())
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, 1),
+        ({"devices": 1}, 1),
+        ({"devices": "1"}, 1),
+        ({"devices": [3]}, 1),
+        ({"devices": "3,"}, 1),
+        ({"devices": 1, "strategy": "ddp"}, 1),  # one process, whatever it is called
+        ({"devices": 2}, 2),
+        ({"devices": "2"}, 2),
+        ({"devices": [0, 1]}, 2),
+        ({"devices": "0,1"}, 2),
+        ({"devices": "auto", "accelerator": "cpu"}, 1),
+        ({"devices": "auto", "accelerator": "auto"}, 4),
+        ({"devices": -1, "accelerator": "gpu"}, 4),
+        ({"devices": "-1", "accelerator": "gpu"}, 4),
+        ({"devices": 1, "num_nodes": 2}, 2),
+        ({"devices": 2, "num_nodes": 3}, 6),
+    ],
+)
+def test_how_many_processes_there_will_be(options, count, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert TrainerConfig(max_epochs=1, **options).num_processes == count
+
+
+def test_processes_that_torchrun_has_started_count_too(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert TrainerConfig(max_epochs=1, devices=1).num_processes == 2
+
+
+@pytest.mark.parametrize("devices", [0, [], "all", 1.5, True, None, -2], ids=repr)
+def test_a_number_that_means_nothing_is_refused(devices):
+    with pytest.raises(UserError, match=r"trainer\.devices="):
+        _ = TrainerConfig(max_epochs=1, devices=devices).num_processes

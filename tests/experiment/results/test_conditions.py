@@ -1,0 +1,216 @@
+"""Shading and scale with methods whose answers are known, and untrained networks end to end."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.renders import scaled_test_renders
+from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.experiment.assembly.system import build_untrained
+from dopepp.experiment.results.conditions import (
+    SCALE,
+    SHADING,
+    Condition,
+    check_masks,
+    measure_scales,
+    measure_shading,
+    record_condition,
+)
+from dopepp.experiment.results.evaluators import Cost, FileMethod, FilePose, ImageId
+from dopepp.experiment.results.measurement import measure_and_record
+from dopepp.experiment.results.protocols import Protocols
+from dopepp.experiment.results.report import measure
+from dopepp.experiment.results.tables import ADD_01D, ADD_5CM, read_csv
+from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.parts.part import Part
+
+RATES = (ADD_5CM, ADD_01D)
+NUM_IMAGES = 6
+SHARES = (0.2, 0.6, 0.8)
+COLOUR = 255
+
+
+class Finder:
+    """Gives the true pose, a bit beside it, of the instances that it sees."""
+
+    def __init__(self, part: Part, offset: float, sees: Callable[[Sample, Instance], bool]) -> None:
+        self.parts: Sequence[Part] = [part]
+        self.offset, self.sees = offset, sees
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[FilePose], float | None]:
+        found = []
+        for one in sample.instances:
+            if self.sees(sample, one):
+                T = one.T_cam_obj.copy()
+                T[0, 3] += self.offset
+                found.append(FilePose(one.label, 1.0, T, one.keypoints))
+        return found, None
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        return Cost()
+
+
+class Discs:
+    """Noise with a disc on it, of which a third is visible."""
+
+    name = "discs"
+
+    def __init__(self, *, masks: bool = True, contrast: bool = True) -> None:
+        self.masks, self.contrast = masks, contrast
+
+    def __len__(self) -> int:
+        return NUM_IMAGES
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        rng = np.random.default_rng([9, index])
+        image = rng.integers(0, 200 if self.contrast else 1, (60, 80, 3), np.uint8)
+        rows, columns = np.mgrid[:60, :80]
+        mask = np.hypot(rows - 30, columns - 40) <= 15
+        image[mask] = COLOUR
+        T = np.eye(4)
+        T[:3, 3] = [0, 0, 0.5]
+        one = Instance("disc", T, np.zeros((9, 2)), 0.3, mask if self.masks else None)
+        return Sample(image, np.diag([80.0, 80, 1]), [one], None, self.name, str(index))
+
+
+def disc_finder(needed: float, offset: float) -> Finder:
+    """Finds the disc while a share of its 709 pixels is in sight."""
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (30, 3))
+    disc = Part("disc", cuboid_keypoints(points.min(0), points.max(0)), 0.1, points)
+
+    def sees(sample: Sample, one: Instance) -> bool:
+        return bool(np.count_nonzero((sample.image == COLOUR).all(axis=2)) >= needed * 709)
+
+    return Finder(disc, offset, sees)
+
+
+NEEDED = {"dope": 0.7, "dopepp": 0.3}
+METHODS = {"dope": disc_finder(0.7, 0.02), "dopepp": disc_finder(0.3, 0.005)}
+
+
+def run_shading(source: Discs, folder: Path, num_examples: int = 2) -> None:
+    reports = measure(METHODS, [source.sample(i) for i in range(NUM_IMAGES)], 0).reports
+    measured = measure_shading(METHODS, source, SHARES, 1, reports, num_examples)
+    record_condition(folder, SHADING, *measured, RATES)
+
+
+def check_pictures(folder: Path, condition: Condition, columns: int) -> None:
+    sheet = cv2.imread(str(folder / f"{condition.name}_examples.png"))
+    assert sheet.shape[1] > columns * 320
+    assert cv2.imread(str(folder / f"{condition.name}.png")).std() > 0
+
+
+def test_every_method_is_measured_at_every_share(tmp_path, capsys):
+    run_shading(Discs(), tmp_path)
+    rows = read_csv(tmp_path / "shading.csv")
+    # At 80 % less than a tenth of the object is left, and it counts all the same.
+    assert {row["num_instances"] for row in rows} == {str(NUM_IMAGES)}
+    assert {row["num_outside_tolerance"] for row in rows} == {"0"}
+    table = {(row["method"], float(row["share"])): row for row in rows}
+    assert list(table) == [(name, share) for name in METHODS for share in (0, *SHARES)]
+    for (method, share), row in table.items():
+        assert float(row["share_reached"]) == pytest.approx(share, abs=0.001)
+        found = 1 - share >= NEEDED[method]
+        assert float(row["pass_5cm"]) == found
+        assert float(row["add_01d"]) == (found and method == "dopepp")
+        assert float(row["miss_rate"]) == 1 - found
+        assert float(row["auc_10cm"]) == pytest.approx(found * (1 - METHODS[method].offset / 0.1))
+        assert row["median_rotation_deg"] == ("0.0" if found else "")
+    lines = (tmp_path / "shading.md").read_text().splitlines()
+    first = lines.index("| method | object | 0 % | 20 % | 60 % | 80 % |")
+    assert lines[first - 2] == "## ADD<5cm %"
+    assert lines[first + 2] == "| dope | disc | 100.0 | 100.0 | 0.0 | 0.0 |"
+    assert lines[first + 3] == "| dopepp | disc | 100.0 | 100.0 | 100.0 | 0.0 |"
+    assert "rotation °" in capsys.readouterr().out
+    check_pictures(tmp_path, SHADING, 4)
+
+
+def test_shares_that_are_not_reached_are_counted_and_said(tmp_path, caplog):
+    run_shading(Discs(contrast=False), tmp_path, 0)
+    said = f"At 60 %, {NUM_IMAGES} of {NUM_IMAGES} instances are not within 2 points"
+    assert said in caplog.text
+    assert said in (tmp_path / "shading.md").read_text()
+    assert not (tmp_path / "shading_examples.png").exists()
+
+
+def test_what_cannot_be_measured_is_refused_before_anything_is(tiny):
+    check_masks(Discs())
+    with pytest.raises(UserError, match="shading on discs, 6 images without an instance mask"):
+        check_masks(Discs(masks=False))
+    poses = FileMethod.__new__(FileMethod)
+    for condition in (SHADING, SCALE):
+        condition.check_methods(METHODS)
+        with pytest.raises(UserError, match=f"{condition.name} with results of posecnn"):
+            condition.check_methods({**METHODS, "posecnn": poses})
+    data = replace(tiny().data, root=Path("photos"))
+    with pytest.raises(UserError, match=r"scale=2 on the images in data\.root=") as error:
+        scaled_test_renders(data, [], 2.0)
+    assert "\n" not in str(error.value)
+
+
+def test_every_method_is_measured_at_every_scale(tiny, tmp_path, caplog):
+    data = tiny().data
+    (part,) = build_parts(data)
+    source = held_out_source(data, [part], "test")
+    scaled = {scale: scaled_test_renders(data, [part], scale) for scale in (0.5, 20.0)}
+    usual = [source.sample(index).instances[0] for index in range(3)]
+    far = [scaled[0.5].sample(index).instances[0] for index in range(3)]
+    for one, other in zip(usual, far, strict=True):
+        centre, farther = (i.T_cam_obj @ [*part.cuboid[8], 1] for i in (one, other))
+        np.testing.assert_allclose(farther[:3], 2 * centre[:3])
+    assert not any(scaled[20.0].sample(index).instances for index in range(3))  # too near to stand
+
+    farthest = 1.05 * max(one.T_cam_obj[2, 3] for one in usual)
+    methods = {
+        "dope": Finder(part, 0.02, lambda _, one: bool(one.T_cam_obj[2, 3] < farthest)),
+        "dopepp": Finder(part, 0.005, lambda *_: True),
+    }
+    unmoved = measure(methods, [source.sample(index) for index in range(3)], 1)
+    levels, tiles = measure_scales(methods, scaled, unmoved, 1)
+    record_condition(tmp_path, SCALE, levels, tiles, RATES)
+
+    rows = {(row["method"], float(row["scale"])): row for row in read_csv(tmp_path / "scale.csv")}
+    assert list(rows) == [(name, scale) for name in methods for scale in (0.5, 1, 20)]
+    for (method, scale), row in rows.items():
+        if scale == 20:
+            assert row["num_instances"] == "0"
+            assert (row["visible_fraction"], row["add_01d"]) == ("", "")
+            continue
+        found = method == "dopepp" or scale == 1
+        assert row["num_instances"] == "3"
+        assert float(row["visible_fraction"]) > 0.7
+        assert float(row["pass_5cm"]) == found
+        assert float(row["add_01d"]) == (method == "dopepp")
+        assert float(row["miss_rate"]) == 1 - found
+    note = "Instances that count at ×20: none; at ×1: 3, of which "
+    assert note in caplog.text
+    text = (tmp_path / "scale.md").read_text()
+    assert note in text
+    assert "| method | object | ×0.5 | ×1 | ×20 |" in text
+    assert "| dope | pivconnector | 0.0 | 100.0 | n/a |" in text
+    assert [tile.caption for tile in tiles] == [f"test/0/0, ×{scale}" for scale in ("0.5", 1, 20)]
+    check_pictures(tmp_path, SCALE, 3)
+
+
+def test_untrained_networks_end_to_end(tiny, tmp_path):
+    config = tiny("data.num_test=2")
+    data, parts = config.data, build_parts(config.data)
+    estimator = PoseEstimator(*build_untrained(config, parts))
+    both, protocols = {"dope": estimator, "dopepp": estimator}, Protocols(scales=(0.5,))
+    reports = measure_and_record(both, parts, data, tmp_path, num_pictures=2, protocols=protocols)
+    rows = read_csv(tmp_path / "scale.csv")
+    assert [(row["method"], row["scale"], row["num_instances"]) for row in rows] == [
+        (name, scale, "2") for name in both for scale in ("0.5", "1.0")
+    ]
+    for report, row in zip(reports, rows[1::2], strict=True):
+        assert float(row["auc_10cm"]) == report.rows["pivconnector"].auc_10cm
+    for name in ("scale.png", "scale_examples.png", "overlay.png"):
+        assert cv2.imread(str(tmp_path / name)) is not None, name

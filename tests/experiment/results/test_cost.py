@@ -1,0 +1,122 @@
+"""``job=cost``: counts of an untrained network, and times from picture to poses."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import DescribedSource
+from dopepp.drawing.pictures import read_rgb
+from dopepp.experiment.assembly.parts import build_parts
+from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.experiment.assembly.system import build_untrained, map_geometry
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.results.cost import (
+    WARM_UP,
+    RehearsedEstimator,
+    likely_maps,
+    measure_cost,
+    read_frames,
+    time_frames,
+)
+from dopepp.experiment.run.train import do_job
+from dopepp.geometry.camera import transform
+from dopepp.maps.encode import MapGeometry
+
+SMALL = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=4", "cost.batch_size=2")
+
+
+def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
+    config = parsed("experiment=table4_parameters", *SMALL, "model.width=1", "job=cost")
+    cost = measure_cost(config, tmp_path)
+    assert torch.is_grad_enabled()  # as before
+    assert cost.backbone_weights == 1_107_776
+    assert cost.input_size == (32, 32)
+    assert cost.picture_size == (128, 128)  # the quickstart's own
+    frames = read_frames(tmp_path / "frames.csv")
+    assert len(frames.seconds) == 4
+    assert (frames.network_seconds > 0).all()
+    assert (frames.recovery_seconds > 0).all()
+    assert (frames.seconds >= frames.network_seconds + frames.recovery_seconds).all()
+    record = json.loads((tmp_path / "cost.json").read_text())
+    assert record["parameters"] == cost.parameters
+    assert record["frames_per_s"] > 0
+    for field, seconds in (
+        ("ms_per_frame", frames.seconds),
+        ("network_ms", frames.network_seconds),
+        ("recovery_ms", frames.recovery_seconds),
+    ):
+        assert record[field] == pytest.approx(1000 * float(np.median(seconds)), rel=1e-2)
+    assert "maps to poses" in capsys.readouterr().out
+    assert read_rgb(tmp_path / "frame_rate.png").std() > 0
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("job=mow", "job='mow'; allowed: train, cost"),
+        ("cost.batch_size=0.5", "cost.batch_size=0.5"),
+        ("recovery.max_peaks=0", "recovery option max_peaks=0"),
+    ],
+)
+def test_impossible_jobs(composed, tmp_path, override, message):
+    with pytest.raises(UserError, match=message):
+        do_job(composed(*SMALL, "job=cost", override), tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def estimator_of(config: RunConfig) -> tuple[RehearsedEstimator, MapGeometry, DescribedSource]:
+    parts = build_parts(config.data)
+    network, description = build_untrained(config, parts)
+    geometry = map_geometry(config.maps, network.stride)
+    return (
+        RehearsedEstimator(network, description),
+        geometry,
+        held_out_source(config.data, parts, "test"),
+    )
+
+
+def test_an_untrained_networks_frames_end_in_the_pictures_poses(parsed):
+    """So recovery has as much to do as behind a trained network."""
+    estimator, geometry, source = estimator_of(
+        parsed("scale=laptop", "model.width=0.0625", "virtual.preset=wide")
+    )
+    samples = [source.sample(index) for index in range(8)]
+    passes = []
+    estimator.network.register_forward_hook(lambda *_: passes.append(1))
+    times = time_frames(estimator, samples, geometry, num_frames=2, seed=0)
+    assert len(passes) == WARM_UP + 2
+    assert (times.seconds > times.network_seconds).all()
+    points = estimator.parts[0].points
+    right = []
+    for sample in samples:
+        estimator.answer = likely_maps(sample, estimator, geometry, torch.Generator())
+        truth = transform(sample.instances[0].T_cam_obj, points)
+        found = estimator.predict(sample.image, sample.K)[:1]
+        errors = [np.linalg.norm(transform(one.T_cam_obj, points) - truth, axis=1) for one in found]
+        right.append(any(error.mean() < 0.1 * estimator.parts[0].diameter for error in errors))
+    assert sum(right) >= 7
+
+
+@pytest.mark.parametrize("size", ["[128,128]", "[96,64]"])
+def test_the_exchanged_maps_have_the_networks_own_shape(parsed, size):
+    """Pictures are padded no further than the network needs, not to the whole input."""
+    config = parsed(
+        "scale=laptop", "model.width=0.0625", "virtual.preset=paper", f"data.input_size={size}",
+        "data.parts=[servoholder,pivconnector]",
+    )  # fmt: skip
+    estimator, geometry, source = estimator_of(config)
+    sample, own = source.sample(0), []
+    estimator.answer = likely_maps(sample, estimator, geometry, torch.Generator())
+    estimator.network.register_forward_hook(lambda *args: own.append(args[-1][-1]))
+    estimator.predict(sample.image, sample.K)
+    ((belief, field),) = own
+    assert [one.shape for one in estimator.answer] == [belief[0].shape, field[0].shape]
+
+
+def test_frames_of_earlier_versions_are_those_of_the_network(tmp_path):
+    (tmp_path / "frames.csv").write_text("frame,seconds\n0,0.5\n1,0.25\n")
+    frames = read_frames(tmp_path / "frames.csv")
+    assert frames.network_seconds.tolist() == frames.seconds.tolist() == [0.5, 0.25]

@@ -1,0 +1,186 @@
+"""Another method's poses through the tables of an evaluation, and out of one again."""
+
+import csv
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.results import PoseResult, read_results, write_results
+from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.sample import Sample
+from dopepp.data.sources.rendered import rendered_sample
+from dopepp.experiment.results import display
+from dopepp.experiment.results.evaluators import image_id, object_numbers
+from dopepp.experiment.results.report import Report
+from dopepp.experiment.run.evaluate import evaluate
+from dopepp.metrics.row import PoseRow
+from dopepp.parts.catalogue import pivconnector, servoholder
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.presets.preset import PRESETS
+
+NUM_IMAGES = 4
+SPLITS = "data.image_sets={train: none, val: none, test: train_pbr}"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A BOP data set of two parts on every image."""
+    folder = tmp_path_factory.mktemp("two-parts")
+    parts = [servoholder(), pivconnector()]
+    factory = Factory(parts, PRESETS["bin"].resized(160, 120), seed=11)
+    writer = BopWriter(folder, parts)
+    writer.prepare()
+    for index in range(NUM_IMAGES):
+        writer.write(index, rendered_sample(factory.render(0, index), "virtual", str(index)))
+    writer.finalize(0, range(NUM_IMAGES))
+    return folder
+
+
+def results(root: Path, offset: float = 0.0) -> list[PoseResult]:
+    """Return the truth, moved along x, with scores and times."""
+    parts = bop_parts(root)
+    numbers = {part.name: number for number, part in enumerate(parts, 1)}
+    source = BopSource(root, parts, "train_pbr")
+    poses = []
+    for index in range(len(source)):
+        for one in source.sample(index).instances:
+            T = one.T_cam_obj.copy()
+            T[0, 3] += offset
+            poses.append(PoseResult(0, index, numbers[one.label], 0.5, T, 0.25))
+    return poses
+
+
+def options(root: Path, *others: str) -> list[str]:
+    return ["data=bop", f"data.root={root}", SPLITS, "num_pictures=1", *others]
+
+
+def test_a_file_goes_through_tables_and_curves_and_comes_back(root, composed, tmp_path, capsys):
+    path = tmp_path / "posecnn_two-test.csv"
+    write_results(path, results(root, 0.002))
+    config = composed(*options(root, f"results={path}", "bop_csv=true"), config="evaluate")
+    (report,) = evaluate(config, tmp_path / "run")
+    assert report.name == report.mean.method == "posecnn"
+    assert report.cost.ms_per_frame == 250
+    assert (report.cost.parameters, report.cost.gmacs) == (None, None)
+    for name in ("servoholder", "pivconnector"):
+        counted = [error for error in report.errors[name] if np.isfinite(error)]
+        assert counted == pytest.approx([0.002] * len(counted), rel=1e-6)
+        assert report.rows[name].ar_mssd == 1
+        assert report.rows[name].ar_mspd is not None
+        assert report.rows[name].average_precision == 1
+    shown = capsys.readouterr().out
+    assert "AR_MSPD %" in shown
+    assert "ADD-S-0.1d %" not in shown
+
+    written = tmp_path / "run" / f"posecnn_{root.name.replace('-', '')}-train-pbr.csv"
+    for back, one in zip(read_results(written, {1, 2}), read_results(path, {1, 2}), strict=False):
+        np.testing.assert_allclose(back.T_cam_obj[:3, 3], one.T_cam_obj[:3, 3], atol=1e-6)
+    again = composed(*options(root, f"results={written}", "method=again"), config="evaluate")
+    (second,) = evaluate(again, tmp_path / "second")
+    assert {name: vars(row) | {"method": ""} for name, row in second.rows.items()} == {
+        name: vars(row) | {"method": ""} for name, row in report.rows.items()
+    }
+    record = json.loads((tmp_path / "second" / "metrics.json").read_text())
+    assert record["objects"]["mean"]["ar_mspd"] == report.mean.ar_mspd
+    with (tmp_path / "second" / "auc.csv").open() as stream:
+        assert next(csv.reader(stream))[1:] == ["servoholder", "pivconnector"]
+
+
+def test_a_folder_is_the_networks_whatever_file_is_measured_beside_it(root, composed, tmp_path):
+    path = tmp_path / "other_two-test.csv"
+    write_results(path, results(root))
+    network = ("ckpt_path=pretrained/pivconnector", "refine=region")
+    config = composed(*options(root, f"results={path}", *network), config="evaluate")
+    reports = evaluate(config, tmp_path / "run")
+    assert [one.name for one in reports] == ["dopepp_fast", "dopepp_fast + region", "other"]
+    written = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert written == reports[0].to_record()
+    assert written["refined"]["name"] == "dopepp_fast + region"
+    assert "| other " not in (tmp_path / "run" / "README.md").read_text()
+
+
+def test_poses_beside_the_test_set_are_left_out(root, composed, tmp_path, caplog):
+    poses = results(root)
+    elsewhere = PoseResult(7, 0, 1, 0.9, poses[0].T_cam_obj)
+    path = tmp_path / "results.csv"
+    write_results(path, [*poses, elsewhere])
+    arguments = options(root, f"results={path}", "data.objects=[pivconnector]", "num_pictures=0")
+    (report,) = evaluate(composed(*arguments, config="evaluate"), tmp_path / "run")
+    assert list(report.rows) == ["pivconnector", "mean"]
+    others = sum(one.obj_id == 1 for one in poses)
+    assert f"left out 1 poses on images that are not in the test set and {others} of" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scene_id": 3}, r"poses are all on other images, the first in scene 3, image 0"),
+        ({"obj_id": 9}, r"line 2: obj_id 9; allowed: the data set's objects: 1, 2"),
+        ({"T_cam_obj": np.diag([2.0, 2, 2, 1])}, r"line 2: R '2\.0 0\.0"),
+    ],
+)
+def test_a_file_that_does_not_fit_the_data(change, message, root, composed, tmp_path):
+    path = tmp_path / "results.csv"
+    one = vars(results(root)[0])
+    write_results(path, [PoseResult(**{**one, **change})])
+    config = composed(*options(root, f"results={path}"), config="evaluate")
+    with pytest.raises(UserError, match=message) as error:
+        evaluate(config, tmp_path / "run")
+    assert "results.csv" in str(error.value)
+
+
+def test_an_evaluation_needs_something_to_measure(composed, tmp_path):
+    with pytest.raises(UserError, match=r"got no ckpt_path; allowed: ckpt_path=… or results=…"):
+        evaluate(composed(config="evaluate"), tmp_path)
+    with pytest.raises(UserError, match=r"x\.csv, which names no data; .*data=…"):
+        evaluate(composed("results=x.csv", config="evaluate"), tmp_path)
+    with pytest.raises(UserError, match=r"x\.csv, which does not say how to render"):
+        evaluate(composed("results=x.csv", "data=virtual", config="evaluate"), tmp_path)
+    with pytest.raises(UserError, match=r"got refine=region without ckpt_path; .*leave refine out"):
+        evaluate(composed("results=x.csv", "refine=region", config="evaluate"), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("source", "key", "expected"),
+    [
+        ("bop/test", "000048/000017", (48, 17)),
+        ("webdataset/shards", "000048_000017", (48, 17)),
+        ("ycb_video/data", "0050/000003", (50, 3)),
+        ("virtual", "test/0/12", (0, 5)),
+        ("ndds/folder", "12/000034", (0, 5)),
+        ("webdataset/shards", "photo-7", (0, 5)),
+    ],
+)
+def test_images_have_bops_numbers_or_their_place(source, key, expected):
+    sample = Sample(np.zeros((1, 1, 3), np.uint8), np.eye(3), source=source, key=key)
+    assert image_id(sample, 5) == expected
+
+
+def test_objects_have_their_data_sets_numbers(root, ycb_root):
+    piv = pivconnector()
+    bop: Any = SimpleNamespace(root=root, format="bop")
+    assert object_numbers(bop, [piv]) == {"servoholder": 1, "pivconnector": 2}
+    frames: Any = SimpleNamespace(root=ycb_root, format="ycb_video")
+    ycb = object_numbers(frames, [])
+    assert len(ycb) == 21
+    assert (ycb["002_master_chef_can"], ycb["003_cracker_box"]) == (1, 2)
+    bop.root = None
+    assert object_numbers(bop, [piv]) == {"pivconnector": 1}
+
+
+@pytest.mark.parametrize(("num", "everything"), [(1, False), (2, False), (1, True)])
+def test_symmetric_measures_are_shown_where_there_are_symmetries(num, everything, capsys):
+    row = PoseRow("part", "x", 3, 0.5, add_s_01d=0.75, num_symmetries=num)
+    report = Report("x", {"part": row, "mean": row}, {}, {}, None, 3)
+    display.show_report(report, everything)
+    shown = capsys.readouterr().out
+    assert ("ADD-S-0.1d %" in shown) == ("rotation-S" in shown) == (num > 1 or everything)
+    assert "ADD-0.1d %" in shown

@@ -1,0 +1,67 @@
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopepp.experiment.results import record
+from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.report import FULL_SIZE_COST, Report
+from dopepp.metrics.row import PoseRow
+
+
+def make_report(share: float | None = 0.5) -> Report:
+    def rows(method: str, share: float | None) -> dict[str, PoseRow]:
+        return {
+            label: PoseRow(label, method, 4, share, 1.0, 1.0, share, 1.0, 0.9, 12.0, 0.003)
+            for label in ("part0", "part1", "mean")
+        }
+
+    errors = {label: np.array([0.001, 0.02, np.inf, 0.3]) for label in ("part0", "part1")}
+    references = {"best constant pose": rows("best constant pose", 0.2)}
+    return Report("dopepp", rows("dopepp", share), references, errors, Cost(1, 1.5, 7.25), 4)
+
+
+@settings(max_examples=30)
+@given(
+    errors=st.lists(st.floats(0, 10) | st.just(np.inf), max_size=5),
+    share=st.none() | st.floats(0, 1),
+    ms=st.none() | st.floats(0, 1e6),
+)
+def test_a_report_survives_json(errors, share, ms):
+    report = make_report(share)
+    report.errors["part0"] = np.array(errors, np.float64)
+    report.rotation_deg = {"part0": np.array(errors, np.float64) * 10}
+    report.diameters, report.test_set = {"part0": 0.1}, "abc"
+    report.cost = Cost(1, 2.0, ms)
+    report.details = {"checkpoint": "best.ckpt", FULL_SIZE_COST: vars(Cost(9, 8.0, 7.0))}
+    report.refined = make_report(share)
+    text = json.dumps(report.to_record(), allow_nan=False)
+    back = Report.from_record(json.loads(text))
+    np.testing.assert_array_equal(back.errors["part0"], report.errors["part0"])
+    np.testing.assert_array_equal(back.rotation_deg["part0"], report.rotation_deg["part0"])
+    assert (back.diameters, back.test_set) == ({"part0": 0.1}, "abc")
+    assert back.rows == report.rows
+    assert back.references == report.references
+    assert (back.name, back.cost, back.num_images) == ("dopepp", report.cost, 4)
+    assert back.details == report.details
+    assert back.refined is not None
+    assert back.refined.to_record() == report.refined.to_record()
+
+
+def test_a_report_of_an_earlier_version_is_read():
+    stored = make_report().to_record()
+    for key in ("rotation_deg", "diameters", "test_set"):
+        del stored[key]
+    back = Report.from_record(stored)
+    assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
+    assert back.refined is None
+
+
+def test_json_that_nobody_else_could_read_is_not_written(tmp_path):
+    path = tmp_path / "x.json"
+    record.write_json(path, {"a": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        record.write_json(path, {"a": float("nan")})
+    assert record.read_json(path) == {"a": 1}

@@ -1,0 +1,64 @@
+"""The fingerprint of a test set changes with what is measured, and with nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.run.images import Fingerprint
+from dopepp.parts.catalogue import pivconnector, servoholder
+
+
+def sample(key: str = "0/1") -> Sample:
+    T = np.eye(4)
+    T[:3, 3] = 0.01, -0.02, 0.4
+    one = Instance("pivconnector", T, np.zeros((9, 2)), 0.8)
+    return Sample(
+        np.zeros((4, 6, 3), np.uint8), np.diag([600.0, 600.0, 1.0]), [one], None, "s", key
+    )
+
+
+def word(*samples: Sample) -> str:
+    fingerprint = Fingerprint([pivconnector()])
+    for one in samples:
+        fingerprint.add(one)
+    return fingerprint.word()
+
+
+def test_the_same_images_have_one_word():
+    again = sample()
+    again.image += 1  # pixels may differ in a bit from machine to machine
+    again.instances[0].T_cam_obj = again.instances[0].T_cam_obj + 1e-10
+    again.instances[0].T_cam_obj[0, 1] = -0.0
+    again.instances[0].visible_fraction = 0.81
+    assert word(sample()) == word(again)
+
+
+ONE = sample().instances[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"instances": [replace(ONE, **fields)]} for fields in (
+            {"T_cam_obj": ONE.T_cam_obj + 1e-4}, {"label": "servoholder"},
+            {"visible_fraction": 0.05}, {"masked_fraction": 0.4},
+        )),
+        {"instances": []},
+        {"key": "0/2"},
+        {"source": "photoreal"},
+        {"K": np.diag([606.0, 606.0, 1.0])},
+        {"image": np.zeros((6, 4, 3), np.uint8)},
+    ],
+)  # fmt: skip
+def test_other_images_have_another(change):
+    assert word(sample()) != word(replace(sample(), **change))
+
+
+def test_number_order_and_objects_count():
+    a, b = sample("a"), sample("b")
+    assert len({word(a), word(a, b), word(b, a), word(a, b, b)}) == 4
+    fingerprint = Fingerprint([pivconnector(), servoholder()])
+    fingerprint.add(a)
+    assert fingerprint.word() != word(a)

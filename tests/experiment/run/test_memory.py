@@ -1,0 +1,67 @@
+"""What tuning makes once: pictures and maps; and that it is the same as made anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.run.memory import Memory
+from dopepp.geometry.camera import camera_matrix
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.spec import build_network
+from dopepp.parts import load_part
+
+K = camera_matrix(100, 100, 31.5, 31.5)
+
+
+class Noise:
+    """Pictures of noise, and how often each was asked for."""
+
+    name = "noise"
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, int]] = []
+
+    def __len__(self) -> int:
+        return 3
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        self.asked.append((index, epoch))
+        image = np.random.default_rng([index, epoch]).integers(0, 256, (64, 64, 3), np.uint8)
+        mask = np.zeros((64, 64), bool)
+        return Sample(image, K, [Instance("servoholder", np.eye(4), np.zeros((9, 2)), mask=mask)])
+
+
+def test_a_sources_items_are_made_once_as_far_as_memory_goes():
+    source, other = Noise(), Noise()
+    memory = Memory(most_bytes=2 * 64 * 64 * 4)  # of two pictures with their masks
+    remembered, its = memory.of(source), memory.of(other)
+    assert len(remembered) == 3
+    for _ in range(2):
+        for index in range(3):
+            assert (remembered.sample(index).image == source.sample(index).image).all()
+    assert [source.asked.count((index, 0)) for index in range(3)] == [3, 3, 4]
+    remembered.sample(0, epoch=1)
+    assert (0, 1) in source.asked
+    its.sample(0)
+    assert other.asked == [(0, 0)]  # no other source's item
+
+
+def test_a_network_runs_once_on_a_picture(tiny_spec):
+    torch.manual_seed(0)
+    network = build_network(tiny_spec)
+    part = load_part("servoholder")
+    checkpoint = Checkpoint(tiny_spec, network.state_dict(), [part], (64, 64), 8, 1.0, {})
+    estimator = PoseEstimator(network, checkpoint)
+    passes: list[int] = []
+    estimator.network.register_forward_hook(lambda *_: passes.append(1))
+    remembering = Memory().behind(estimator)
+    first, second = (Noise().sample(index).image for index in range(2))
+    for image in (first, second, first, first[::-1].copy(), second):
+        for one, same in zip(remembering.maps(image), estimator.maps(image), strict=True):
+            torch.testing.assert_close(one, same, rtol=0, atol=0)
+    assert len(passes) == 5 + 3
+    remembering.recovery = None  # its own: the estimator's stays
+    assert estimator.recovery is not None

@@ -1,0 +1,205 @@
+"""What may change between the parts of one run, and what a run's folder may say."""
+
+import contextlib
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.experiment.results import record
+from dopepp.experiment.run.images import describe_images, differing_images
+from dopepp.experiment.run.resume import (
+    check_resume,
+    config_differences,
+    read_overrides,
+    trusted_overrides,
+)
+from dopepp.models.checkpoint.schema import Checkpoint
+
+
+class Pictures:
+    """A source of one image."""
+
+    name = "pictures"
+
+    def __init__(self, level: int = 100, shift: float = 0.0, **identity: object) -> None:
+        self.level, self.shift, self.identity = level, shift, identity
+
+    def __len__(self) -> int:
+        return 1
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        image = np.full((48, 64, 3), self.level, np.uint8)
+        T = np.eye(4)
+        T[2, 3] = 0.5 + self.shift
+        return Sample(image, np.eye(3), [Instance("part", T, np.zeros((9, 2)))], None, "x", "0")
+
+    def describe(self) -> list[SourceInfo]:
+        return [SourceInfo(self.name, 1, self.identity)]
+
+    def contains(self, label: str) -> bool:
+        return True
+
+
+def test_a_description_of_images_tells_what_is_another():
+    first = describe_images(Pictures(files="ab" * 32, parts={"a": "1"}))
+    # Through a file and back, and with another machine's rounding, it is the same.
+    again = yaml.safe_load(yaml.safe_dump(first))
+    rounded = describe_images(Pictures(101, 1e-7, files="ab" * 32, parts={"a": "1"}))
+    assert differing_images(first, again) == []
+    assert differing_images(first, rounded) == []
+    for other, expected in (
+        (Pictures(files="cd" * 32, parts={"a": "1"}), "0 pictures.files: abab"),
+        (Pictures(files="ab" * 32, parts={"a": "2"}), "0 pictures.parts.a: 1 → 2"),
+        (Pictures(files="ab" * 32), "0 pictures.parts.a: 1 → None"),
+        (Pictures(100, 0.01, files="ab" * 32, parts={"a": "1"}), "labels of the first image"),
+        (Pictures(110, 0.0, files="ab" * 32, parts={"a": "1"}), "pixels of the first image"),
+    ):
+        (line,) = differing_images(first, describe_images(other))
+        assert line.startswith(expected)
+        assert len(line) < 120
+
+
+@pytest.fixture
+def resumed(tiny, tmp_path):
+    """Resume a run with these overrides and say which differences are accepted."""
+    (tmp_path / "run").mkdir()
+    started = tiny()
+    record.write_config(tmp_path / "run", started.plain)
+    images = {split: describe_images(Pictures()) for split in ("train", "val", "test")}
+
+    def go_on(*overrides: str, spec: str = "a", **splits: Pictures) -> list[str]:
+        saved = Checkpoint({"net": "a"}, {}, [], (64, 64), 8, 1.0, data={"images": images})
+        present = {**images, **{name: describe_images(one) for name, one in splits.items()}}
+        payload = {"spec": {"net": spec}, "data": {"images": copy.deepcopy(present)}}
+        config = tiny(*overrides) if overrides else started
+        accepted = check_resume(tmp_path / "run", config, saved, payload)
+        return [str(one) for one in accepted]
+
+    return go_on
+
+
+ACCEPTED = {
+    "trainer.max_epochs=9": "trainer.max_epochs: 1 → 9",
+    "data.num_workers=3": "data.num_workers: 0 → 3",
+    "data.num_test=9": "data.num_test: 3 → 9",
+    "data/test=photoreal": "data.test.renderer: None → photoreal",
+    "data.cache_dir=/x": "data.cache_dir: None → /x",
+    "optimizer.weight_decay=0.5": "optimizer.weight_decay: 0.01 → 0.5",
+    "trainer.precision=32-true": "trainer.precision: auto → 32-true",
+    "callbacks.overlays.num_images=3": "callbacks.overlays.num_images: 12 → 3",
+    "recovery.max_peaks=3": "recovery.max_peaks: 16 → 3",
+    "logger=tensorboard": "logger.tensorboard.name: not set → tensorboard",
+}
+
+
+def test_how_a_run_goes_on_may_change_and_is_told(resumed):
+    accepted = resumed(*ACCEPTED)
+    assert set(ACCEPTED.values()) <= set(accepted)
+    assert len(accepted) < len(ACCEPTED) + 5  # what hangs on them: the other logger's options
+
+
+def test_nothing_is_told_where_nothing_changed(resumed):
+    assert resumed() == []
+    assert resumed("output_dir=/elsewhere", "resume=x", "resume_anyway=true") == []
+    assert resumed(test=Pictures(50)) == []  # other test images change nothing that is learnt
+
+
+LEARNT_FROM = {
+    "seed=1": "seed: 0 → 1",
+    "data.batch_size=2": "data.batch_size: 4 → 2",
+    "data.samples_per_epoch=4": "data.samples_per_epoch: 8 → 4",
+    "data.cache=memory": "data.cache: none → memory",  # its epochs are all the same
+    "virtual.preset=table": "virtual.preset: quickstart → table",
+    "++virtual.scene.turning.tilt_deg=5": "virtual.scene.turning.tilt_deg: not set → 5",
+    "data.masking.probability=0.1": "data.masking.probability: 0.5 → 0.1",
+    "data/augment=none": "data.augment._target_: dopepp.data.transforms.augment.Photometric → None",
+    "maps.sigma=2.0": "maps.sigma: 1.0 → 2.0",
+    "symmetry=none": "symmetry.canonical: True → False",
+    "model/loss=mse": "model.loss._target_: dopepp.models.losses.SpatialCrossEntropy → ",
+    "trainer.accumulate_grad_batches=2": "trainer.accumulate_grad_batches: 1 → 2",
+    "trainer.devices=2": "trainer.devices: 1 → 2",
+}
+
+
+def test_what_is_learnt_from_changes_only_when_that_is_said(resumed):
+    harmless = "trainer.max_epochs=9"
+    with pytest.raises(UserError, match="with other data or another loss") as error:
+        resumed(*LEARNT_FROM, harmless)
+    for line in LEARNT_FROM.values():
+        assert line in error.value.got
+    assert "max_epochs" not in error.value.got
+    assert error.value.fix.endswith("add resume_anyway=true")
+    accepted = resumed(*LEARNT_FROM, harmless, "resume_anyway=true")
+    for line in (*LEARNT_FROM.values(), "trainer.max_epochs: 1 → 9"):
+        assert sum(one.startswith(line) for one in accepted) == 1, line
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_images_that_changed_behind_the_same_options_are_other_data(split, resumed):
+    changed: dict[str, Any] = {split: Pictures(50)}
+    with pytest.raises(UserError, match=rf"{split} images: as trained on → others \(pixels of"):
+        resumed(**changed)
+    assert len(resumed("resume_anyway=true", **changed)) == 1
+
+
+@pytest.mark.parametrize("anyway", ["true", "false"])
+def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resumed):
+    with pytest.raises(UserError, match=r"network differs.*model\.width: 0\.0625 → 0\.5") as error:
+        resumed("model.width=0.5", f"resume_anyway={anyway}", spec="b")
+    assert "init_from=" in error.value.fix
+    with pytest.raises(UserError, match="the number of objects"):
+        resumed(f"resume_anyway={anyway}", spec="b")
+    with pytest.raises(UserError, match=r"another optimiser \(optimizer\._target_: .*Muon → .*SGD"):
+        resumed("optimizer=sgd", f"resume_anyway={anyway}")
+
+
+def test_a_run_that_wrote_no_config_is_compared_by_its_checkpoint(resumed, tmp_path):
+    (tmp_path / "run" / record.CONFIG_FILE).unlink()
+    assert resumed("seed=1") == []
+    with pytest.raises(UserError, match="network differs"):
+        resumed(spec="b")
+
+
+def test_an_option_that_a_later_version_added_is_no_difference():
+    assert config_differences({"data": {"a": 1}}, {"data": {"a": 1, "new": None}}) == []
+
+
+def test_a_runs_own_overrides_are_kept():
+    stored = [
+        "model=dope", "data/augment=none", "data.parts=[pivconnector]", "+trainer.num_nodes=1",
+        "++virtual.scene.turning={tilt_deg: 3}", "~callbacks.overlays", "output_dir=/a b/ö=1",
+        "logger=wandb", "experiment=quickstart", "optimizer._target_=torch.optim.RMSprop",
+        "resume=/x", "resume_anyway=true", "hydra.run.dir=/x",
+    ]  # fmt: skip
+    assert trusted_overrides(stored, Path("overrides.yaml")) == stored[:10]
+
+
+OF_HYDRA = (
+    "hydra.callbacks.x._target_=os.system", "+hydra.callbacks.x={_target_: sympy.sympify, a: x}",
+    "++hydra.callbacks.x._target_=torch.load", "hydra/launcher=joblib", "+hydra/launcher=x",
+    "hydra/sweeper@x=y", "override hydra/launcher=x", "hydra.sweeper._target_=os.system",
+    "hydra.launcher._target_=torch.utils.collect_env.run", "hydra.searchpath=[file:///tmp/evil]",
+    "hydra.mode=MULTIRUN", "~hydra.callbacks", "+logger@hydra.callbacks=wandb",
+    "+logger@_global_.hydra.callbacks=wandb", "hydra={callbacks: {x: {_target_: os.system}}}",
+    " hydra.mode=MULTIRUN", "--config-dir=/tmp/evil", "-cd=/tmp", "--multirun", "-m",
+    "--config-path", "",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", OF_HYDRA)
+def test_nothing_of_hydras_own_comes_from_a_runs_folder(text):
+    """Hostile files are in tests/security/test_hostile_runs.py."""
+    kept = []
+    with contextlib.suppress(UserError):
+        kept = trusted_overrides(["model=dope", text], Path("overrides.yaml"))
+    assert kept in ([], ["model=dope"])
+
+
+def test_a_folder_without_overrides_has_none(tmp_path):
+    assert read_overrides(tmp_path) is None

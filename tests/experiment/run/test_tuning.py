@@ -1,0 +1,220 @@
+"""Weights and threshold from detections; the tuned checkpoint beside the old one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dopepp.core.errors import UserError
+from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.run.tuning import (
+    HIDDEN,
+    FalsePositiveTarget,
+    Hidden,
+    Scored,
+    choose,
+    fit_factors,
+    joined,
+    matched_poses,
+    score_images,
+    write_tuned,
+)
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.metrics.functional import expected_calibration_error
+from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.spec import build_network
+from dopepp.parts import load_part
+from dopepp.recovery.calibration import FEATURES, score
+from dopepp.recovery.detection import Detection
+
+K = camera_matrix(300, 300, 64, 64)
+NOTHING = Scored(
+    np.zeros((0, len(FEATURES))), np.zeros(0), np.zeros(0, bool), np.zeros(0, int), 100, 0
+)
+
+
+def scored(seed: int, count: int, right: bool = True) -> Scored:
+    """Detections whose belief and spread say how likely they are right."""
+    rng = np.random.default_rng(seed)
+    features = np.column_stack([np.ones(count), rng.normal(size=(count, 4)) - (0 if right else 2)])
+    truth = score(features, np.array([0.0, 2.0, -1.0, -0.5, 0.0]))
+    correct = (rng.random(count) < truth) & right
+    image = rng.permutation(count)
+    return Scored(features, rng.random(count), correct, image, count, count)
+
+
+def test_chosen_scores_are_calibrated_and_silent_on_other_images():
+    options = choose(scored(0, 3000), scored(1, 1000, right=False))
+    weights = np.array([options[f"score_{name}"] for name in FEATURES])
+    shown, empty = scored(2, 3000), scored(3, 1000, right=False)
+    scores = np.concatenate([score(one.features, weights) for one in (shown, empty)])
+    correct = np.concatenate([shown.correct, empty.correct])
+    assert expected_calibration_error(torch.from_numpy(scores), torch.from_numpy(correct)) < 0.05
+    loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
+    assert loud.mean() <= 4 * FalsePositiveTarget.false_positive_rate
+    assert options["min_score"] < 1
+
+
+def test_the_threshold_lets_no_more_pass_than_it_may():
+    shown, empty = scored(4, 500), scored(5, 250, right=False)
+    for rate in (0.0, 0.005, 0.1):
+        options = choose(shown, empty, rate)
+        weights = np.array([options[f"score_{name}"] for name in FEATURES])
+        loud = empty.loudest(score(empty.features, weights)) >= options["min_score"]
+        assert loud.sum() == int(rate * 250)
+    assert choose(shown, empty, 1.0)["min_score"] == 0.0
+
+
+def test_silence_needs_no_threshold():
+    assert choose(scored(6, 300), NOTHING)["min_score"] < 1e-300
+
+
+@pytest.mark.parametrize(("correct", "what"), [(False, "wrong"), (True, "right")])
+def test_nothing_to_learn_from_is_said(correct, what):
+    with pytest.raises(UserError, match=f"all of them {what}"):
+        choose(replace(scored(7, 50), correct=np.full(50, correct)), NOTHING)
+    with pytest.raises(UserError, match="no detection on any"):
+        choose(NOTHING, NOTHING)
+
+
+class Images:
+    """Two images of one part: at a place, and nowhere."""
+
+    name = "two"
+
+    def __init__(self, T: np.ndarray, visible_fraction: float = 1.0) -> None:
+        keypoints = project_keypoints(PART.cuboid, T, K)
+        instance = Instance(PART.name, T, keypoints, visible_fraction)
+        blank = np.zeros((128, 128, 3), np.uint8)
+        self.samples = [Sample(blank, K, [instance]), Sample(blank, K)]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def sample(self, index: int, epoch: int) -> Sample:
+        return self.samples[index]
+
+
+PART = load_part("pivconnector")
+POSE = make_transform(np.eye(3), np.array([0.0, 0.0, 0.5]))
+
+
+def found(T: np.ndarray, certainty: float, shift: float = 0.0) -> Detection:
+    """A detection at a pose, shifted by a share of the part's diameter."""
+    moved = T.copy()
+    moved[0, 3] += shift * PART.diameter
+    keypoints = project_keypoints(PART.cuboid, moved, K)
+    return Detection(
+        PART.name, certainty, certainty, moved, keypoints, keypoints, 1.0, 1e-6 * np.eye(6)
+    )
+
+
+def estimator(*detections: Detection, refiner: object = None) -> Any:
+    return SimpleNamespace(predict=lambda image, K, **_: list(detections), refiner=refiner)
+
+
+def test_right_is_matched_once_and_within_a_tenth_of_the_diameter():
+    detections = [found(POSE, 0.9, 0.05), found(POSE, 0.8, 0.05), found(POSE, 0.7, 0.2)]
+    result = score_images(estimator(*detections), [PART], Images(POSE))
+    # A duplicate is wrong, and so is everything on the image without the part.
+    assert result.correct.tolist() == [True, False, False, False, False, False]
+    assert (result.num_images, result.num_instances) == (2, 1)
+    far = estimator(found(POSE, 0.9, 0.2))
+    assert not score_images(far, [PART], Images(POSE)).correct.any()
+
+
+def test_what_finds_a_hidden_instance_is_not_judged():
+    result = score_images(estimator(found(POSE, 0.9), found(POSE, 0.8)), [PART], Images(POSE, 0.05))
+    # One explains itself by the instance that is hardly visible; its duplicate is wrong, and so
+    # are both on the image without the part.
+    assert result.correct.tolist() == [False, False, False]
+    assert result.scores.tolist() == [0.8, 0.9, 0.8]
+    assert result.num_instances == 0
+
+
+def test_poses_are_paired_with_the_instances_that_they_find():
+    near, stray = found(POSE, 0.9, 0.05), found(POSE, 0.8, 3.0)
+    ((one, true),) = matched_poses(estimator(near, stray), [PART], Images(POSE))
+    assert one is near
+    assert np.array_equal(true, POSE[None])
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    symmetric = replace(PART, symmetries_discrete=flip[None])
+    ((_, alike),) = matched_poses(estimator(near), [symmetric], Images(POSE))
+    assert np.array_equal(alike, [POSE, POSE @ flip])
+    assert matched_poses(estimator(near), [PART], Images(POSE, 0.05)) == []
+
+
+def test_the_factors_of_a_network_that_is_too_near_and_too_sure():
+    rng = np.random.default_rng(0)
+    deviation = np.array([0.02, 0.02, 0.01, 0.002, 0.002, 0.004])
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    pairs = []
+    for number in range(2000):
+        step = 2.0 * deviation * rng.normal(size=6)
+        turn = rotation_vector_to_matrix(step[:3])
+        T = make_transform(turn @ POSE[:3, :3], 0.9 * (POSE[:3, 3] + step[3:]))
+        one = replace(found(T, 0.9), covariance=np.diag(deviation**2))
+        equivalents = [POSE, POSE @ flip]
+        pairs.append((one, np.array(equivalents[:: -1 if number % 3 == 0 else 1])))
+    factors = fit_factors(pairs)
+    assert factors["distance_factor"] == pytest.approx(1 / 0.9, rel=0.01)
+    assert factors["covariance_factor"] == pytest.approx(4.0, rel=0.1)
+    assert fit_factors([]) == {"distance_factor": 1.0, "covariance_factor": 1.0}
+
+
+def test_refined_poses_are_scored_by_their_agreement():
+    sure = replace(found(POSE, 0.3), agreement=0.9, support=0.6)
+    result = score_images(estimator(sure, refiner=True), [PART], Images(POSE))
+    expected = [1.0, np.log(0.3 / 0.7), 0.9, 0.6]
+    np.testing.assert_allclose(result.features, [expected, expected])
+    kept = score_images(estimator(found(POSE, 0.3), refiner=True), [PART], Images(POSE))
+    assert kept.features[0, 2:].tolist() == [0.0, 0.0]
+    nothing = score_images(estimator(refiner=True), [PART], Images(POSE))
+    assert nothing.features.shape == (0, 4)
+
+
+def test_scores_of_refined_poses_learn_from_hidden_parts_too():
+    images = Images(POSE)
+    mask = np.zeros((128, 128), bool)
+    mask[40:90, 30:100] = True
+    images.samples[0].image[:] = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
+    images.samples[0].instances[0].mask = mask
+    (shown,) = Hidden(images).sample(0, 0).instances
+    assert shown.mask.sum() == pytest.approx((1 - HIDDEN) * mask.sum(), abs=1)
+    assert np.array_equal(shown.T_cam_obj, POSE)
+    assert not Hidden(images).sample(1, 0).instances
+    one, other = scored(0, 30), scored(1, 20, right=False)
+    both = joined(one, other)
+    assert (both.num_images, both.num_instances) == (50, 50)
+    loudest = both.loudest(both.scores)
+    np.testing.assert_array_equal(loudest[:30], one.loudest(one.scores))
+    np.testing.assert_array_equal(loudest[30:], other.loudest(other.scores))
+
+
+def test_a_symmetric_part_is_right_at_any_of_its_poses():
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])
+    mirrored = replace(PART, points=np.vstack([PART.points, PART.points @ flip[:3, :3]]))
+    turned = estimator(found(POSE @ flip, 0.9))
+    assert not score_images(turned, [mirrored], Images(POSE)).correct.any()
+    symmetric = replace(mirrored, symmetries_discrete=flip[None])
+    assert score_images(turned, [symmetric], Images(POSE)).correct.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("name", ["best.ckpt", "best.safetensors"])
+def test_the_tuned_checkpoint_stands_beside_the_old_one(tiny_spec, tmp_path, name):
+    weights = build_network(tiny_spec).state_dict()
+    old = Checkpoint(tiny_spec, weights, [PART], (128, 96), 8, 1.0, {"max_angle_deg": 30.0})
+    path = write_tuned(
+        old, tmp_path / name, {"min_score": 0.5, "score_bias": -1.5, "distance_factor": 0.95}
+    )
+    assert path == tmp_path / "best_tuned.ckpt"
+    tuned = PoseEstimator.load(path)
+    assert tuned.recovery.max_angle_deg == 30.0
+    assert tuned.recovery.min_score == 0.5
+    assert tuned.recovery.distance_factor == 0.95
+    assert tuned.recovery.score_weights == (-1.5, 1.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,209 @@
+"""Hydra's sweeps as Optuna's distributions; searches as a user runs them, of no training time."""
+
+import fcntl
+import json
+import statistics
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("optuna")
+import optuna
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.utils import create_config_search_path
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.trial import FrozenTrial, TrialState
+
+from dopepp.core.errors import UserError
+from dopepp.experiment.sweep.search import chosen, examples, overrides, read_space
+
+
+@pytest.fixture(scope="module")
+def loader():
+    return ConfigLoaderImpl(create_config_search_path(None))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("interval(0, 1)", FloatDistribution(0, 1)),
+        ("interval(1e-4, 0.5)", FloatDistribution(1e-4, 0.5)),
+        ("tag(log, interval(1e-4, 1))", FloatDistribution(1e-4, 1, log=True)),
+        ("int(interval(8, 64))", IntDistribution(8, 64)),
+        ("tag(log, int(interval(8, 64)))", IntDistribution(8, 64, log=True)),
+        ("range(1, 10, 4)", IntDistribution(1, 9, step=4)),
+        ("range(3)", IntDistribution(0, 2)),
+        ("range(9, 0, -3)", IntDistribution(3, 9, step=3)),
+        ("range(0.0, 0.5, 0.25)", CategoricalDistribution(["0.0", "0.25"])),
+        ("choice(a, 3, true)", CategoricalDistribution(["a", "3", "True"])),
+        ("a,b", CategoricalDistribution(["a", "b"])),
+    ],
+)
+def test_every_form(text, expected, loader):
+    space = read_space(loader, [f"x.y={text}"], [])
+    assert space.varied == {"x.y": expected}
+    assert space.texts == {"x.y": text}
+
+
+def test_the_command_line_adds_replaces_and_fixes(loader):
+    listed = ["a=interval(0, 1)", "b=choice(1, 2)", "c=interval(0, 1)"]
+    space = read_space(loader, listed, ["model=dope", "b=7", "c=interval(0, 9)", "+d=x,y"])
+    assert list(space.varied) == ["a", "c", "+d"]
+    assert space.varied["c"] == FloatDistribution(0, 9)
+    assert space.fixed == ["model=dope", "b=7"]
+    written = overrides(space, {"a": 0.123456789, "+d": "x"})
+    assert written == ["model=dope", "b=7", "a=0.1235", "+d=x"]
+
+
+def test_every_choice_is_tried_before_the_search(loader):
+    space = read_space(loader, ["a=choice(1, 2)", "b=interval(0, 1)", "c=choice(x, y)"], [])
+    assert examples(space) == [
+        ["a=1", "b=0", "c=x"], ["a=2", "b=0", "c=x"], ["a=1", "b=0", "c=y"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("bad", ["a=1", "a=", "a=interval(1,", "a=interval(2, 1)", "a"])
+def test_what_is_no_range_is_refused(bad, loader):
+    with pytest.raises(UserError, match=r"search\.space with .*allowed: interval\(low, high\)"):
+        read_space(loader, [bad], [])
+
+
+def test_numbers_are_written_as_they_are_run():
+    written = chosen({"lr": 1.23456e-4, "n": 123456, "m": "cbam"})
+    assert written == ["lr=0.0001235", "n=123456", "m=cbam"]
+
+
+SEARCH = ("search=optuna", "search.study=s", "search.space=[]")
+LR = "optimizer.lr=tag(log, interval(1e-6, 1.0))"
+FAST = (*SEARCH, LR, "search.prune=false")
+
+
+def trials(folder: Path) -> list[FrozenTrial]:
+    storage = f"sqlite:///{folder}/search/s/study.db"
+    return optuna.load_study(study_name="s", storage=storage).trials
+
+
+def started(folder: Path) -> list[list[str]]:
+    lines = (folder / "search" / "s" / "started.txt").read_text().splitlines()
+    return [line.split() for line in lines]
+
+
+def test_the_same_command_goes_on_and_the_best_trial_is_named(call_fast, tmp_path):
+    assert call_fast(*FAST, "search.num_trials=2")[0] == 0
+    for _ in range(2):  # the second time, nothing is missing
+        code, out, err = call_fast(*FAST, "search.num_trials=4")
+        assert code == 0, err
+        assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 2, 3]
+    found = trials(tmp_path)
+    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 4
+    for trial, (number, lr) in zip(found, started(tmp_path), strict=True):
+        assert (tmp_path / "search" / "s" / number / "metrics.json").is_file()
+        assert trial.number == int(number)
+        assert trial.params["optimizer.lr"] == pytest.approx(float(lr), rel=1e-3)
+    drawn = {trial.params["optimizer.lr"] for trial in found}
+    assert len(drawn) == 4  # the second command did not draw the first one's again
+    best = max(found, key=lambda trial: trial.value or 0)
+    assert f"best trial {best.number}, objective {best.value:.4f}: optimizer.lr=" in out
+    assert "study s: 4 complete" in out
+
+
+def test_interrupted_trials_run_again_under_their_numbers(call_fast, tmp_path, monkeypatch):
+    for number in (0, 1):
+        monkeypatch.setenv(f"END_{number}", "interrupt")
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 130
+    assert trials(tmp_path)[0].state == TrialState.RUNNING
+    drawn = trials(tmp_path)[0].params
+    code, out, _ = call_fast(*FAST, "search.num_trials=3")
+    assert code == 130
+    assert "goes on with trials 0" in out
+    assert call_fast(*FAST, "search.num_trials=3")[0] == 0
+    found = trials(tmp_path)
+    assert [trial.state for trial in found] == [TrialState.COMPLETE] * 3
+    assert found[0].params == drawn
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 0, 1, 1, 2]
+
+
+def test_a_result_that_was_not_told_is_not_computed_again(call_fast, tmp_path):
+    """The command died after a job's end: here, one of two that run at a time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("END_1", "interrupt")
+        assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 130
+    assert [trial.state for trial in trials(tmp_path)] == [TrialState.RUNNING] * 2
+    assert call_fast(*FAST, "search.num_trials=2", "search.num_parallel=2")[0] == 0
+    assert [int(number) for number, _ in started(tmp_path)] == [0, 1, 1]
+    assert [trial.state for trial in trials(tmp_path)] == [TrialState.COMPLETE] * 2
+
+
+def test_a_failing_trial_does_not_stop_the_study(call_fast, tmp_path, monkeypatch):
+    monkeypatch.setenv("END_0", "raise")
+    done = call_fast(*FAST, "search.num_trials=2", code=0)
+    assert "1 complete, 1 fail" in done.out
+    assert trials(tmp_path)[0].state == TrialState.FAIL
+    failed = json.loads((tmp_path / "search" / "s" / "0" / "failed.json").read_text())
+    assert failed["reason"] == "as the test asked"
+
+
+def test_trials_below_the_median_are_pruned(call_fast, tmp_path):
+    rule = ("search.prune_after_trials=2", "search.prune_after_epochs=1", "search.num_trials=6")
+    assert call_fast(*SEARCH, LR, *rule)[0] == 0
+    found = trials(tmp_path)
+    pruned = [trial for trial in found if trial.state == TrialState.PRUNED]
+    assert pruned
+    assert all(trial.number >= 2 for trial in pruned)
+    for trial in found:
+        # Only finished trials count, and those of before: one ran after the other.
+        before = [one for one in found[: trial.number] if one.state == TrialState.COMPLETE]
+        reported = trial.intermediate_values
+        for epoch in (1, 2):
+            if epoch not in reported or trial.number < 2:
+                continue
+            median = statistics.median(one.intermediate_values[epoch] for one in before)
+            best = max(value for step, value in reported.items() if step <= epoch)
+            is_last = epoch == max(reported)
+            assert (best < median) == (is_last and trial.state == TrialState.PRUNED)
+        record = tmp_path / "search" / "s" / str(trial.number) / "pruned.json"
+        assert record.is_file() == (trial.state == TrialState.PRUNED)
+    record = tmp_path / "search" / "s" / str(pruned[0].number) / "pruned.json"
+    assert "worse than the other trials' median" in json.loads(record.read_text())["reason"]
+
+
+def test_a_study_is_not_mixed_with_another_configuration(call_fast):
+    assert call_fast(*FAST, "search.num_trials=1")[0] == 0
+    line = call_fast(*FAST, "search.num_trials=2", "data.batch_size=7").line
+    assert "data.batch_size=7, while the study s was begun with data.batch_size=32" in line
+    done = call_fast(*SEARCH, "optimizer.lr=interval(1e-6,1e-5)", "search.prune=false")
+    assert "choose another search.study=NAME" in done.line
+
+
+def test_a_folder_of_another_study_or_command_is_refused(call_fast, tmp_path):
+    folder = tmp_path / "search" / "s"
+    (folder / "0").mkdir(parents=True)
+    assert "with the jobs 0 of another study" in call_fast(*FAST).line
+    with (folder / ".search.lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        assert "search.study=s, which another command is searching" in call_fast(*FAST).line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["search.num_trials=0"], "search.num_trials=0"),
+        (["search.num_parallel=x"], "search.num_parallel='x'"),
+        (["experiment=table6_dope_vs_dopepp"], "sweeps over model, data.parts itself"),
+        (["optimizer.lr=range(0.1,0.5,0.1)", "optimizer.lx=interval(0,1)"], "optimizer.lx"),
+        (["optimizer.lr=tag(log, interval(0.0, 1.0))"], "optimizer.lr"),
+        (["search.space=['optimizer.lr=1']"], "which is one value"),
+        (["search.space=[]", "optimizer.lr=1"], "nothing to vary"),
+        (["model/attention=choice(cbam,cbbm)"], "cbbm"),
+        (["search.storage=/dev/null/study.db"], "search.storage=/dev/null/study.db"),
+        (["search.storage=nowhere://x"], "search.storage=nowhere://x"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(arguments, message, call_fast, tmp_path):
+    assert message in call_fast("search=optuna", "search.study=s", *arguments).line
+    assert not (tmp_path / "search" / "s" / "started.txt").exists()
+
+
+def test_without_optuna_it_says_what_to_install(call_fast, monkeypatch):
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
+    assert "pip install 'dopepp[search]'" in call_fast(*FAST).line
