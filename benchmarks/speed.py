@@ -10,7 +10,8 @@ and is left out under one. In a process all take turns, frame by frame of the sa
 frame of 640×480 is 416×320: their maps are made, timed and put aside, and poses are recovered from
 the true maps with a trained network's noise (:mod:`dopepp.experiment.results.cost`); int8 is
 calibrated on random pixels. ``tracker`` follows a part through a rendered sequence
-(``benchmarks/track.py``) with the released ``pivconnector_wide``. Milliseconds; *CPU*, the process's time on all its threads, and
+(``benchmarks/track.py``) with the released ``pivconnector_wide``. Milliseconds; *CPU*, the
+process's time on all its threads, and
 the parts are 10th percentiles, which neighbours disturb least: with one thread they are about what
 an idle core takes.
 """
