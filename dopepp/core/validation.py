@@ -7,7 +7,7 @@ that collect problems.
 
 Values are never coerced: ``"1"`` is no number and ``true`` is no integer. As in JSON, a list stands
 for a tuple and text for a path. A dataclass that refuses unknown fields has the line
-``__pydantic_config__ = STRICT``.
+``__pydantic_config__ = STRICT``. :func:`check` and :func:`check_fields` validate arguments.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
 from pydantic import ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
@@ -51,25 +51,61 @@ _WORDS: Final = {
 
 @dataclass(frozen=True)
 class Range:
-    """Closed range of a number, as in ``Annotated[int, Range(1, 10)]``."""
+    """Closed range of a number, as in ``Annotated[int, Range(1, 10)]``.
+
+    On a tuple, e.g. ``Annotated[tuple[int, int], Range(1, 10)]``, each number must lie within.
+    """
 
     lowest: float
     highest: float
     unit: str = ""
 
-    def __str__(self) -> str:
-        unit = f" ({self.unit})" if self.unit else ""
-        return f"from {self.lowest:g} to {self.highest:g}{unit}"
+    def allowed(self, kind: Any) -> str:
+        """Return the allowed values in words; ``kind`` is the annotated type."""
+        length = len(typing.get_args(kind))
+        is_integer = int in (kind, *typing.get_args(kind))
+        form = ".0f" if is_integer else "g"
+        noun = "integer" if is_integer else "number"
+        noun = f"a list of {length} {noun}s" if length else f"{'an' if is_integer else 'a'} {noun}"
+        return f"{noun} from {self.lowest:{form}} to {self.highest:{form}}{self._unit}"
+
+    def holds(self, value: Any) -> bool:
+        """Return whether a number, or each of a tuple's, lies within."""
+        numbers = value if isinstance(value, tuple) else (value,)
+        return all(self.lowest <= number <= self.highest for number in numbers)
+
+    @property
+    def _unit(self) -> str:
+        return f" ({self.unit})" if self.unit else ""
 
     def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        noun = "an integer" if kind is int else "a number"
+        refused = PydanticCustomError("range", "{allowed}", {"allowed": self.allowed(kind)})
 
-        def check(value: float) -> float:
-            if not self.lowest <= value <= self.highest:
-                raise PydanticCustomError("range", "{allowed}", {"allowed": f"{noun} {self}"})
-            return value
+        def check(value: object, inner: Callable[[object], Any]) -> Any:
+            try:
+                # The list of a JSON array is a Python object here, and so would be no tuple.
+                typed = inner(tuple(value) if isinstance(value, list) else value)
+            except ValidationError:
+                raise refused from None
+            if not self.holds(typed):
+                raise refused
+            return typed
 
-        return core_schema.no_info_after_validator_function(check, handler(kind))
+        return core_schema.no_info_wrap_validator_function(check, handler(kind))
+
+
+class Span(Range):
+    """Range of a pair (smallest, largest), as in ``Annotated[tuple[float, float], Span(0, 1)]``."""
+
+    def allowed(self, kind: Any) -> str:
+        """Return the allowed values in words."""
+        bounds = f"{self.lowest:g} <= smallest <= largest <= {self.highest:g}"
+        return f"(smallest, largest) with {bounds}{self._unit}"
+
+    def holds(self, value: Any) -> bool:
+        """Return whether both numbers lie within, the smallest first."""
+        smallest, largest = value
+        return bool(self.lowest <= smallest <= largest <= self.highest)
 
 
 class Mistake(NamedTuple):
@@ -122,6 +158,56 @@ def mistakes(kind: type[Any], value: object) -> list[Mistake]:
     except ValidationError as error:
         return list(_mistakes(kind, value, error))
     return []
+
+
+def check(
+    name: str, value: object, kind: type[T], limits: Range | None = None, of: object = None
+) -> T:
+    """Validate an argument of a constructor or function.
+
+    For example ``check("stages", stages, int, Range(1, 6))`` or ``check("refine", refine, bool)``;
+    ``tuple[float, float]`` with a :class:`Span` is a pair (smallest, largest).
+
+    Args:
+        name: Name of the argument, for messages.
+        value: Plain value, of unknown type.
+        kind: Required type.
+        limits: Range of the number or numbers.
+        of: Owner of the argument, for messages: an object with a name, or of a named class.
+
+    Returns:
+        The typed value: a float for a number, a tuple for a list.
+
+    Raises:
+        UserError: The value is of another type or out of range.
+    """
+    limited: Any = kind if limits is None else Annotated[kind, limits]
+    try:
+        typed: T = _validated(limited, value, name)
+    except ValidationError as error:
+        mistake = next(_mistakes(limited, value, error))
+        owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
+        got = f"{mistake.name(name)}={mistake.got}{owner}"
+        raise UserError(got, mistake.allowed, f"change {name}") from None
+    return typed
+
+
+def check_fields(instance: object) -> None:
+    """Validate those fields of a dataclass that are annotated with a :class:`Range`.
+
+    A ``__post_init__`` that calls this function checks what Python code passes, too.
+
+    Raises:
+        UserError: A field is of another type or out of range.
+    """
+    for name, kind in _ranged_fields(type(instance)).items():
+        check(name, getattr(instance, name), kind, of=instance)
+
+
+@cache
+def _ranged_fields(kind: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {name: hint for name, hint in hints.items() if typing.get_origin(hint) is Annotated}
 
 
 def shown(value: object, most: int = 100) -> str:

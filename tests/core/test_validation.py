@@ -11,7 +11,16 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import STRICT, Mistake, Range, mistakes, parse
+from dopepp.core.validation import (
+    STRICT,
+    Mistake,
+    Range,
+    Span,
+    check,
+    check_fields,
+    mistakes,
+    parse,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,14 +50,17 @@ def test_plain_values_become_typed():
     )
 
 
+SHARE = "a number from 0 to 1 (part)"
+
+
 @pytest.mark.parametrize(
     ("given", "got", "allowed"),
     [
         ({}, "no root.number", "root.number=…"),
         ({"number": "1"}, "root.number='1'", "an integer"),
         ({"number": True}, "root.number=True", "an integer"),
-        ({"number": 1, "inner": {"share": 2}}, "root.inner.share=2", "a number from 0 to 1 (part)"),
-        ({"number": 1, "inner": {"share": math.nan}}, "root.inner.share=nan", "a finite number"),
+        ({"number": 1, "inner": {"share": 2}}, "root.inner.share=2", SHARE),
+        ({"number": 1, "inner": {"share": math.nan}}, "root.inner.share=nan", SHARE),
         ({"number": 1, "inner": {"count": 10}}, "root.inner.count=10", "an integer from 1 to 9"),
         ({"number": 1, "inner": {"shar": 1}}, "root.inner.shar=1", "share, count"),
         ({"number": 1, "many": [{}, {"no": 1}]}, "root.many[1].no=1", "share, count"),
@@ -82,3 +94,52 @@ def test_all_mistakes_are_collected():
         Mistake(("a",), "'x'", "an integer"),
         Mistake(("b", 1), "'y'", "a finite number"),
     ]
+
+
+PAIR = tuple[float, float]
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "limits", "typed"),
+    [
+        (True, bool, None, True),
+        (9, int, Range(1, 9), 9),
+        (1, float, Range(0, 1), 1.0),
+        ([1, 9], tuple[int, int], Range(1, 9), (1, 9)),
+        ((0, 0.5), PAIR, Span(0, 1), (0.0, 0.5)),
+    ],
+)
+def test_an_argument_becomes_typed(value, kind, limits, typed):
+    checked = check("name", value, kind, limits)
+    assert (checked, type(checked)) == (typed, type(typed))
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "limits", "message"),
+    [
+        (1, bool, None, "got name=1; allowed: true or false; fix: change name"),
+        (True, int, Range(1, 9), "got name=True; allowed: an integer from 1 to 9;"),
+        (1.0, int, Range(1, 10**6), "got name=1.0; allowed: an integer from 1 to 1000000;"),
+        ("1", float, Range(0, 1, "share"), "got name='1'; allowed: a number from 0 to 1 (share);"),
+        (math.inf, float, Range(0, 1), "got name=inf; allowed: a number from 0 to 1;"),
+        (math.nan, float, Range(0, 1), "got name=nan; allowed: a number from 0 to 1;"),
+        (True, float, Range(0, 1), "got name=True; allowed: a number from 0 to 1;"),
+        ([1], tuple[int, int], Range(1, 9), "allowed: a list of 2 integers from 1 to 9;"),
+        ([0, 1], tuple[int, int], Range(1, 9), "got name=[0, 1]; allowed: a list of 2 integers"),
+        ((1, 0), PAIR, Span(0, 1, "m"), "with 0 <= smallest <= largest <= 1 (m);"),
+        ((0, math.nan), PAIR, Span(0, 1), "got name=(0, nan);"),
+        (3, PAIR, Span(0, 1), "got name=3; allowed: (smallest, largest) with 0 <="),
+        pytest.param(10**5000, int, Range(1, 9), "got name", id="endless"),
+        (object(), int, Range(1, 9), "got name"),
+    ],
+)  # fmt: skip
+def test_an_argument_of_another_kind_is_refused(value, kind, limits, message):
+    with pytest.raises(UserError) as caught:
+        check("name", value, kind, limits)
+    assert message in str(caught.value)
+
+
+def test_a_dataclass_checks_its_own_fields():
+    with pytest.raises(UserError, match="got share=2 of Inner; allowed: a number from 0 to 1 "):
+        check_fields(Inner(share=2))
+    check_fields(Inner())
