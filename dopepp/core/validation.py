@@ -187,12 +187,12 @@ def check(
     except ValidationError as error:
         mistake = next(_mistakes(limited, value, error))
         owner = "" if of is None else f" of {getattr(of, 'name', None) or type(of).__name__}"
-        got = f"{mistake.name(name)}={mistake.got}{owner}"
+        got = f"{mistake.name(name)}={mistake.got if mistake.location else shown(value)}{owner}"
         raise UserError(got, mistake.allowed, f"change {name}") from None
     return typed
 
 
-def check_fields(instance: object) -> None:
+def check_fields(instance: Any) -> None:
     """Validate those fields of a dataclass that are annotated with a :class:`Range`.
 
     A ``__post_init__`` that calls this function checks what Python code passes, too.
