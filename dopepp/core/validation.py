@@ -192,7 +192,7 @@ def check(
     return typed
 
 
-def check_fields(instance: Any) -> None:
+def check_fields(instance: object) -> None:
     """Validate those fields of a dataclass that are annotated with a :class:`Range`.
 
     A ``__post_init__`` that calls this function checks what Python code passes, too.
@@ -200,7 +200,8 @@ def check_fields(instance: Any) -> None:
     Raises:
         UserError: A field is of another type or out of range.
     """
-    for name, kind in _ranged_fields(type(instance)).items():
+    owner: Any = type(instance)
+    for name, kind in _ranged_fields(owner).items():
         check(name, getattr(instance, name), kind, of=instance)
 
 
