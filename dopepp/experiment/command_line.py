@@ -117,7 +117,7 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
     """Run a job of a multirun, whose end stands in its folder."""
     from dopepp.experiment.results import display, record
     from dopepp.experiment.results.report import Report
-    from dopepp.experiment.sweep.sweep import compare_jobs
+    from dopepp.experiment.sweep.multirun import compare_jobs
     from dopepp.training.callbacks.trial import PrunedError
 
     for name in (record.FAILURE_FILE, record.PRUNED_FILE):  # of an attempt before this one

@@ -177,12 +177,10 @@ class DataConfig:
     def of(cls, data: object, virtual: object) -> DataConfig:
         """Read both nodes; ``virtual`` None is one that says nothing.
 
-        ``data.virtual``, which earlier versions wrote beside ``virtual``, may repeat it. A
-        :class:`UserError` tells which option is unknown, missing, of a wrong type or out of range.
+        A :class:`UserError`: an option is unknown, missing, of a wrong type or out of range.
         """
         if isinstance(data, Mapping):
             _check_size(data.get("input_size"))
-            data = _without_copy(data, virtual)
         how = parse(VirtualConfig, with_lens(virtual or {}), "virtual")
         return parse(cls, data, "data", virtual=how)
 
@@ -226,9 +224,9 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
     whole = "name" in given  # a file of conf/data, not single options
     if not whole and not isinstance(stored, dict):
         raise UserError(f"{source}, which names no data", "data=… on the command line", "add it")
-    own, how = _without_copy(given, virtual), base.get("virtual")
+    base, how = {key: base[key] for key in base if key != "virtual"}, base.get("virtual")
     try:
-        merged = own if whole else _changed(_without_copy(base, how), own, "data")
+        merged = given if whole else _changed(base, given, "data")
         chosen = DataConfig.of(merged, None)
         if not virtual and how is None and not chosen.is_rendered("test"):
             return chosen
@@ -244,15 +242,9 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
 
 
 def trained_on(description: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the data config that a checkpoint's description names, None where it names none.
-
-    Where it is older than ``data.eval_seed``, held-out images were rendered with the training's
-    own seed.
-    """
+    """Return the data config that a checkpoint's description names, None where it names none."""
     config = description.get("config")
-    if not isinstance(config, dict):
-        return None
-    return {"eval_seed": description.get("seed", 0), **config}
+    return config if isinstance(config, dict) else None
 
 
 def with_lens(virtual: object) -> object:
@@ -275,14 +267,6 @@ def _check_size(size: object) -> None:
             f"[width, height], each a multiple of {_MULTIPLE}",
             "round up; images are letterboxed into it",
         )
-
-
-def _without_copy(data: Mapping[str, Any], virtual: object) -> dict[str, Any]:
-    """Leave out what the node ``data`` says of ``virtual``; it may not say anything else."""
-    copy = data.get("virtual")
-    if copy is not None and copy != virtual:
-        raise UserError(f"data.virtual={copy!r:.100}", "virtual.… alone", "set virtual.…")
-    return {key: value for key, value in data.items() if key != "virtual"}
 
 
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:

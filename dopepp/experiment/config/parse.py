@@ -18,7 +18,6 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union
 
 from dopepp.core.checks import check_flag, check_integer, check_number
 from dopepp.core.errors import UserError
-from dopepp.models.registry import TARGET
 
 T = TypeVar("T")
 
@@ -105,52 +104,6 @@ def _plain(kind: type[Any], value: Any, name: str) -> Any:
     if type(value) is not kind or kind is float:
         raise UserError(f"{name}={value!r:.100}", _WORDS[kind], f"change {name}")
     return value
-
-
-FORMER_TARGETS: Final = {
-    "dopepp.data.augment.Photometric": "dopepp.data.transforms.augment.Photometric",
-    "dopepp.data.masking.RandomMask": "dopepp.data.transforms.masking.RandomMask",
-    **{
-        f"dopepp.training.{former}": f"dopepp.training.{present}"
-        for former, present in (
-            ("auc_curves.AUCCurves", "callbacks.pictures.AUCCurves"),
-            ("belief_maps.BeliefMaps", "callbacks.pictures.BeliefMaps"),
-            ("early_stopping.EarlyStop", "callbacks.pose_metrics.EarlyStop"),
-            ("empty_maps.EmptyMaps", "callbacks.empty_maps.EmptyMaps"),
-            ("finite.FiniteSteps", "callbacks.finite.FiniteSteps"),
-            ("last_checkpoint.LastCheckpoint", "checkpointing.last.LastCheckpoint"),
-            ("overlays.Overlays", "callbacks.pictures.Overlays"),
-            ("pose_metrics.PoseMetricsCallback", "callbacks.pose_metrics.PoseMetricsCallback"),
-            ("throughput.Throughput", "callbacks.throughput.Throughput"),
-            ("trial.TrialReport", "callbacks.trial.TrialReport"),
-        )
-    },
-}
-"""What users' files call classes that have moved since, and where they are."""
-
-
-def with_present_names(node: Any) -> Any:
-    """Return a config, or a node of it, whose targets are where they are now."""
-    if isinstance(node, Mapping):
-        return {
-            key: FORMER_TARGETS.get(value, value)
-            if key == TARGET and isinstance(value, str)
-            else with_present_names(value)
-            for key, value in node.items()
-        }
-    return node
-
-
-def as_written_now(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the config of any version's run as this one writes it.
-
-    Classes go by their present names, and ``data`` does not say again what ``virtual`` says.
-    """
-    present: dict[str, Any] = with_present_names(config)
-    data = present.get("data")
-    if isinstance(data, dict):
-        present["data"] = {key: value for key, value in data.items() if key != "virtual"}
-    return present
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:

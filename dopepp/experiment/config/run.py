@@ -11,7 +11,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.data import DataConfig, with_lens
-from dopepp.experiment.config.parse import Node, Range, Seed, parse, with_present_names
+from dopepp.experiment.config.parse import Node, Range, Seed, parse
 from dopepp.experiment.results.protocols import Protocols
 from dopepp.experiment.run.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
@@ -232,8 +232,7 @@ class RunConfig(MeasurementConfig):
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
         """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
-        plain = with_present_names(config)
-        plain["virtual"] = with_lens(plain.get("virtual"))
+        plain = {**config, "virtual": with_lens(config.get("virtual"))}
         nodes = {
             "data": DataConfig.of(plain.get("data"), plain.get("virtual")),
             "trainer": TrainerConfig.of(plain.get("trainer") or {}),
@@ -277,7 +276,7 @@ class EvaluationConfig(MeasurementConfig):
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> EvaluationConfig:
         """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
-        return _parsed(cls, with_present_names(config))
+        return _parsed(cls, config)
 
 
 def _parsed(kind: type[T], plain: Mapping[str, Any], read: Sequence[str] = (), **known: Any) -> T:

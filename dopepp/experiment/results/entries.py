@@ -16,7 +16,6 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.config.parse import as_written_now
 from dopepp.experiment.results import record
 from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.evaluators import Cost
@@ -198,7 +197,7 @@ def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
     """Return configs as one text, without seed, objects and what does not touch the result."""
     kept = [
         {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE, *_BESIDE)}
-        for config in map(as_written_now, configs)
+        for config in configs
     ]
     for config in kept:
         if isinstance(config.get("data"), dict):

@@ -146,7 +146,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
         _log.warning("the checkpoint was trained on another shape of %s", ", ".join(others))
     stored, config = checkpoint.data.get("images"), trained_on(checkpoint.data)
     if not isinstance(stored, dict) or config is None:
-        return  # a checkpoint of an earlier version does not say
+        return  # a checkpoint that train.py has not written
     try:
         own = DataConfig.of(config, config.get("virtual"))
     except UserError:

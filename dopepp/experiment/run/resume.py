@@ -21,7 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.config.parse import as_written_now, below, flat
+from dopepp.experiment.config.parse import below, flat
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.results import record
 from dopepp.experiment.run.images import differing_images
@@ -104,7 +104,7 @@ def check_resume(
 
 def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[ConfigDifference]:
     """Return the options in which two configs differ, but for what belongs to one call alone."""
-    one, other = (dict(flat(as_written_now(config))) for config in (old, new))
+    one, other = (dict(flat(config)) for config in (old, new))
     return [
         ConfigDifference(key, _text(one, key), _text(other, key))
         for key in {**one, **other}
@@ -115,7 +115,7 @@ def config_differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[C
 def image_differences(saved: object, present: object) -> list[ConfigDifference]:
     """Say where training and validation images are others though the options may be the same."""
     if not isinstance(saved, Mapping) or not isinstance(present, Mapping):
-        return []  # a checkpoint of an earlier version does not say
+        return []  # a checkpoint that train.py has not written
     return [
         ConfigDifference(f"{split} images", "as trained on", f"others ({'; '.join(lines)})")
         for split in ("train", "val")
@@ -156,7 +156,7 @@ def read_overrides(run: Path) -> list[str] | None:
     own, overrides, hydra = (run / path for path in (record.OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if own.is_file():
         return trusted_overrides(record.read_json(own).get("overrides"), own)
-    # Killed before it wrote its own file, or of an older version. Hydra writes the overrides last
+    # Killed before it wrote its own file. Hydra writes the overrides last
     # and once more in another file: a file that was cut in the middle does not agree with it.
     if not overrides.is_file():
         return None

@@ -36,7 +36,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.parse import FORMER_TARGETS, below, flat
+from dopepp.experiment.config.parse import below, flat
 from dopepp.experiment.results import display, record
 from dopepp.training.callbacks.trial import MOST, open_storage
 
@@ -46,10 +46,9 @@ _MAX_PARALLEL: Final = 10_000
 _DIRECTIONS: Final = {"max": StudyDirection.MAXIMIZE, "min": StudyDirection.MINIMIZE}
 _NO_PART: Final = (
     "hydra", "output_dir", "resume", "search.num_trials", "search.num_parallel", "search.storage",
-    "search.space", "callbacks.trial.storage", "data.virtual",
+    "search.space", "callbacks.trial.storage",
 )  # fmt: skip
-"""What may differ between two commands of one study; of the space, its texts are compared, and
-``data.virtual`` is where earlier versions say again what the node ``virtual`` says."""
+"""What may differ between two commands of one study; of the space, its texts are compared."""
 
 
 @dataclass(frozen=True)
@@ -320,8 +319,6 @@ def open_study(options: Mapping[str, Any], facts: Mapping[str, str], seed: int) 
 
 def _check_same(before: Mapping[str, str], now: Mapping[str, str], study: str) -> None:
     """Refuse to mix trials that cannot be compared."""
-    named = {key: FORMER_TARGETS.get(value, value) for key, value in before.items()}
-    before = {key: value for key, value in named.items() if not below(key, _NO_PART)}
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if not keys:
         return

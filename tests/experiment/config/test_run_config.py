@@ -1,21 +1,11 @@
-"""Options are read once: what one may not be is refused in a line; former names still count."""
+"""Options are read once: what one may not be is refused in a line."""
 
-import copy
-import importlib
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hydra.utils import get_class
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.assembly.registries import AUGMENTATIONS, CALLBACKS, MASKINGS
-from dopepp.experiment.config.parse import FORMER_TARGETS, flat, with_present_names
 from dopepp.experiment.config.run import EvaluationConfig, RunConfig
-from dopepp.experiment.results import record
-from dopepp.experiment.run.resume import config_differences
-from dopepp.experiment.sweep.remote import goes_on
-from dopepp.experiment.sweep.sweep import CompareJobs
 
 
 @pytest.mark.parametrize(
@@ -94,37 +84,3 @@ def test_values_are_typed_and_the_plain_config_stays(composed):
     assert config.false_positives.num_empty == 500
     assert config.stored_data()["virtual"] == plain["virtual"]
     assert (config.ema, config.logger, config.search) == (0.5, None, None)
-
-
-def test_a_class_goes_by_its_former_name(composed):
-    for former, present in FORMER_TARGETS.items():
-        with pytest.raises(ModuleNotFoundError):
-            importlib.import_module(former.rpartition(".")[0])
-        registry: Any = CALLBACKS
-        if former.startswith("dopepp.data"):
-            registry = MASKINGS if "masking" in former else AUGMENTATIONS
-        registry.resolve(present)
-    # What Hydra itself builds.
-    assert get_class("dopepp.experiment.sweep.CompareJobs") is CompareJobs
-    overrides = [
-        "data.masking._target_=dopepp.data.masking.RandomMask",
-        "callbacks.overlays._target_=dopepp.training.overlays.Overlays",
-    ]
-    assert RunConfig.of(composed(*overrides)) == RunConfig.of(composed())
-
-
-def test_an_older_runs_config_is_no_other_one(composed, tmp_path):
-    plain = composed()
-    former = {present: name for name, present in FORMER_TARGETS.items()}
-    older = with_present_names(plain)
-    older["data"] = {**older["data"], "virtual": copy.deepcopy(older["virtual"])}
-    for node in (older["data"]["masking"], older["data"]["augment"], *older["callbacks"].values()):
-        node["_target_"] = former.get(node["_target_"], node["_target_"])
-    assert "dopepp.training.finite.FiniteSteps" in dict(flat(older)).values()
-    assert config_differences(older, plain) == []
-    record.write_config(tmp_path, older)
-    (tmp_path / record.LAST_CHECKPOINT).parent.mkdir()
-    (tmp_path / record.LAST_CHECKPOINT).touch()
-    assert goes_on(plain, tmp_path)
-    # Users' own files of conf/data may still hold the copy of `virtual`.
-    assert RunConfig.of(older).data == RunConfig.of(plain).data

@@ -35,7 +35,7 @@ from dopepp.experiment.results.entries import (
 from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import DELTA, read_csv
-from dopepp.experiment.sweep.sweep import CompareJobs
+from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 

@@ -19,7 +19,7 @@ from dopepp.experiment.results.paper_table import PaperTable
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import read_csv
 from dopepp.experiment.run.train import do_job
-from dopepp.experiment.sweep.sweep import CompareJobs
+from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import PoseErrors, mean_row, summarise
 
