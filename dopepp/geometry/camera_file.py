@@ -2,10 +2,7 @@
 
 Read are ROS ``camera_info`` (as calibration writes it, or as a message is echoed), OpenCV's
 FileStorage (YAML, XML, JSON), BOP's ``camera.json``, NDDS's ``_camera_settings.json``, COLMAP's
-``cameras.txt`` and plain text with 3×3 or four numbers. The content tells which, not the suffix.
-A file may come from anybody, so none is given to ``cv2.FileStorage``, which is C++.
-
-To read a further format, see the modules of :mod:`dopepp.geometry.camera_files`.
+``cameras.txt`` and plain text with 3×3 or four numbers; see :mod:`dopepp.geometry.camera_formats`.
 """
 
 from __future__ import annotations
@@ -29,9 +26,13 @@ from dopepp.geometry.camera import (
     pinhole_matrix,
     resize_camera,
 )
-from dopepp.geometry.camera_files.fields import find_camera, read_fields
-from dopepp.geometry.camera_files.numbers import read_lines
-from dopepp.geometry.camera_files.values import FORMATS, Calibration, Size
+from dopepp.geometry.camera_formats import (
+    FORMATS,
+    Calibration,
+    Size,
+    calibration_of_fields,
+    parse_calibration,
+)
 
 Crop = tuple[int, int, int, int]
 """x and y of the upper left pixel, width and height, pixels."""
@@ -128,14 +129,12 @@ def read_camera(path: Path | str) -> Camera:
             it has no camera matrix, a lens model that is not OpenCV's pinhole one (fisheye), or a
             field that cannot be right.
     """
-    path = Path(path)
-    text = _text(path)
-    return _camera(read_lines(text, path) or read_fields(text, path), str(path))
+    return _camera(parse_calibration(_text(Path(path)), str(path)), str(path))
 
 
 def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
     """Return the camera of named fields, as of a ROS message; a UserError as from a file."""
-    return _camera(find_camera(fields, source), source)
+    return _camera(calibration_of_fields(fields, source), source)
 
 
 def _camera(found: Calibration, source: str) -> Camera:

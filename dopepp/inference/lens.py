@@ -10,7 +10,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
-from dopepp.geometry.camera_files.values import Size
+from dopepp.geometry.camera_formats import Size
 from dopepp.inference.sources import Source
 
 if TYPE_CHECKING:

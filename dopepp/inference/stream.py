@@ -12,7 +12,7 @@ from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop
-from dopepp.geometry.camera_files.values import Size
+from dopepp.geometry.camera_formats import Size
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.lens import Lens, one_camera
 from dopepp.inference.overlay import make_shape

@@ -1,1 +1,0 @@
-"""The families of camera files: named fields, numbers alone; each module reads one."""

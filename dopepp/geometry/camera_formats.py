@@ -1,0 +1,276 @@
+"""Formats of camera files: ROS, OpenCV, BOP and NDDS of named fields, COLMAP and K of numbers.
+
+The content tells the format, not the suffix. Every function returns a :class:`Calibration`, whose
+lens the caller checks. A file may come from anybody, so no file is given to ``cv2.FileStorage``,
+which is C++.
+
+To read a further format of named fields, add its names to :class:`_Fields`; for any other format,
+add a function and call it in :func:`parse_calibration`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import parse_json
+from dopepp.core.validation import Range, check, shown
+from dopepp.core.yaml import parse_yaml
+from dopepp.geometry.camera import CameraMatrix, camera_matrix, pinhole_matrix
+
+Size = tuple[int, int]
+"""(width, height), pixels."""
+
+FORMATS: Final = (
+    "ROS camera_info, OpenCV FileStorage, BOP camera.json, COLMAP cameras.txt, "
+    "3×3 numbers, or the four numbers fx fy cx cy"
+)
+_UNDISTORT: Final = "undistort the pictures and pass the K of the undistorted ones"
+
+_SIDE: Final = Range(1, 65_536, "pixels")
+"""Side of a calibrated picture."""
+
+_COLMAP_MODELS: Final = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "FULL_OPENCV": 12,
+}
+"""COLMAP's models that are OpenCV's, with their numbers of parameters."""
+
+
+class Calibration(NamedTuple):
+    """A picture's (width, height), where the file states it; K; coefficients in OpenCV's order."""
+
+    size: Size | None
+    K: CameraMatrix
+    distortion: tuple[float, ...] = ()
+
+
+def parse_calibration(text: str, source: str) -> Calibration:
+    """Parse the text of a camera file.
+
+    In a text of numbers, ``#`` begins a comment, and brackets and commas do not matter.
+
+    Args:
+        text: Content of the file.
+        source: Path of the file, for messages.
+
+    Raises:
+        UserError: The text has none of the formats, or describes several cameras or none.
+    """
+    lines = [line.partition("#")[0].split() for line in text.splitlines()]
+    lines = [words for words in lines if words]
+    if lines and all(re.fullmatch("[A-Z][A-Z_]{2,}", "".join(words[1:2])) for words in lines):
+        return _colmap(lines, source)
+    numbers = _floats(re.sub(r"[\[\](),;]", " ", " ".join(map(" ".join, lines))).split())
+    if numbers:
+        return Calibration(None, _matrix(numbers, source))
+    if text.startswith("<"):
+        content: object = _xml(text, source)
+    elif text.startswith("{"):
+        content = parse_json(text, source)
+    else:
+        # OpenCV begins with a line of its own, and its matrices have a tag; behind a message that
+        # was echoed stands a line.
+        text = re.sub(r"\A%YAML.*\n", "", text).removesuffix("---")
+        content = parse_yaml(re.sub(r"!!opencv-(nd-)?matrix\b", "", text), source)
+    if not isinstance(content, Mapping):
+        raise UserError(f"{source} without any fields", FORMATS, "pass the camera's file")
+    return calibration_of_fields(content, source)
+
+
+def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
+    """Parse ``cameras.txt``: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], of one camera."""
+    if len(lines) > 1:
+        numbers = ", ".join(words[0][:20] for words in lines[:10]) + ", …" * (len(lines) > 10)
+        raise UserError(
+            f"{source} of {len(lines)} cameras ({numbers})", "one camera",
+            "keep the line of the camera that took the picture",
+        )  # fmt: skip
+    _, model, *rest = lines[0]
+    if model not in _COLMAP_MODELS:
+        raise UserError(
+            f"{source}: camera model {model:.40}", ", ".join(_COLMAP_MODELS), _UNDISTORT
+        )
+    values = _floats(rest)
+    if values is None or len(values) != 2 + _COLMAP_MODELS[model]:
+        allowed = f"WIDTH HEIGHT and {_COLMAP_MODELS[model]} numbers behind {model}"
+        raise UserError(f"{source}: {' '.join(rest)!r:.100}", allowed, "export it again")
+    width, height, fx, *values = values
+    has_one_focal_length = "OPENCV" not in model and model != "PINHOLE"
+    fy, cx, cy, *lens = [fx, *values] if has_one_focal_length else values
+    if "RADIAL" in model:
+        lens += [0.0] * (4 - len(lens))
+    size = _side(f"{source}: width", width), _side(f"{source}: height", height)
+    # COLMAP's (0.5, 0.5) is the centre of the top-left pixel.
+    return Calibration(size, camera_matrix(fx, fy, cx - 0.5, cy - 0.5), tuple(lens))
+
+
+def _xml(text: str, source: str) -> dict[object, object]:
+    """Return the fields of OpenCV's XML; without a document type it cannot expand anything."""
+    allowed = "OpenCV's XML (opencv_storage), without DOCTYPE"
+    if "<!DOCTYPE" in text:
+        raise UserError(f"{source} with DOCTYPE", allowed, "write the file again")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        got = f"{source}, unreadable: {error!s:.200}"
+        raise UserError(got, allowed, "write the file again") from error
+    if root.tag != "opencv_storage":
+        raise UserError(f"{source}: <{root.tag:.50}>", allowed, "write it with cv2.FileStorage")
+    return {node.tag: {part.tag: _words(part) for part in node} or _words(node) for node in root}
+
+
+def _words(element: ElementTree.Element) -> object:
+    words = (element.text or "").split()
+    return words[0] if len(words) == 1 else words
+
+
+def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibration:
+    """Return the calibration in named fields, as of a file or a ROS message.
+
+    Args:
+        content: Fields by name; capitals and underscores in the names do not matter.
+        source: Origin of the fields, for messages.
+
+    Raises:
+        UserError: There is no camera matrix, a lens that is not OpenCV's pinhole model, or a field
+            that holds no numbers.
+    """
+    fields = _Fields(content, source)
+    array = fields.find("camera_matrix", "K", "intrinsic_matrix", "cam_K")
+    four = [fields.find(name) for name in ("fx", "fy", "cx", "cy")]
+    if array is not None:
+        K = _matrix(_numbers(*array), array[0])
+    elif all(four):
+        K = camera_matrix(*(_number(*field) for field in four if field))
+    else:
+        fix = "pass the camera's file, of one camera"
+        raise UserError(f"{source} without camera_matrix (it has {fields})", FORMATS, fix)
+    lens = fields.find(
+        "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
+    )
+    distortion = () if lens is None else tuple(_numbers(*lens))
+    _check_model(fields, distortion)
+    return Calibration(_size(fields), K, distortion)
+
+
+class _Fields:
+    """Named fields of a file, each with its full name for messages."""
+
+    def __init__(self, content: Mapping[Any, object], source: str) -> None:
+        self.source = source
+        cameras = content.get("camera_settings")
+        if isinstance(cameras, list):  # NDDS's ``_camera_settings.json``
+            camera = cameras[0] if len(cameras) == 1 else None
+            inner = camera.get("intrinsic_settings") if isinstance(camera, Mapping) else None
+            if not isinstance(camera, Mapping) or not isinstance(inner, Mapping):
+                got = f"{source}: camera_settings of {len(cameras)} cameras"
+                raise UserError(got, "one camera with intrinsic_settings", "keep one of them")
+            size = camera.get("captured_image_size")
+            content = {**inner, **(size if isinstance(size, Mapping) else {})}
+        named = {name[:40]: value for name, value in content.items() if isinstance(name, str)}
+        self._fields = {_key(name): (f"{source}: {name}", value) for name, value in named.items()}
+        self._names = list(named)
+
+    def __str__(self) -> str:
+        return ", ".join(self._names[:10]) or "no field"
+
+    def find(self, *names: str) -> tuple[str, object] | None:
+        """Return the full name and the value of the first of these fields that exists."""
+        return next(
+            (self._fields[_key(name)] for name in names if _key(name) in self._fields), None
+        )
+
+
+def _key(name: str) -> str:
+    return name.lower().replace("_", "")
+
+
+def _size(fields: _Fields) -> Size | None:
+    both = fields.find("image_size", "resolution")
+    if both is not None:
+        sides = _numbers(*both)
+        if len(sides) != 2:
+            got = f"{both[0]} of {len(sides)} numbers"
+            raise UserError(got, "width and height", "correct it")
+        return _side(both[0], sides[0]), _side(both[0], sides[1])
+    width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
+    if width is None and height is None:
+        return None
+    if width is None or height is None:
+        missing = "height" if width else "width"
+        raise UserError(
+            f"{fields.source} without image_{missing}", "both or none", f"add {missing}"
+        )
+    return _side(*width), _side(*height)
+
+
+def _check_model(fields: _Fields, distortion: Sequence[float]) -> None:
+    """Refuse a lens that OpenCV's pinhole model does not describe."""
+    fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
+    if fisheye is not None and fisheye[1] not in (0, "0"):
+        raise UserError(f"{fields.source}: fisheye_model=1", "no fisheye lens", _UNDISTORT)
+    if model is None or (model[1] in (None, "") and not any(distortion)):
+        return
+    models = ("plumb_bob", "rational_polynomial")
+    if model[1] not in models:
+        raise UserError(f"{model[0]}={shown(model[1], 80)}", ", ".join(models), _UNDISTORT)
+
+
+def _numbers(name: str, value: object) -> list[float]:
+    """Return an array's numbers: a list, a list of rows, or a mapping with ``data``."""
+    if isinstance(value, Mapping):
+        numbers = _numbers(f"{name}.data", value.get("data"))
+        rows, columns = value.get("rows"), value.get("cols")
+        stated = None not in (rows, columns)
+        if stated and len(numbers) != _number(name, rows) * _number(name, columns):
+            raise UserError(
+                f"{name} of {rows}×{columns} with {len(numbers)} numbers",
+                "as many numbers as rows × cols", "write the file again",
+            )  # fmt: skip
+        return numbers
+    rows = value if isinstance(value, list) else [value]
+    flat = [entry for row in rows for entry in (row if isinstance(row, list) else [row])]
+    return [_number(name, entry) for entry in flat]
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number, which XML has as text."""
+    numbers = None if isinstance(value, bool) else _floats([value])
+    if numbers is None:
+        got = f"{name}={shown(value, 80)}"
+        raise UserError(got, "finite numbers", "write it as plain numbers, without base64")
+    return numbers[0]
+
+
+def _floats(values: Sequence[Any]) -> list[float] | None:
+    """Return finite numbers, or texts of them, as floats; None if a value is anything else."""
+    try:
+        numbers = [float(value) for value in values]
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return numbers if all(map(math.isfinite, numbers)) else None
+
+
+def _side(name: str, value: object) -> int:
+    number = _number(name, value)
+    return check(name, int(number) if number.is_integer() else number, int, _SIDE)
+
+
+def _matrix(values: Sequence[float], name: str) -> CameraMatrix:
+    """Return a camera matrix of nine numbers, row by row, or of fx, fy, cx, cy."""
+    if len(values) == 9:
+        return pinhole_matrix([values[:3], values[3:6], values[6:]], name)  # type: ignore[arg-type]
+    if len(values) != 4:
+        allowed = "nine (K, row by row) or four (fx fy cx cy)"
+        raise UserError(f"{name}: {len(values)} numbers", allowed, "write K as 3×3 numbers")
+    fx, fy, cx, cy = values
+    return camera_matrix(fx, fy, cx, cy)
