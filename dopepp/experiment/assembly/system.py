@@ -14,13 +14,14 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core.errors import UserError
 from dopepp.core.futures import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
+from dopepp.experiment import program
 from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
-from dopepp.experiment.results import display
 from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint.schema import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
@@ -141,7 +142,8 @@ def build_trainer(config: RunConfig, run_dir: Path, trackers: Sequence[Logger] =
     elif accelerator == "auto":
         accelerator = "cpu"
     precision, reason = choose_precision(options.precision, accelerator)
-    display.console.print(f"precision {precision}: {reason}")
+    if not getattr(rank_zero_only, "rank", 0):
+        program.say(f"precision {precision}: {reason}")
     callbacks = [CALLBACKS.build(node) for node in config.callbacks.values()]
     if config.ema is not None:
         callbacks.append(AveragedWeights(config.ema))

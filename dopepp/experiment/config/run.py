@@ -12,7 +12,7 @@ import torch
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.data import DataConfig, with_lens
 from dopepp.experiment.config.parse import Node, Range, Seed, parse
-from dopepp.experiment.results.protocols import Protocols
+from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.run.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.symmetry import SymmetryOptions

@@ -16,7 +16,6 @@ from rich.tree import Tree
 from dopepp.data.sample import SourceInfo
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import header_of
-from dopepp.experiment.run.tuning import Tuning
 from dopepp.metrics.row import shown_columns
 
 # Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:
@@ -83,20 +82,6 @@ def show_table(title: str, rows: Sequence[Mapping[str, str]], num_labels: int = 
     for row in rows:
         table.add_row(*(row.get(heading, "") for heading in header))
     console.print(table)
-
-
-def show_tuning(tuning: Tuning, path: Path) -> None:
-    """Print what tuning changed, measured on test images, and where the checkpoint is."""
-    shown, empty = tuning.num_images
-    title = f"tuned; measured on {shown} test images and {empty} without objects"
-    table = Table("", "before", "after", title=title)
-    for name, before in vars(tuning.before).items():
-        after = getattr(tuning.after, name)
-        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
-    console.print(table)
-    for name, value in tuning.options.items():
-        console.print(f"recovery.{name}: {value:.4g}")
-    console.print(f"tuned checkpoint {path}")
 
 
 def show_files(run_dir: Path) -> None:

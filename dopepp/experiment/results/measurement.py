@@ -16,9 +16,10 @@ from dopepp.drawing.sheet import contact_sheet
 from dopepp.experiment.assembly.renders import scaled_test_renders
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.results import conditions, display, evaluators, record
 from dopepp.experiment.results.compare import compare_reports
-from dopepp.experiment.results.protocols import Protocols, record_breakdown
+from dopepp.experiment.results.protocols import record_breakdown
 from dopepp.experiment.results.report import Measured, Report, measure
 from dopepp.experiment.results.tables import reported_rates
 from dopepp.inference.estimator import PoseEstimator

@@ -1,9 +1,7 @@
-"""What an evaluation measures beside the test set as it is: shading, scale, and rates per bin.
+"""Rates per bin of a quantity, such as the distance: they tell where a method fails.
 
-Rates per bin of a quantity, such as the distance, tell where a method fails. To add a quantity,
-write a function of the instances of one object and name it in :data:`QUANTITIES`. To add a
-protocol, give :class:`Protocols` its option, write a module that measures and records it, and call
-that in :func:`dopepp.experiment.results.measurement.measure_and_record`.
+To add a quantity, write a function of the instances of one object, name it in :data:`QUANTITIES`
+and in :data:`dopepp.experiment.config.protocols.QuantityName`.
 """
 
 from __future__ import annotations
@@ -14,17 +12,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dopepp.core.checks import check_integer
-from dopepp.core.errors import UserError
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
+from dopepp.experiment.config.protocols import QuantityName
 from dopepp.experiment.results import display, tables
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
@@ -32,9 +29,6 @@ from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
 from dopepp.metrics.row import finite_median
 
 _log = logging.getLogger(__name__)
-
-_MAX_SCALE: Final = 20.0
-"""Twenty times as near or as far."""
 
 Values = Float[np.ndarray, "n"]
 """A number of each of n instances."""
@@ -90,7 +84,7 @@ def _centres(instances: Gathered) -> Float[np.ndarray, "n 3"]:
     return np.asarray(T[:, :3, :3] @ instances.part.cuboid[CENTROID] + T[:, :3, 3])
 
 
-QUANTITIES: Final[dict[str, Quantity]] = {
+QUANTITIES: Final[dict[QuantityName, Quantity]] = {
     "distance": Quantity("distance (m)", distances, 3),
     "visibility": Quantity("visible fraction", visible_fractions, 3),
     "size": Quantity("apparent size (px)", sizes, 1),
@@ -125,7 +119,7 @@ class Bin:
 
 def break_down(
     metrics: Mapping[str, PoseMetrics],
-    quantity: str,
+    quantity: QuantityName,
     num_bins: int,
     rates: Sequence[tables.PassRate],
 ) -> tuple[list[Bin], list[tables.Figure]]:
@@ -181,7 +175,7 @@ def _in_bin(
 def record_breakdown(
     run_dir: Path,
     metrics: Mapping[str, PoseMetrics],
-    quantity: str,
+    quantity: QuantityName,
     num_bins: int,
     rates: Sequence[tables.PassRate],
 ) -> None:
@@ -228,59 +222,3 @@ def record_breakdown(
     edges = np.array([bins[0].low, *gaps, bins[-1].high])
     figure = rates_figure(panels, what.heading, len(rates), edges)
     write_png(path.with_suffix(".png"), figure_image(figure))
-
-
-@dataclass(frozen=True)
-class Protocols:
-    """The protocols asked for.
-
-    Attributes:
-        shading: Shares of every object's visible area to cover, ascending, without 0.
-        scales: How many times as large the parts are to appear, ascending, without 1.
-        by: Quantities over which rates are broken down.
-        num_bins: Bins of each.
-    """
-
-    shading: tuple[float, ...] = ()
-    scales: tuple[float, ...] = ()
-    by: tuple[str, ...] = ()
-    num_bins: int = 5
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Protocols:
-        """Read the options, of which a training has no scales; one may be a :class:`UserError`."""
-        shares = "shares of the visible area from 0 to 1, not 0 alone, e.g. [0.2,0.4,0.6,0.8]"
-        bounds = (1 / _MAX_SCALE, _MAX_SCALE)
-        factors = "factors from {:g} to {:g}, not 1 alone, e.g. [0.5,1,2]".format(*bounds)
-        return cls(
-            shading=_levels("shading", config["shading"], (0, 1), 0, shares),
-            scales=_levels("scale", config.get("scale_factors"), bounds, 1, factors),
-            by=_quantities(config["by"]),
-            num_bins=check_integer("num_bins", config["num_bins"], 1, 1000),
-        )
-
-    def __bool__(self) -> bool:
-        """Tell whether there is any."""
-        return bool(self.shading or self.scales or self.by)
-
-
-def _levels(
-    option: str, given: object, bounds: tuple[float, float], usual: float, allowed: str
-) -> tuple[float, ...]:
-    """Read one level or several; the usual one, the images as they are, is measured anyway."""
-    levels = [] if given is None else given if isinstance(given, list) else [given]
-    numbers = [one for one in levels if isinstance(one, int | float) and not isinstance(one, bool)]
-    wrong = len(numbers) < len(levels) or not all(bounds[0] <= one <= bounds[1] for one in numbers)
-    if wrong or (given is not None and all(one == usual for one in numbers)):
-        raise UserError(f"{option}={given!r:.100}", allowed, f"change {option}")
-    return tuple(sorted({float(one) for one in numbers if one != usual}))
-
-
-def _quantities(given: object) -> tuple[str, ...]:
-    """Read ``by``: one quantity or several."""
-    names = [] if given is None else given if isinstance(given, list) else [given]
-    wrong = [name for name in names if not isinstance(name, str) or name not in QUANTITIES]
-    if wrong or (given is not None and not names):
-        allowed = f"one or more of {', '.join(QUANTITIES)}"
-        raise UserError(f"by={given!r:.100}", allowed, "change by")
-    return tuple(dict.fromkeys(str(name) for name in names))

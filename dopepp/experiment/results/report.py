@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,14 +20,13 @@ from dopepp.drawing.pictures import DepthMap, Size
 from dopepp.drawing.sheet import Tile
 from dopepp.experiment.results.evaluators import Cost, MeasuredPose, Method, image_id
 from dopepp.experiment.results.tables import shown_rows
-from dopepp.experiment.run.images import Fingerprint
 from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.metrics.localisation import BopScores, Localisation
-from dopepp.metrics.pose import MEAN, PoseMetrics
+from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
 from dopepp.metrics.row import PoseRow, mean_row
 from dopepp.models.network import network_cost
 from dopepp.models.spec import build_network
-from dopepp.parts.part import Part
+from dopepp.parts.part import Part, Parts
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
@@ -35,6 +36,9 @@ FULL_SIZE_COST: Final = "full_size_cost"
 
 BOP: Final = "bop"
 """Key of the details that holds BOP's scores."""
+
+_DECIMALS: Final = 6
+"""Of pixels and metres: machines differ in the last digits of what they compute."""
 
 _REFINED: Final = "refined"
 """Key of a record that holds that of the same poses refined."""
@@ -242,6 +246,39 @@ def measure(
         for name, method in methods.items()
     ]
     return measured
+
+
+class Fingerprint:
+    """A hash over a test set: its objects, and every image's name, camera and truth, in order.
+
+    The pixels are not in it, because they may differ in a bit from machine to machine; the name of
+    the source tells renderers apart, and the covered share shaded images.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self._hash = hashlib.sha256()
+        self._add(sorted((part.name, part.mesh_hash) for part in parts))
+
+    def add(self, sample: Sample) -> None:
+        """Take the next image."""
+        truths = []
+        for one in sample.instances:
+            counts = bool(one.visible_fraction >= MIN_VISIBLE_FRACTION)
+            covered = round(one.masked_fraction, 2)
+            truths.append([one.label, _rounded(one.T_cam_obj), counts, covered])
+        self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
+
+    def word(self) -> str:
+        """Return the hash of what was taken so far."""
+        return self._hash.hexdigest()
+
+    def _add(self, facts: object) -> None:
+        self._hash.update(json.dumps(facts).encode() + b"\n")
+
+
+def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
+    """Return rounded numbers, of which none is a negative zero."""
+    return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
 
 
 class DepthDrawer:

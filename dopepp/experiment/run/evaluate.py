@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.table import Table
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.parts import build_parts
@@ -19,7 +20,7 @@ from dopepp.experiment.results.measurement import measure_and_record, of_network
 from dopepp.experiment.results.readme import write_job_readme
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.images import warn_of_other_images
-from dopepp.experiment.run.tuning import FalsePositiveTarget, tune, write_tuned
+from dopepp.experiment.run.tuning import FalsePositiveTarget, Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export
 from dopepp.models.network import PoseNetwork
@@ -38,8 +39,22 @@ def tune_and_record(
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
     record.write_json(run_dir / "tuning.json", asdict(tuning))
-    display.show_tuning(tuning, tuned)
+    _show(tuning, tuned)
     return tuned
+
+
+def _show(tuning: Tuning, path: Path) -> None:
+    """Print what tuning changed, measured on test images, and where the checkpoint is."""
+    shown, empty = tuning.num_images
+    title = f"tuned; measured on {shown} test images and {empty} without objects"
+    table = Table("", "before", "after", title=title)
+    for name, before in vars(tuning.before).items():
+        after = getattr(tuning.after, name)
+        table.add_row(name.replace("_", " ") + " %", f"{100 * before:.1f}", f"{100 * after:.1f}")
+    display.console.print(table)
+    for name, value in tuning.options.items():
+        display.console.print(f"recovery.{name}: {value:.4g}")
+    display.console.print(f"tuned checkpoint {path}")
 
 
 def parts_of(estimators: Sequence[PoseEstimator], data: DataConfig) -> list[Part]:

@@ -1,22 +1,18 @@
 """Which images a run has learnt from and was measured on, so that it shows when they are others.
 
-Results on other images cannot be compared, so a report holds a fingerprint of its test images. The
-data's configuration may stay as it is while files, meshes or the rendering code change. So a
+The data's configuration may stay as it is while files, meshes or the rendering code change. So a
 checkpoint holds, of every split, what its sources say of themselves and how its first image looks:
 its labels and a picture of 16 × 12 pixels, which another machine's rounding does not change.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Mapping
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
@@ -24,15 +20,10 @@ from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig, trained_on
 from dopepp.experiment.config.parse import flat
 from dopepp.geometry.camera import Letterbox
-from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.checkpoint.schema import Checkpoint
 from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)
-
-_DECIMALS: Final = 6
-"""Of pixels and metres: machines differ in the last digits of what they compute."""
-
 
 _LOOK_SIZE: Final = (16, 12)
 _MAX_LEVELS: Final = 2.0
@@ -41,39 +32,6 @@ _MAX_LABEL: Final = 1e-4
 """Difference of two camera matrices (relative) or poses (metres) above which they are others."""
 _LONG: Final = 40
 """Values with more characters are not shown."""
-
-
-class Fingerprint:
-    """A hash over a test set: its objects, and every image's name, camera and truth, in order.
-
-    The pixels are not in it, because they may differ in a bit from machine to machine; the name of
-    the source tells renderers apart, and the covered share shaded images.
-    """
-
-    def __init__(self, parts: Parts) -> None:
-        self._hash = hashlib.sha256()
-        self._add(sorted((part.name, part.mesh_hash) for part in parts))
-
-    def add(self, sample: Sample) -> None:
-        """Take the next image."""
-        truths = []
-        for one in sample.instances:
-            counts = bool(one.visible_fraction >= MIN_VISIBLE_FRACTION)
-            covered = round(one.masked_fraction, 2)
-            truths.append([one.label, _rounded(one.T_cam_obj), counts, covered])
-        self._add([sample.source, sample.key, sample.size, _rounded(sample.K), truths])
-
-    def word(self) -> str:
-        """Return the hash of what was taken so far."""
-        return self._hash.hexdigest()
-
-    def _add(self, facts: object) -> None:
-        self._hash.update(json.dumps(facts).encode() + b"\n")
-
-
-def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
-    """Return rounded numbers, of which none is a negative zero."""
-    return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
 
 
 def describe_images(source: DescribedSource) -> dict[str, Any]:

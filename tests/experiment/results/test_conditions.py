@@ -14,6 +14,7 @@ from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.renders import scaled_test_renders
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.assembly.system import build_untrained
+from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.results.conditions import (
     SCALE,
     SHADING,
@@ -25,7 +26,6 @@ from dopepp.experiment.results.conditions import (
 )
 from dopepp.experiment.results.evaluators import Cost, FileMethod, FilePose, ImageId
 from dopepp.experiment.results.measurement import measure_and_record
-from dopepp.experiment.results.protocols import Protocols
 from dopepp.experiment.results.report import measure
 from dopepp.experiment.results.tables import ADD_01D, ADD_5CM, read_csv
 from dopepp.geometry.cuboid import cuboid_keypoints

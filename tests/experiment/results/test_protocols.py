@@ -8,7 +8,7 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, entry
-from dopepp.experiment.results.protocols import Protocols
+from dopepp.experiment.config.protocols import Protocols
 
 OPTIONS: dict[str, Any] = {"shading": None, "by": None, "num_bins": 5, "scale_factors": None}
 SHARES = r"shading=.*; allowed: shares .* 0 to 1"

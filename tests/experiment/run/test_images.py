@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dopepp.data.sample import Instance, Sample
-from dopepp.experiment.run.images import Fingerprint
+from dopepp.experiment.results.report import Fingerprint
 from dopepp.parts.catalogue import pivconnector, servoholder
 
 
