@@ -14,8 +14,7 @@ import torch
 
 from dopepp.experiment.assembly.system import choose_precision, keep_freed_memory
 from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.network import PoseNetwork, network_cost
-from dopepp.models.spec import build_network
+from dopepp.models.network import PoseNetwork, build_network, network_cost
 
 BATCH, SIZE, WIDTH = 32, 128, 0.25
 STEPS, ROUNDS = 4, 7

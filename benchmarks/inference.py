@@ -13,8 +13,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from dopepp.models.network import PoseNetwork, network_cost
-from dopepp.models.spec import build_network
+from dopepp.models.network import PoseNetwork, build_network, network_cost
 
 FRAMES = {128: 30, 416: 4}
 CASES = (("dopepp_fast", 128, 0.5), ("dopepp", 128, 0.25), ("dopepp_fast", 416, 1.0),

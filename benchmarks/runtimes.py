@@ -58,7 +58,7 @@ def main() -> None:
 
 def pivconnector():
     """Return the released network of the quickstart."""
-    from dopepp.models.checkpoint.schema import load_network
+    from dopepp.models.checkpoint import load_network
 
     return "pivconnector", *load_network(Path("pretrained/pivconnector"))
 

@@ -56,7 +56,7 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     from dopepp.experiment.assembly.system import build_untrained
     from dopepp.inference.export import EXPORTERS
     from dopepp.inference.runtimes.description import Export
-    from dopepp.models.checkpoint.schema import load_network
+    from dopepp.models.checkpoint import load_network
 
     exporter, ending = EXPORTERS[layout]
     path = folder / f"{name.replace(' ', '_')}_{precision}{ending}"

@@ -35,7 +35,7 @@ from dopepp.inference.refinement.view import Coefficients, checked_depth, undist
 from dopepp.inference.refinement.visible import Depth
 from dopepp.inference.runtimes.runtime import Runtime
 from dopepp.inference.scales import Distances, letterboxes, merged
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import RecoveryOptions, rescored
 from dopepp.recovery.detection import Detection

@@ -26,8 +26,7 @@ from dopepp.core.files import write_whole
 from dopepp.inference.runtimes.description import Export, described, pack
 from dopepp.inference.runtimes.openvino import NAME, load_openvino
 from dopepp.inference.runtimes.runtime import INPUT, OUTPUTS, Pixels
-from dopepp.models.checkpoint.released import KEY, SUFFIX, write_content
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import KEY, SUFFIX, Checkpoint, write_content
 from dopepp.models.network import PoseNetwork
 
 PRECISIONS: Final = ("fp32", "fp16", "int8")

@@ -17,7 +17,7 @@ import numpy as np
 from dopepp.core.checks import check_range
 from dopepp.drawing.pictures import Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.seen import Seen
 from dopepp.recovery.detection import Detection
 

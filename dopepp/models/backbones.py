@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from dopepp.core.checks import check_flag, check_integers
 from dopepp.core.errors import UserError
-from dopepp.models.checkpoint.storage import read_mapping
 from dopepp.models.layers import (
     MAX_BLOCKS,
     MAX_CHANNELS,
@@ -26,6 +25,7 @@ from dopepp.models.layers import (
     initialise,
     scaled_channels,
 )
+from dopepp.models.storage import read_mapping
 
 Images = Float[Tensor, "batch 3 height width"]
 

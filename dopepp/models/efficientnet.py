@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from dopepp.core.checks import check_integer, check_integers
 from dopepp.core.errors import UserError, require
 from dopepp.models.backbones import Backbone, Images, copy_layer
-from dopepp.models.checkpoint.storage import read_mapping
 from dopepp.models.layers import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -31,6 +30,7 @@ from dopepp.models.layers import (
     initialise,
     scaled_channels,
 )
+from dopepp.models.storage import read_mapping
 
 IMAGENET: Final = "imagenet"
 """In place of a path: the file of the package :data:`_PACKAGE` (Apache-2.0), an extra."""

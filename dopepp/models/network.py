@@ -1,13 +1,17 @@
-"""The network: normalisation, backbone, attention and head, and what one costs.
+"""The network: normalisation, backbone, attention and head, built from a plain spec.
 
-The parts are wired from what each publishes (:mod:`dopepp.models.spec`); a cost is counted without
-running the network.
+A spec, which configs and checkpoints share, holds ``backbone``, ``attention`` and ``head`` nodes
+(``_target_`` and arguments), ``activation`` and ``num_objects``. Channel counts are not in it: the
+builder hands on what each part publishes. To make a class of another package buildable,
+``BACKBONES.register(dotted name)``.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Num
@@ -17,12 +21,19 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from torch.utils.flop_counter import FlopCounterMode
 
 from dopepp.core.errors import UserError
-from dopepp.models.attention import Attention
-from dopepp.models.backbones import Backbone
-from dopepp.models.heads import Head, Stage
+from dopepp.models import attention, backbones, heads, losses
 from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD, find_activation
+from dopepp.models.registry import TARGET, Registry
 
 Images = Num[Tensor, "batch 3 height width"]
+
+BACKBONES = Registry.of_module("backbone", backbones.Backbone, backbones)  # type: ignore[type-abstract]
+BACKBONES.register("dopepp.models.efficientnet.EfficientNetLite")
+ATTENTIONS = Registry.of_module("attention", attention.Attention, attention)  # type: ignore[type-abstract]
+HEADS = Registry.of_module("head", heads.Head, heads)
+LOSSES = Registry.of_module("loss", losses.MapLoss, losses)  # type: ignore[type-abstract]
+
+SPEC_KEYS = ("backbone", "attention", "head", "activation", "num_objects")
 
 
 class PoseNetwork(nn.Module):
@@ -41,9 +52,9 @@ class PoseNetwork(nn.Module):
 
     def __init__(
         self,
-        backbone: Backbone,
-        attention: Attention,
-        head: Head,
+        backbone: backbones.Backbone,
+        attention: attention.Attention,
+        head: heads.Head,
         activation: str,
         num_objects: int,
     ) -> None:
@@ -57,7 +68,7 @@ class PoseNetwork(nn.Module):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, images: Images) -> list[Stage]:
+    def forward(self, images: Images) -> list[heads.Stage]:
         """Return the belief logits and vector field of every stage.
 
         Images are RGB, 0–255, uint8 or floating point; of a shape that does not fit the network
@@ -89,7 +100,7 @@ class PoseNetwork(nn.Module):
                     del chain[number + 1]
         return network
 
-    def maps(self, images: Images) -> Stage:
+    def maps(self, images: Images) -> heads.Stage:
         """Return the last stage's belief maps (after the activation) and vector field."""
         logits, field = self(images)[-1]
         return self.activate(logits), field
@@ -120,3 +131,56 @@ def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, 
             module.training = mode
     num_parameters = sum(parameter.numel() for parameter in network.parameters())
     return num_parameters, counter.get_total_flops() / 2e9
+
+
+def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
+    """Build the network that a spec describes (see :mod:`dopepp.models.registry` for its nodes).
+
+    A :class:`UserError`: a key is missing or unknown, a target is not allowed, or an argument is.
+    """
+    _check_keys(spec)
+    activation, num_objects = spec["activation"], spec["num_objects"]
+    backbone = BACKBONES.build(spec["backbone"])
+    channels = backbone.out_channels
+    return PoseNetwork(
+        backbone,
+        ATTENTIONS.build(spec["attention"], channels=channels),
+        HEADS.build(
+            spec["head"], in_channels=channels, num_objects=num_objects, activation=activation
+        ),
+        activation,
+        num_objects,
+    )
+
+
+def check_spec(spec: Mapping[str, Any]) -> None:
+    """Check that a spec names nothing but allowed targets, without building any of them.
+
+    A :class:`UserError`: a key is missing or unknown, or a target is not allowed.
+    """
+    _check_keys(spec)
+    registries: dict[str, Registry[Any]] = {
+        "backbone": BACKBONES, "attention": ATTENTIONS, "head": HEADS,
+    }  # fmt: skip
+    for key, registry in registries.items():
+        node = spec[key]
+        registry.resolve(node.get(TARGET) if isinstance(node, Mapping) else node)
+
+
+def _check_keys(spec: object) -> None:
+    if not isinstance(spec, Mapping) or set(spec) != set(SPEC_KEYS):
+        got = sorted(map(str, spec)) if isinstance(spec, Mapping) else repr(spec)[:200]
+        keys = f"exactly {', '.join(SPEC_KEYS)}"
+        raise UserError(f"a model spec with {got!s:.200}", keys, "add or remove keys")
+
+
+def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a deep copy of a spec without ``weights_path``.
+
+    Pretrained weights are where training started; a checkpoint holds the trained ones, so it must
+    not need, nor make its reader open, a file of somebody else's machine.
+    """
+    plain: dict[str, Any] = copy.deepcopy(dict(spec))
+    if isinstance(plain.get("backbone"), dict):
+        plain["backbone"].pop("weights_path", None)
+    return plain

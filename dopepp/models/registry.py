@@ -2,7 +2,7 @@
 
 A node is a plain dict ``{"_target_": "package.module.Class", argument: value, …}``. The dotted name
 is compared with the allow-list before anything is imported, and what it resolves to is checked
-again, so neither a path through another module (``dopepp.models.spec.os.system``) nor a re-bound
+again, so neither a path through another module (``dopepp.models.network.os.system``) nor a re-bound
 name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
 
 To add a class of your own, import its module and call ``register("package.module.Class")`` of the

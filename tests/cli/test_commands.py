@@ -14,8 +14,8 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from dopepp.cli import app
-from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual.presets.preset import PRESETS
 

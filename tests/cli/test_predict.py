@@ -207,7 +207,7 @@ def test_any_picture_has_an_answer_in_time(folder, name, camera, silent):
 
 
 def test_an_old_checkpoint_without_meshes_names_the_option(folder, four, tmp_path):
-    from dopepp.models.checkpoint.schema import read, write_atomic
+    from dopepp.models.checkpoint import read, write_atomic
 
     own = read(Path(RELEASED))
     bare = replace(own, parts=[replace(own.parts[0], name="bracket", mesh=None)])

@@ -14,7 +14,7 @@ import torch
 from dopepp.geometry.camera import camera_matrix, make_transform
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.agreement import compare
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import pivconnector
 
 K = camera_matrix(130, 130, 63.5, 47.5)

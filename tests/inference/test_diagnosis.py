@@ -9,7 +9,7 @@ import pytest
 from dopepp import PoseEstimator
 from dopepp.geometry.camera import project_keypoints
 from dopepp.inference.diagnosis import CHECKS, Case, diagnose
-from dopepp.models.checkpoint.schema import load_network
+from dopepp.models.checkpoint import load_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
 from dopepp.virtual.scene import Sensor

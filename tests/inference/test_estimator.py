@@ -23,8 +23,8 @@ from dopepp.geometry.rotation import random_rotation, rotation_angle, rotation_v
 from dopepp.inference import estimator as module
 from dopepp.inference.picture import letterboxed
 from dopepp.maps import MapGeometry, encode
-from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.network import build_network
 from dopepp.parts.part import make_part
 
 K_VGA = camera_matrix(560, 565, 318.0, 242.5)

@@ -18,9 +18,9 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, check_possible
 from dopepp.inference.runtimes.description import Export
 from dopepp.inference.runtimes.runtime import num_threads
-from dopepp.models import spec as specs
+from dopepp.models import network as specs
 from dopepp.models.backbones import Backbone
-from dopepp.models.checkpoint.schema import Checkpoint, load_network, write_atomic
+from dopepp.models.checkpoint import Checkpoint, load_network, write_atomic
 from dopepp.parts.catalogue import pivconnector
 
 K = camera_matrix(130, 130, 63.5, 47.5)

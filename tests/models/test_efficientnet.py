@@ -8,7 +8,7 @@ from dopepp.core import errors
 from dopepp.core.errors import UserError
 from dopepp.models.efficientnet import DepthwiseConv, EfficientNetLite
 from dopepp.models.layers import IMAGENET_MEAN, IMAGENET_STD
-from dopepp.models.spec import architecture, build_network
+from dopepp.models.network import architecture, build_network
 
 ENDS = (4, 10, 15)
 """The published network's last blocks at strides 8, 16 and 32."""

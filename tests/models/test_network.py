@@ -8,8 +8,7 @@ from torch import nn
 from dopepp.core.errors import UserError
 from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
 from dopepp.models.layers import find_activation, scaled_channels
-from dopepp.models.network import network_cost
-from dopepp.models.spec import build_network
+from dopepp.models.network import build_network, network_cost
 
 
 def num_parameters(module: nn.Module) -> int:

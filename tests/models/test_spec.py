@@ -11,9 +11,8 @@ from torch import nn
 
 from dopepp.core.errors import UserError
 from dopepp.models import backbones
-from dopepp.models.network import PoseNetwork
+from dopepp.models.network import BACKBONES, LOSSES, PoseNetwork, architecture, build_network
 from dopepp.models.registry import Registry
-from dopepp.models.spec import BACKBONES, LOSSES, architecture, build_network
 
 OPTIMIZERS = Registry("optimizer", torch.optim.Optimizer, ["torch.optim.AdamW", "torch.optim.SGD"])
 DSC = "dopepp.models.backbones.DSC"
@@ -31,7 +30,7 @@ def test_builds_a_network_from_plain_values(make_spec):
 
 OTHERS = ("Path", "nn.Sequential", "conv_block", "Backbone")
 HOSTILE = [
-    *("os.system", "dopepp.models.spec.os.system", "dopepp.models.spec.backbones.DSC", "."),
+    *("os.system", "dopepp.models.network.os.system", "dopepp.models.network.backbones.DSC", "."),
     *(f"dopepp.models.backbones.{name}" for name in OTHERS),
     *(None, 7, nn.Identity, b"os.system"),
 ]

@@ -14,8 +14,8 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.network import build_network
 from dopepp.parts.part import Mesh, make_part
 
 MOST_MB = 400

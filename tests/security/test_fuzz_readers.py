@@ -43,8 +43,8 @@ from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.geometry.camera import camera_matrix, project_keypoints
-from dopepp.models.checkpoint.released import read_safetensors, write_safetensors
-from dopepp.models.checkpoint.schema import load_network
+from dopepp.models.checkpoint import load_network
+from dopepp.models.storage import read_safetensors, write_safetensors
 from dopepp.parts.mesh.read import read_mesh
 from dopepp.parts.part import Mesh, make_part
 

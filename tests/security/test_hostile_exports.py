@@ -11,8 +11,8 @@ import torch
 
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint.released import MAX_HEADER_BYTES
-from dopepp.models.checkpoint.schema import parse_description
+from dopepp.models.checkpoint import parse_description
+from dopepp.models.storage import MAX_HEADER_BYTES
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dopepp.models.checkpoint.released import MAX_HEADER_BYTES, read_safetensors, write_safetensors
+from dopepp.models.storage import MAX_HEADER_BYTES, read_safetensors, write_safetensors
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -13,9 +13,9 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.sources.rendered import RenderedSource, Split
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.losses import SpatialCrossEntropy
-from dopepp.models.spec import build_network
+from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import RecoveryOptions

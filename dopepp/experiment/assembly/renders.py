@@ -13,7 +13,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.experiment.assembly.parts import build_negatives
 from dopepp.experiment.config.data import Cache, DataConfig, chosen_data, trained_on
 from dopepp.geometry.camera import Letterbox
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.catalogue import with_meshes
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import find_backgrounds

@@ -23,9 +23,8 @@ from dopepp.experiment import program
 from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
-from dopepp.models.network import PoseNetwork
-from dopepp.models.spec import LOSSES, build_network
+from dopepp.models.checkpoint import Checkpoint, load_network
+from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.seen import Seen
 from dopepp.recovery.calibration import RecoveryOptions

@@ -39,10 +39,10 @@ class ModelConfig:
     Attributes:
         name: What it is called in tables.
         width: Factor on every channel count, of which the nodes below take their own.
-        backbone: Node of :data:`~dopepp.models.spec.BACKBONES`.
-        attention: Node of :data:`~dopepp.models.spec.ATTENTIONS`.
-        head: Node of :data:`~dopepp.models.spec.HEADS`.
-        loss: Node of :data:`~dopepp.models.spec.LOSSES`.
+        backbone: Node of :data:`~dopepp.models.network.BACKBONES`.
+        attention: Node of :data:`~dopepp.models.network.ATTENTIONS`.
+        head: Node of :data:`~dopepp.models.network.HEADS`.
+        loss: Node of :data:`~dopepp.models.network.LOSSES`.
     """
 
     name: str

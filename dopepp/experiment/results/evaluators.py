@@ -28,8 +28,7 @@ from dopepp.geometry.camera import Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
-from dopepp.models.network import network_cost
-from dopepp.models.spec import build_network
+from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Parts
 from dopepp.recovery.silence import Reason, furthest
 

@@ -12,8 +12,7 @@ from dopepp.experiment.results import record
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import markdown_text, shown_rows
 from dopepp.metrics.row import COLUMNS
-from dopepp.models.checkpoint.released import SUFFIX, write_content
-from dopepp.models.checkpoint.schema import Checkpoint, read
+from dopepp.models.checkpoint import SUFFIX, Checkpoint, read, write_content
 
 MAX_BYTES: Final = 8_000_000
 """Of a released file: it travels with the package."""

@@ -24,8 +24,7 @@ from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.metrics.localisation import BopScores, Localisation
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
 from dopepp.metrics.row import PoseRow, mean_row
-from dopepp.models.network import network_cost
-from dopepp.models.spec import build_network
+from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Part, Parts
 from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
 from dopepp.virtual.scene import SceneObject

@@ -28,8 +28,7 @@ from dopepp.inference.picture import letterboxed
 from dopepp.inference.runtimes.description import Export
 from dopepp.inference.runtimes.runtime import Pixels
 from dopepp.inference.scales import letterboxes
-from dopepp.models.checkpoint.released import FOLDER
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
+from dopepp.models.checkpoint import FOLDER, Checkpoint, load_network
 from dopepp.models.network import network_cost
 
 _log = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig, trained_on
 from dopepp.experiment.config.parse import flat
 from dopepp.geometry.camera import Letterbox
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Parts
 
 _log = logging.getLogger(__name__)

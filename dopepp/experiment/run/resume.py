@@ -25,7 +25,7 @@ from dopepp.experiment.config.parse import below, flat
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.results import record
 from dopepp.experiment.run.images import differing_images
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 
 _log = logging.getLogger(__name__)
 

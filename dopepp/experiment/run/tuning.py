@@ -30,8 +30,8 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import add, add_s, expected_calibration_error, mahalanobis
 from dopepp.metrics.pose import assign, counted
 from dopepp.metrics.row import symmetries
-from dopepp.models.checkpoint.schema import Checkpoint
-from dopepp.models.checkpoint.storage import write_atomic
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.storage import write_atomic
 from dopepp.parts.part import Part, Parts
 from dopepp.recovery import calibration
 from dopepp.recovery.calibration import RecoveryOptions

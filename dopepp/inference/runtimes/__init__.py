@@ -13,7 +13,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.inference.runtimes.runtime import Runtime
-from dopepp.models.checkpoint.schema import Checkpoint, load_network
+from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import PoseNetwork
 
 SUFFIXES: Final = {

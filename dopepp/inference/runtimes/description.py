@@ -13,9 +13,9 @@ from typing import Any, Final
 from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.core.json import parse_json
-from dopepp.models.checkpoint.released import KEY, MAX_HEADER_BYTES, packed
-from dopepp.models.checkpoint.schema import Checkpoint, parse_description
-from dopepp.models.spec import check_spec
+from dopepp.models.checkpoint import KEY, Checkpoint, packed, parse_description
+from dopepp.models.network import check_spec
+from dopepp.models.storage import MAX_HEADER_BYTES
 
 _SECTION: Final = "export"
 _MOST: Final = 1e12

@@ -26,8 +26,7 @@ from dopepp.inference.runtimes.runtime import (
     read_bytes,
     refused,
 )
-from dopepp.models.checkpoint.released import KEY
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import KEY, Checkpoint
 
 if TYPE_CHECKING:
     import onnx

@@ -24,8 +24,8 @@ from dopepp.inference.runtimes.runtime import (
     read_bytes,
     refused,
 )
-from dopepp.models.checkpoint.released import KEY, MAX_HEADER_BYTES
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import KEY, Checkpoint
+from dopepp.models.storage import MAX_HEADER_BYTES
 
 NAME: Final = "model.xml"
 WEIGHTS: Final = ".bin"

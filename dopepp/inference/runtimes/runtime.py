@@ -16,7 +16,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.futures import physical_cores
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.inference.runtimes.description import Export
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.heads import Stage
 from dopepp.models.network import Images
 

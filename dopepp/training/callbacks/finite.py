@@ -24,7 +24,7 @@ from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
 from dopepp.drawing.overlay import GREEN, Wireframe, overlay
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.models.checkpoint.storage import write_atomic
+from dopepp.models.storage import write_atomic
 
 _log = logging.getLogger(__name__)
 

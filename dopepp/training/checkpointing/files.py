@@ -22,8 +22,8 @@ from torch import Tensor
 
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import PARTIAL_SUFFIX, is_abandoned
-from dopepp.models.checkpoint.schema import Checkpoint, read
-from dopepp.models.checkpoint.storage import write_atomic
+from dopepp.models.checkpoint import Checkpoint, read
+from dopepp.models.storage import write_atomic
 
 _log = logging.getLogger(__name__)
 

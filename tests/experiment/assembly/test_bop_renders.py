@@ -19,7 +19,7 @@ from dopepp.experiment.assembly.parts import build_negatives, build_parts
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.assembly.sources import build_datamodule, held_out_source
 from dopepp.geometry.camera import project_keypoints
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory
 from dopepp.virtual.presets.preset import customised_preset

@@ -18,8 +18,8 @@ from dopepp.experiment.assembly.sources import build_datamodule
 from dopepp.experiment.assembly.system import build_system, build_trainer
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.run.tracking import tracked
+from dopepp.models.network import ATTENTIONS, BACKBONES, HEADS, LOSSES
 from dopepp.models.registry import Registry
-from dopepp.models.spec import ATTENTIONS, BACKBONES, HEADS, LOSSES
 
 CONF = Path(__file__).parents[3] / "conf"
 REGISTRIES: dict[str, Registry[Any]] = {
@@ -144,7 +144,7 @@ HOSTILE = (
     "subprocess.Popen",
     "builtins.eval",
     "dopepp.experiment.assembly.system.torch.hub.load",
-    "dopepp.models.spec.build_network",
+    "dopepp.models.network.build_network",
     "dopepp.training.system.PoseSystem",
     "not_a_module.Thing",
     "torch.utils.collect_env.run",  # these three pass Hydra's own list of forbidden names

@@ -9,7 +9,7 @@ from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.sources import share_of
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
-from dopepp.models.checkpoint.schema import read
+from dopepp.models.checkpoint import read
 
 PRETRAINED = sorted((Path(__file__).parents[3] / "dopepp" / "pretrained").glob("*.safetensors"))
 

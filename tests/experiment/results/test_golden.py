@@ -28,8 +28,8 @@ from dopepp.experiment.results.release import release
 from dopepp.experiment.results.tables import ADD_01D, ADD_5CM
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
-from dopepp.models.checkpoint.schema import Checkpoint, write_atomic
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint, write_atomic
+from dopepp.models.network import build_network
 from dopepp.parts import load_part
 
 GOLDEN = Path(__file__).parent / "golden"

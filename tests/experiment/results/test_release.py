@@ -10,8 +10,8 @@ from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.release import release
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.row import PoseRow
-from dopepp.models.checkpoint.schema import Checkpoint, read, write_atomic
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint, read, write_atomic
+from dopepp.models.network import build_network
 from dopepp.parts import load_part
 
 

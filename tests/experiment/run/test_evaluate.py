@@ -9,7 +9,7 @@ from dopepp.experiment.results.measurement import made_worse
 from dopepp.experiment.results.record import METRICS_FILE, read_json
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.evaluate import evaluate
-from dopepp.models.checkpoint.schema import read, write_atomic
+from dopepp.models.checkpoint import read, write_atomic
 
 
 def test_refined_poses_are_measured_beside_the_networks(composed, tmp_path):

@@ -9,8 +9,8 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.experiment.run.memory import Memory
 from dopepp.geometry.camera import camera_matrix
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.models.checkpoint.schema import Checkpoint
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.network import build_network
 from dopepp.parts import load_part
 
 K = camera_matrix(100, 100, 31.5, 31.5)

@@ -19,7 +19,7 @@ from dopepp.experiment.run.resume import (
     read_overrides,
     trusted_overrides,
 )
-from dopepp.models.checkpoint.schema import Checkpoint
+from dopepp.models.checkpoint import Checkpoint
 
 
 class Pictures:

@@ -26,8 +26,8 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoi
 from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.functional import expected_calibration_error
-from dopepp.models.checkpoint.schema import Checkpoint
-from dopepp.models.spec import build_network
+from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.network import build_network
 from dopepp.parts import load_part
 from dopepp.recovery.calibration import FEATURES, score
 from dopepp.recovery.detection import Detection

@@ -9,9 +9,9 @@ import torch
 from safetensors import safe_open
 
 from dopepp.core.errors import UserError
-from dopepp.models.checkpoint import released
-from dopepp.models.checkpoint.schema import Checkpoint, load_network, read
-from dopepp.models.spec import build_network
+from dopepp.models import checkpoint as released
+from dopepp.models.checkpoint import Checkpoint, load_network, read
+from dopepp.models.network import build_network
 from dopepp.parts import load_part
 
 

@@ -1,8 +1,10 @@
-"""Torch files: written whole or not at all, read as the untrusted input they are.
+"""Torch and safetensors files: written whole or not at all, read as untrusted input.
 
-``torch.load(weights_only=True)`` runs no code, but it builds what a pickle of a few bytes asks for,
-and it reads where the archive points. So before it sees a file, the archive, the names that the
-pickle calls and the sizes that it claims are held to what is in the file.
+``torch.load(weights_only=True)`` runs no code, but it builds whatever a pickle of a few bytes asks
+for, and reads wherever the archive points. Before it sees a file, the archive, the names that the
+pickle calls and the sizes that it claims are therefore compared with the bytes of the file. A
+safetensors file is the length of its header (8 bytes, little endian), the header in JSON, and bare
+numbers: nothing in it can run, and the library compares every tensor with its bytes in the file.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import torch
+from safetensors.torch import load, save
+from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import partial_path
+from dopepp.core.files import partial_path, write_whole
+from dopepp.core.json import parse_json
 
 MAX_BYTES: Final = 4 * 2**30
 """The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
@@ -58,6 +63,19 @@ _NAMES: Final = {
 """What a pickle may name: each makes an object no larger than its arguments. torch's own list also
 has ``bytearray`` and tensor classes, which allocate what a number says (case "a call that fills the
 memory"), and ``_rebuild_from_type_v2``, which sets any attribute ("methods set on a tensor")."""
+
+MAX_SAFETENSORS_BYTES: Final = 2**30
+"""Five times the full DOPE in float32."""
+
+MAX_HEADER_BYTES: Final = 16_000_000
+"""Of a safetensors header with its metadata: ADD points and meshes of forty parts as text."""
+
+_MAX_NAME: Final = 200
+"""Characters of a tensor's name or of a key of the metadata."""
+
+_LENGTH_BYTES: Final = 8
+_METADATA: Final = "__metadata__"
+_FIELDS: Final = {"dtype", "shape", "data_offsets"}
 
 
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
@@ -259,3 +277,60 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
             if kind in _STORAGE_BYTES and key.isascii():
                 return kind, key, count
     raise ValueError("a reference to something that is no storage")
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a file that anybody may have written: tensors by name, on the CPU, and the metadata.
+
+    A file that is missing, damaged or too large, or whose header is, is a :class:`UserError`.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_SAFETENSORS_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = path.read_bytes()
+        header = _header(content)
+        tensors = load(content)
+        # Here the library has found every tensor and every byte of the file to be in its place.
+        entries: Any = parse_json(header, "its header")
+        metadata = entries.pop(_METADATA, {})
+        # It takes these four: "another field", "a long name", "no name", "metadata of a long name".
+        known = all(entry.keys() == _FIELDS for entry in entries.values())
+        if not known or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
+            raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
+    except OSError as error:
+        raise _bad_safetensors(path, str(error.strerror)) from error
+    except UserError as error:
+        raise _bad_safetensors(path, error.got) from error
+    except Exception as error:  # the library's own, and what a foreign header leads to
+        raise _bad_safetensors(path, str(error)) from error
+    return tensors, metadata
+
+
+def write_safetensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> None:
+    """Write a file, whole or not at all: tensors of any device and strides, metadata as texts.
+
+    A header longer than what is read is a ``ValueError``.
+    """
+    plain = {name: one.detach().cpu().contiguous().clone() for name, one in tensors.items()}
+    content = save(plain, dict(metadata))
+    _header(content)
+    write_whole(path, content)
+
+
+def _header(content: bytes) -> bytes:
+    """Return a file's header; the library would parse up to 100 MB of it."""
+    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
+    if length > MAX_HEADER_BYTES:
+        raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")
+    return content[_LENGTH_BYTES : _LENGTH_BYTES + length]
+
+
+def _bad_safetensors(path: Path, got: str) -> UserError:
+    return UserError(
+        f"{path}: {' '.join(got[:300].split())}",
+        f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB",
+        "get the file again from its source",
+    )

@@ -1,0 +1,374 @@
+"""The checkpoint: one self-describing file, read under ``weights_only=True``.
+
+A ``.ckpt`` is a Lightning checkpoint (or just these two keys): the weights under ``state_dict``,
+prefixed ``network.``, and under ``dopepp`` everything that turns them into a pose estimator. A
+released ``.safetensors`` holds the weights in half precision and the same description as JSON in
+its metadata; ``pretrained/NAME`` stands for a file of the package's folder ``dopepp/pretrained``.
+This module alone knows the files; training writes them, inference and experiment read them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Annotated, Any, Final
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import parse_json
+from dopepp.core.validation import Range, parse
+from dopepp.models.network import PoseNetwork, architecture, build_network
+from dopepp.models.storage import (
+    check_container,
+    read_mapping,
+    read_safetensors,
+    write_atomic,
+    write_safetensors,
+)
+from dopepp.parts.part import Part
+from dopepp.parts.seen import Seen
+
+__all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
+
+KEY: Final = "dopepp"
+"""Of the description in a file of either kind."""
+
+STATE_PREFIX: Final = "network."
+FORMAT_VERSION: Final = 2
+
+SUFFIX: Final = ".safetensors"
+FOLDER: Final = "pretrained"
+
+MAX_SIDE: Final = 8192
+"""Pixels of an input: an image is enlarged to it, so it decides about memory."""
+
+_MAX_VALUES: Final = 4_000_000
+_MAX_DEPTH: Final = 32
+_MAX_BITS: Final = 128
+"""Values, levels of nesting, bits of an integer: more than any description of ours has."""
+
+_FOLDER_KEYS: Final = ("root", "cache_dir", "backgrounds")
+"""Keys of a data configuration that name folders of the machine it was trained on."""
+
+_WHAT: Final = "a checkpoint (.ckpt) written by train.py"
+_FIX: Final = "write the file with train.py"
+
+
+@dataclass(eq=False)
+class Checkpoint:
+    """A trained network and all that is needed to use it.
+
+    Attributes:
+        spec: The network's spec (:mod:`dopepp.models.network`), without pretrained weights' path.
+        state_dict: The network's weights, without prefix.
+        parts: The objects, in channel order.
+        input_size: (width, height) the network was trained at, pixels.
+        stride: Pixels per map cell.
+        sigma: Standard deviation of the belief targets, cells.
+        recovery: Thresholds that turn maps into detections.
+        data: The data and camera configuration it was trained on.
+        data_fingerprint: Hash that changes whenever the training data would.
+        seen: How large and how far away the network has seen its parts, by name.
+    """
+
+    spec: dict[str, Any]
+    state_dict: dict[str, Tensor]
+    parts: list[Part]
+    input_size: tuple[int, int]
+    stride: int
+    sigma: float
+    recovery: dict[str, float] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+    data_fingerprint: str = ""
+    seen: dict[str, Seen] = field(default_factory=dict)
+
+    def to_payload(self) -> dict[str, Any]:
+        """Return everything but the weights as plain values, for the file's ``dopepp`` key.
+
+        Raises:
+            TypeError: A value is neither plain nor a numpy scalar or array.
+        """
+        names = ("input_size", "stride", "sigma", "recovery", "data", "data_fingerprint", "seen")
+        values = {
+            "format_version": FORMAT_VERSION,
+            "spec": architecture(self.spec),
+            "parts": [part.to_record() for part in self.parts],
+            **{name: getattr(self, name) for name in names},
+        }
+        payload: dict[str, Any] = json.loads(json.dumps(values, default=_from_numpy))
+        return payload
+
+    def to_file(self) -> dict[str, Any]:
+        """Return the content of a file that holds this checkpoint and no training state."""
+        weights = {STATE_PREFIX + name: value for name, value in self.state_dict.items()}
+        return {"state_dict": weights, KEY: self.to_payload()}
+
+
+_Side = Annotated[int, Range(1, MAX_SIDE, "pixels")]
+
+
+@dataclass(frozen=True)
+class _Header:
+    """A description's fields, except the version; unknown ones are ignored."""
+
+    spec: dict[str, Any]
+    parts: list[Any]
+    data: dict[str, Any]
+    input_size: Annotated[list[_Side], Field(min_length=2, max_length=2)]
+    stride: Annotated[int, Range(1, 256, "pixels")]
+    sigma: Annotated[float, Range(0.1, 100, "cells")]
+    recovery: dict[str, int | float]
+    data_fingerprint: str
+    seen: dict[str, Any]
+
+
+def read(path: Path) -> Checkpoint:
+    """Read a checkpoint and compare its weights with its own spec.
+
+    Args:
+        path: A file that training or ``dopepp release`` has written, or ``pretrained/NAME``.
+
+    Raises:
+        UserError: The file is missing, damaged, foreign, too large, of another version, names
+            something that may not be built, or is inconsistent.
+    """
+    path = find(Path(path))
+    if path.suffix == SUFFIX:
+        content, size = _read_released(path)
+    else:
+        size = check_container(path, _WHAT)
+        content = read_mapping(path, _WHAT)
+    if KEY not in content:
+        raise UserError(f"{path} without {KEY!r} entry", _WHAT, "pass a file written by train.py")
+    try:
+        weights = _parse_weights(content.get("state_dict"))
+        checkpoint = replace(parse_description(content[KEY]), state_dict=weights)
+        _check_weights(checkpoint, size)
+    except UserError as error:
+        raise UserError(f"{error.got}, in checkpoint {path}", error.allowed, error.fix) from error
+    return checkpoint
+
+
+def load_network(path: Path) -> tuple[PoseNetwork, Checkpoint]:
+    """Read a checkpoint as :func:`read`; return its network, evaluating on the CPU, and itself."""
+    checkpoint = read(path)
+    network = build_network(checkpoint.spec)
+    network.load_state_dict(checkpoint.state_dict)
+    return network.eval(), checkpoint
+
+
+def parse_description(payload: object) -> Checkpoint:
+    """Parse the result of :meth:`Checkpoint.to_payload`: a checkpoint without weights.
+
+    Raises:
+        UserError: A field is missing, of the wrong type or out of its range. Nothing is built.
+    """
+    if not isinstance(payload, dict):
+        raise UserError(f"a {type(payload).__name__} under {KEY!r}", "a mapping", "train again")
+    _check_plain(payload)
+    version = payload.get("format_version")
+    if type(version) is not int or version != FORMAT_VERSION:
+        fix = "read the file with the dopepp that wrote it, or train again"
+        raise UserError(f"format_version {version!r:.100}", f"{FORMAT_VERSION}", fix)
+    # Containers whose content has a reader of its own are not copied: empty ones stand for them.
+    own = {name: payload[name] for name in ("spec", "parts", "data") if name in payload}
+    empty = {name: type(value)() for name, value in own.items() if isinstance(value, (dict, list))}
+    header = parse(_Header, {**payload, **empty}, fix=_FIX)
+    return Checkpoint(
+        spec=architecture(own["spec"]),
+        state_dict={},
+        parts=[Part.from_record(record) for record in own["parts"]],
+        input_size=(header.input_size[0], header.input_size[1]),
+        stride=header.stride,
+        sigma=header.sigma,
+        recovery=header.recovery,
+        data=own["data"],
+        data_fingerprint=header.data_fingerprint,
+        seen={name: Seen.parse(values) for name, values in header.seen.items()},
+    )
+
+
+def _check_plain(payload: Mapping[Any, Any]) -> None:
+    """Refuse values that are not plain, nested too deep or too many.
+
+    A list that holds one other list many times, and so on, takes no memory until it is printed.
+    """
+    counts: dict[int, int] = {}
+    for name, value in payload.items():
+        try:
+            _count(value, 0, counts)
+        except ValueError as error:
+            allowed = "mappings, lists, text, numbers, true/false and null"
+            raise UserError(f"{name!s:.50} with {error}", allowed, _FIX) from error
+
+
+def _count(value: object, depth: int, counts: dict[int, int]) -> int:
+    """Return the number of plain values in a value, repeated ones as often as they occur.
+
+    ``counts`` are those of the containers that were counted before, by identity.
+    """
+    if type(value) not in (dict, list, tuple):
+        if isinstance(value, int) and value.bit_length() > _MAX_BITS:
+            raise ValueError(f"an integer of {value.bit_length()} bits")
+        if type(value) not in (str, int, float, bool, type(None)):
+            raise ValueError(f"a {type(value).__name__}")
+        return 1
+    if id(value) not in counts:
+        if depth == _MAX_DEPTH:
+            raise ValueError(f"values nested more than {_MAX_DEPTH} deep")
+        items: Iterable[object] = value  # type: ignore[assignment]
+        if isinstance(value, dict):
+            odd = next((key for key in value if type(key) not in (str, int)), None)
+            if odd is not None:
+                raise ValueError(f"a key of type {type(odd).__name__}")
+            items = value.values()
+        counts[id(value)] = 1 + sum(_count(item, depth + 1, counts) for item in items)
+    if counts[id(value)] > _MAX_VALUES:
+        raise ValueError(f"over {_MAX_VALUES} values")
+    return counts[id(value)]
+
+
+def _parse_weights(state_dict: object) -> dict[str, Tensor]:
+    if not isinstance(state_dict, dict):
+        got = f"state_dict as {type(state_dict).__name__}"
+        raise UserError(got, "weights by name", _FIX)
+    return {
+        name.removeprefix(STATE_PREFIX): value
+        for name, value in state_dict.items()
+        if isinstance(name, str) and name.startswith(STATE_PREFIX)
+    }
+
+
+def _check_weights(checkpoint: Checkpoint, size: int) -> None:
+    """Compare the weights with the network of the spec, built without memory on ``meta``."""
+    with torch.device("meta"):
+        network = build_network(checkpoint.spec)
+    if checkpoint.stride != network.stride or network.num_objects != len(checkpoint.parts):
+        raise UserError(
+            f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts",
+            f"stride {network.stride} and {network.num_objects} parts, as the spec has it",
+            _FIX,
+        )
+    expected, weights = network.state_dict(), checkpoint.state_dict
+    odd = sorted(expected.keys() ^ weights.keys()) or [
+        name for name, value in expected.items() if not _same_kind(weights[name], value)
+    ]
+    # A tensor may be a view that repeats a few stored numbers to any size: the file must hold all.
+    stored = 0 if odd else sum(value.numel() * value.element_size() for value in weights.values())
+    if odd or stored > size:
+        raise UserError(
+            f"weights that do not fit the spec's network, first {odd[0] if odd else 'their size'}",
+            f"the {len(expected)} tensors of that network",
+            "write the file with train.py, or use the spec it was trained with",
+        )
+
+
+def _same_kind(value: object, expected: Tensor) -> bool:
+    return (
+        isinstance(value, Tensor)
+        and value.layout is torch.strided
+        and value.device.type == "cpu"
+        and value.shape == expected.shape
+        and value.is_floating_point() == expected.is_floating_point()
+        and not value.is_complex()
+    )
+
+
+def _from_numpy(value: object) -> object:
+    """Return a numpy scalar or array as built-in types, which load under ``weights_only``."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"a checkpoint holds plain values, got {value!r:.200}")
+
+
+def released_paths() -> dict[str, Path]:
+    """Return the released checkpoints by name."""
+    folder = Path(__file__).parents[1] / FOLDER
+    return {path.stem: path for path in sorted(folder.glob(f"*{SUFFIX}"))}
+
+
+def find(path: Path) -> Path:
+    """Return the file that a path stands for: ``pretrained/NAME`` is a released checkpoint.
+
+    Raises:
+        UserError: No checkpoint of that name was released.
+    """
+    if path.parent != Path(FOLDER) or path.exists():
+        return path
+    known = released_paths()
+    if path.name not in known:
+        names = ", ".join(f"{FOLDER}/{name}" for name in known) or "none"
+        raise UserError(f"checkpoint {path}", f"a file, or one of {names}", "correct the name")
+    return known[path.name]
+
+
+def _read_released(path: Path) -> tuple[dict[str, Any], int]:
+    """Read a released file; return its content, weights in single precision, and their bytes."""
+    tensors, metadata = read_safetensors(path)
+    if KEY not in metadata:
+        got, allowed = f"{path} without a description under {KEY!r}", "a file of `dopepp release`"
+        raise UserError(got, f"{allowed} or `dopepp export`", "get the file again")
+    payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
+    weights = {
+        name: value.float() if value.is_floating_point() else value
+        for name, value in tensors.items()
+    }
+    size = sum(value.numel() * value.element_size() for value in weights.values())
+    return {"state_dict": weights, KEY: payload}, size
+
+
+def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
+    """Write a safetensors file whose description names no local path.
+
+    Args:
+        content: Result of :meth:`Checkpoint.to_file`.
+        path: File to write.
+        half: Whether to write the weights in half precision.
+
+    Raises:
+        UserError: A weight does not fit into half precision.
+    """
+    weights = content["state_dict"]
+    if half:
+        weights = {name: _half(name, value) for name, value in weights.items()}
+    write_safetensors(path, weights, {KEY: packed(content[KEY])})
+
+
+def packed(payload: Mapping[str, Any]) -> str:
+    """Return a payload as one line of JSON, without folders of this machine."""
+    return json.dumps(_portable(payload), allow_nan=False)
+
+
+def _half(name: str, value: Tensor) -> Tensor:
+    if not value.is_floating_point():
+        return value
+    half = value.to(torch.float16)
+    if not half.isfinite().all():
+        raise UserError(
+            f"{name} with values up to {float(value.abs().max()):g}",
+            f"finite weights of at most {torch.finfo(torch.float16).max:g}",
+            "train again: such weights come from a run that diverged",
+        )
+    return half
+
+
+def _portable(value: Any, key: str = "") -> Any:
+    """Return a payload in which folders of this machine are null and files have only a name."""
+    if isinstance(value, Mapping):
+        return {name: _portable(item, name) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_portable(item, key) for item in value]
+    if not isinstance(value, str):
+        return value
+    if key in _FOLDER_KEYS and ("/" in value or "\\" in value):
+        return None
+    for kind in (PurePosixPath, PureWindowsPath):
+        if kind(value).is_absolute() or value.startswith(("~", "..")):
+            return kind(value).name
+    return value

@@ -1,1 +1,0 @@
-"""The checkpoint: one self-describing file, written whole, read without trust."""
