@@ -270,9 +270,9 @@ def _location(value: object, steps: Sequence[str | int]) -> tuple[str | int, ...
         if isinstance(value, Mapping) and (step in value or is_last):
             location.append(step)
             value = value.get(step)
-        elif isinstance(value, (list, tuple)) and isinstance(step, int) and step < len(value):
+        elif isinstance(value, (list, tuple)) and isinstance(step, int):
             location.append(step)
-            value = value[step]
+            value = value[step] if step < len(value) else None
     return tuple(location)
 
 
@@ -280,7 +280,10 @@ def _allowed(detail: ErrorDetails) -> str:
     context = detail.get("ctx", {})
     if "expected" in context:
         return str(context["expected"]).replace("'", "").replace(" or ", ", ")
-    return _WORDS.get(detail["type"].partition("_")[0], detail["msg"])
+    if "pattern" in context:
+        return f"text like {context['pattern']}"
+    words = detail["msg"].removeprefix("Input should be ")
+    return _WORDS.get(detail["type"].partition("_")[0], words)
 
 
 def _fields(kind: Any, location: Sequence[str | int]) -> list[str]:

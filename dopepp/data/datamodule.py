@@ -30,7 +30,7 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, focal_length, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
-from dopepp.parts.seen import Seen, widest
+from dopepp.parts.size import Seen, widest
 from dopepp.virtual.backgrounds import Backgrounds
 
 _SEEN_ITEMS: Final = 200

@@ -37,7 +37,7 @@ from dopepp.inference.overlay import make_shape
 from dopepp.inference.picture import letterboxed
 from dopepp.inference.results import PoseResult
 from dopepp.inference.scales import letterboxes
-from dopepp.parts.wording import part_in_words
+from dopepp.parts.size import part_in_words
 from dopepp.recovery.silence import explained
 
 HOST: Final = "127.0.0.1"

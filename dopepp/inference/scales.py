@@ -18,7 +18,7 @@ from dopepp.core.checks import check_range
 from dopepp.drawing.pictures import Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.models.checkpoint import Checkpoint
-from dopepp.parts.seen import Seen
+from dopepp.parts.size import Seen
 from dopepp.recovery.detection import Detection
 
 Distances = tuple[float, float] | Literal["any"]

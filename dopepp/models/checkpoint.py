@@ -32,7 +32,7 @@ from dopepp.models.storage import (
     write_safetensors,
 )
 from dopepp.parts.part import Part
-from dopepp.parts.seen import Seen
+from dopepp.parts.size import Seen
 
 __all__ = ["Checkpoint", "load_network", "parse_description", "read", "write_atomic"]
 

@@ -25,7 +25,7 @@ from dopepp.core.errors import UserError
 from dopepp.parts.mesh.measure import weld
 from dopepp.parts.mesh.read import READERS, read_in_unit
 from dopepp.parts.part import Mesh, Part, make_part
-from dopepp.parts.wording import is_plausible, part_in_words
+from dopepp.parts.size import is_plausible, part_in_words
 
 _log = logging.getLogger(__name__)
 
@@ -121,28 +121,26 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
 
 
 def with_meshes(
-    known: Sequence[Part], given: Sequence[str] = (), unit: str | None = None
+    parts: Sequence[Part], given: Sequence[str] = (), unit: str | None = None
 ) -> list[Part]:
     """Return a checkpoint's parts, each with a mesh.
 
     Args:
-        known: The parts; those of earlier versions' checkpoints have no mesh.
-        given: Meshes that are used instead of a checkpoint's: ``NAME=FILE``, where NAME may be left
-            out if it is the file's stem or there is one part only.
-        unit: Of the mesh files; None takes the one they have by their format.
+        parts: Parts of the checkpoint.
+        given: Meshes that replace the checkpoint's: ``NAME=FILE``, where NAME may be left out if it
+            is the file's stem or there is one part only.
+        unit: Unit of the mesh files; None takes the unit that their format states.
 
     Returns:
-        The parts in order. A built-in part's mesh is found by its name. The log warns of a mesh
-        other than the one that was trained on.
+        The parts in order. The log warns of a mesh that was not trained on.
 
     Raises:
         UserError: A part has no mesh, a given one is not known, or a file cannot be used.
     """
-    names = [part.name for part in known]
+    names = [part.name for part in parts]
     chosen: dict[str, str] = {}
     for text in given:
         name, named, path = text.rpartition("=")
-        path = path if named else text
         if not named:
             single = len(names) == len(given) == 1
             name = names[0] if single else text if text in BUILTIN else Path(text).stem
@@ -152,25 +150,24 @@ def with_meshes(
                 "name the part: --part NAME=FILE",
             )  # fmt: skip
         chosen[name] = path
-    return [_with_mesh(part, chosen.get(part.name), unit) for part in known]
+    return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 
 
 def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
-    """Return a part with the chosen mesh, its own one, or that of the built-in part."""
-    if chosen is None and part.mesh is not None:
-        return part
-    if chosen is None and part.name not in BUILTIN:
+    """Return a part with the chosen mesh, or with its own one."""
+    if chosen is None:
+        if part.mesh is not None:
+            return part
         raise UserError(
-            f"no mesh of {part.name}: an earlier version wrote this checkpoint",
-            "a mesh file for every part of the checkpoint",
-            f"add --part {part.name}=FILE and its --unit, or train again",
+            f"no mesh of {part.name} in the checkpoint",
+            "a mesh file for every part without one",
+            f"add --part {part.name}=FILE and its --unit",
         )
-    loaded = load_part(chosen or part.name, unit)
+    loaded = load_part(chosen, unit)
     if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
         _log.warning(
-            "the mesh of %s (%s) is not the one the checkpoint was trained on",
-            part.name, chosen or "built in",
-        )  # fmt: skip
+            "the mesh of %s (%s) is not the one the checkpoint was trained on", part.name, chosen
+        )
     return replace(part, mesh=loaded.mesh, mesh_deviation=loaded.mesh_deviation)
 
 

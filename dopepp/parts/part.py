@@ -10,16 +10,18 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
 from dopepp.core.errors import UserError
+from dopepp.core.validation import STRICT, parse
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.cuboid import cuboid_keypoints
+from dopepp.geometry.rotation import is_rotation
 from dopepp.geometry.symmetry import ContinuousSymmetry
-from dopepp.parts import record as fields
 from dopepp.parts.mesh.decimate import MAX_FACES, decimate
 from dopepp.parts.mesh.measure import (
     Colours,
@@ -44,6 +46,17 @@ LARGEST_DIAMETER: Final = 5.0
 
 MAX_NAME: Final = 200
 """Characters: far above any real part, and a bound on what a hostile file prints."""
+
+MAX_POINTS: Final = 100_000
+MAX_SYMMETRIES: Final = 1000
+"""Far above any real part (YCB-Video: 2,621 points); they bound memory for a hostile file."""
+
+MAX_LIGHT_FACES: Final = 4000
+"""Triangles of a record's mesh, and of an outline's: their edges are two pixels long on a part of
+100 pixels."""
+
+_FARTHEST: Final = 1e6
+"""Metres. No part reaches out this far, and squares of such lengths stay finite."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +88,8 @@ class Part:
         cuboid: Eight bounding-box corners in NDDS order and the centre, metres, object frame.
         diameter: Largest distance between two vertices, metres.
         points: ADD points in the object frame, metres.
-        mesh: Triangles to render, at most 200,000; out of a checkpoint, its :attr:`light_mesh`, or
-            None where an earlier version wrote it.
+        mesh: Triangles to render, at most 200,000; out of a checkpoint, its :attr:`light_mesh`;
+            None for an object known by its ADD points only.
         mesh_deviation: How far the mesh is from all triangles, at most, metres; 0 where it has all.
         mesh_hash: SHA-256 of the vertices and faces that the part was made from, hex.
         symmetries_discrete: BOP-style rigid transforms that map the part onto itself, without the
@@ -107,9 +120,9 @@ class Part:
             return None
         vertices, faces = weld(np.round(self.mesh.vertices, 7), self.mesh.faces)
         deviation = self.mesh_deviation
-        if len(faces) > fields.MAX_FACES:
+        if len(faces) > MAX_LIGHT_FACES:
             try:
-                fewer, corners, *_ = decimate(vertices, faces, None, fields.MAX_FACES)
+                fewer, corners, *_ = decimate(vertices, faces, None, MAX_LIGHT_FACES)
             except ValueError as error:
                 logger.warning("part %r goes without a mesh into checkpoints: %s", self.name, error)
                 return None
@@ -138,39 +151,99 @@ class Part:
 
     @classmethod
     def from_record(cls, record: object) -> Part:
-        """Make a part from what :meth:`to_record` returned, in this version or an earlier one.
+        """Make a part from the plain values of :meth:`to_record`.
 
         Raises:
             UserError: A field is missing, unknown, or not what ``to_record`` writes.
         """
-        if not isinstance(record, dict) or {*record, "mesh"} != {*FIELDS}:
-            got = type(record).__name__
-            if isinstance(record, dict):
-                got = f"a mapping with {', '.join(sorted(map(repr, record))[:12]) or 'no fields'}"
-            raise fields.bad(got, f"a mapping with the fields {', '.join(FIELDS)}")
+        values = parse(_Record, record, "part", _FIX)
         mesh, deviation = None, 0.0
-        if record.get("mesh") is not None:
-            *triangles, deviation = fields.parse_mesh(record["mesh"])
-            mesh = Mesh(*triangles)
-        discrete = record["symmetries_discrete"]
+        if values.mesh is not None:
+            faces = np.array(values.mesh.faces, np.int32)
+            if faces.max() >= len(values.mesh.vertices):
+                allowed = f"0 to {len(values.mesh.vertices) - 1}"
+                raise UserError(f"part.mesh with a face of vertex {faces.max()}", allowed, _FIX)
+            mesh = Mesh(np.array(values.mesh.vertices, np.float64), faces)
+            deviation = values.mesh.deviation
         return cls(
-            name=check_name(record["name"]),
-            cuboid=fields.parse_cuboid(record["cuboid"]),
-            diameter=fields.parse_diameter(record["diameter"]),
-            points=fields.parse_numbers("points", record["points"], fields.MAX_POINTS, 3, fewest=1),
+            name=check_name(values.name),
+            cuboid=_checked_cuboid(values.cuboid),
+            diameter=values.diameter,
+            points=np.array(values.points, np.float64),
             mesh=mesh,
             mesh_deviation=deviation,
-            mesh_hash=fields.parse_hash(record["mesh_hash"]),
-            symmetries_discrete=None if discrete is None else fields.parse_transforms(discrete),
-            symmetries_continuous=fields.parse_axes(record["symmetries_continuous"]),
+            mesh_hash=values.mesh_hash,
+            symmetries_discrete=_checked_transforms(values.symmetries_discrete),
+            symmetries_continuous=_checked_axes(values.symmetries_continuous),
         )
 
 
-FIELDS: Final = (
-    "name", "cuboid", "diameter", "points", "mesh", "mesh_hash", "symmetries_discrete",
-    "symmetries_continuous",
-)  # fmt: skip
-"""Of a part's record."""
+_FIX: Final = "load a file that this version of dopepp has written"
+
+_Metres: TypeAlias = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
+_Point: TypeAlias = tuple[_Metres, _Metres, _Metres]
+_Corner: TypeAlias = Annotated[int, Field(ge=0, lt=3 * MAX_LIGHT_FACES)]
+_Row: TypeAlias = tuple[_Metres, _Metres, _Metres, _Metres]
+
+
+@dataclass(frozen=True)
+class _MeshRecord:
+    """Triangles of a record, and how far any vertex had been moved, metres."""
+
+    __pydantic_config__ = STRICT
+    vertices: Annotated[list[_Point], Field(min_length=3, max_length=3 * MAX_LIGHT_FACES)]
+    faces: Annotated[
+        list[tuple[_Corner, _Corner, _Corner]], Field(min_length=1, max_length=MAX_LIGHT_FACES)
+    ]
+    deviation: Annotated[float, Field(ge=0, le=_FARTHEST)]
+
+
+@dataclass(frozen=True)
+class _Record:
+    """Plain values of a :class:`Part`."""
+
+    __pydantic_config__ = STRICT
+    name: str
+    cuboid: Annotated[list[_Point], Field(min_length=9, max_length=9)]
+    diameter: Annotated[float, Field(gt=0, le=_FARTHEST)]
+    points: Annotated[list[_Point], Field(min_length=1, max_length=MAX_POINTS)]
+    mesh: _MeshRecord | None
+    mesh_hash: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
+    symmetries_discrete: (
+        Annotated[list[tuple[_Row, _Row, _Row, _Row]], Field(max_length=MAX_SYMMETRIES)] | None
+    )
+    symmetries_continuous: Annotated[list[tuple[_Point, _Point]], Field(max_length=MAX_SYMMETRIES)]
+
+
+def _checked_cuboid(rows: Sequence[_Point]) -> Float[np.ndarray, "9 3"]:
+    cuboid = np.array(rows, np.float64)
+    expected = cuboid_keypoints(cuboid.min(axis=0), cuboid.max(axis=0))
+    # Another order of corners would give wrong poses without any error; 1e-6 is float32's rounding.
+    if not np.abs(cuboid - expected).max() <= 1e-6 * np.ptp(cuboid):
+        got, allowed = "part.cuboid that is no axis-aligned box", "eight corners in NDDS order"
+        raise UserError(got, f"{allowed}, then the centre", _FIX)
+    return cuboid
+
+
+def _checked_transforms(
+    matrices: Sequence[Sequence[_Row]] | None,
+) -> Float[np.ndarray, "symmetries 4 4"] | None:
+    if matrices is None:
+        return None
+    transforms = np.array(matrices, np.float64).reshape(-1, 4, 4)
+    for matrix in transforms:
+        if not is_rotation(matrix[:3, :3]) or (matrix[3] != [0, 0, 0, 1]).any():
+            got = "part.symmetries_discrete with a matrix that is no rigid transform"
+            raise UserError(got, "[R t; 0 0 0 1] with a rotation R", _FIX)
+    return transforms
+
+
+def _checked_axes(pairs: Sequence[tuple[_Point, _Point]]) -> tuple[ContinuousSymmetry, ...]:
+    if any(not any(axis) for axis, _ in pairs):
+        got = "part.symmetries_continuous with an axis of length 0"
+        raise UserError(got, "[axis, offset] with an axis other than 0", _FIX)
+    return tuple(pairs)
+
 
 Parts = Sequence[Part]
 

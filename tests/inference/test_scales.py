@@ -17,7 +17,7 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
 from dopepp.inference.scales import MARGIN, MAX_PIXELS, letterboxes, merged
 from dopepp.parts.catalogue import load_part
-from dopepp.parts.seen import Seen
+from dopepp.parts.size import Seen
 from dopepp.virtual import PRESETS, Factory, render
 
 SEEN = Seen(48.0, 98.0, 0.12, 0.25)

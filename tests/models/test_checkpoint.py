@@ -12,7 +12,7 @@ from dopepp.models import storage
 from dopepp.models.checkpoint import Checkpoint, load_network, read, write_atomic
 from dopepp.models.network import build_network
 from dopepp.parts.part import Mesh, make_part
-from dopepp.parts.seen import Seen
+from dopepp.parts.size import Seen
 
 
 @pytest.fixture

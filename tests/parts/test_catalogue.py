@@ -8,19 +8,20 @@ from dopepp.parts.catalogue import pivconnector, servoholder, with_meshes
 from dopepp.parts.part import Part
 
 
-def known(name: str, mesh_hash: str) -> Part:
+def without_mesh(name: str, mesh_hash: str = "") -> Part:
     return replace(servoholder(), name=name, mesh=None, mesh_hash=mesh_hash)
 
 
-def test_meshes_are_found_by_name_and_compared(tmp_path, caplog):
-    own = servoholder().mesh_hash
+def test_a_given_mesh_is_taken_and_compared(caplog):
+    mesh_hash = servoholder().mesh_hash
+    parts = [servoholder(), without_mesh("other", mesh_hash)]
     with caplog.at_level(logging.WARNING):
-        found = with_meshes([known("servoholder", own), known("other", own)], ["other=servoholder"])
-    assert [part.name for part in found] == ["servoholder", "other"]
-    assert all(part.mesh is not None for part in found)
+        meshed = with_meshes(parts, ["other=servoholder"])
+    assert [part.name for part in meshed] == ["servoholder", "other"]
+    assert all(part.mesh is not None for part in meshed)
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
-        with_meshes([known("bracket", own)], ["pivconnector"])
+        with_meshes([without_mesh("bracket", mesh_hash)], ["pivconnector"])
     assert "is not the one the checkpoint was trained on" in caplog.text
 
 
@@ -31,8 +32,7 @@ def test_a_checkpoints_own_mesh_is_taken_unless_another_is_given():
 
 
 def test_missing_or_unknown_meshes():
-    part = known("bracket", "")
     with pytest.raises(UserError, match=r"no mesh of bracket.*--part bracket=FILE"):
-        with_meshes([part], [])
+        with_meshes([without_mesh("bracket")])
     with pytest.raises(UserError, match="no part of the checkpoint"):
-        with_meshes([part, pivconnector()], ["wrong=servoholder"])
+        with_meshes([servoholder(), pivconnector()], ["wrong=servoholder"])

@@ -26,7 +26,7 @@ from dopepp.drawing.sheet import (
     text_line,
 )
 from dopepp.geometry.camera import project, resize_points, transform
-from dopepp.parts.wording import part_in_words
+from dopepp.parts.size import part_in_words
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.scene import Rendered
 

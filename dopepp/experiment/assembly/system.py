@@ -26,7 +26,7 @@ from dopepp.maps.encode import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part
-from dopepp.parts.seen import Seen
+from dopepp.parts.size import Seen
 from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.training.callbacks.averaging import AveragedWeights
 from dopepp.training.callbacks.throughput import RunProgress, make_profiler

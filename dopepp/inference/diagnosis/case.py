@@ -17,7 +17,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.picture import letterboxed
 from dopepp.inference.scales import letterboxes
 from dopepp.parts.part import Part
-from dopepp.parts.seen import Seen, widest
+from dopepp.parts.size import Seen, widest
 from dopepp.recovery.detection import Detection
 
 NEARER, FARTHER = 2.0, 4.0

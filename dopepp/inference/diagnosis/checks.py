@@ -18,7 +18,7 @@ from dopepp.inference.diagnosis.case import Case, num_keypoints
 from dopepp.inference.quality import clipped, edge_width, highlights
 from dopepp.inference.scales import MARGIN
 from dopepp.parts.part import UNITS
-from dopepp.parts.wording import is_plausible, size_in_words
+from dopepp.parts.size import is_plausible, size_in_words
 
 SAME: Final = 1.05
 """Factor on a part's size that a lighter mesh may have."""

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 
 from dopepp.parts.mesh.decimate import decimate
 from dopepp.parts.mesh.measure import Faces, Vertices, face_areas, weld
-from dopepp.parts.record import MAX_FACES
+from dopepp.parts.part import MAX_LIGHT_FACES
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,9 @@ class OutlineMesh:
     is_closed: bool
 
 
-def make_outline_mesh(vertices: Vertices, faces: Faces, max_faces: int = MAX_FACES) -> OutlineMesh:
+def make_outline_mesh(
+    vertices: Vertices, faces: Faces, max_faces: int = MAX_LIGHT_FACES
+) -> OutlineMesh:
     """Prepare triangles; more than ``max_faces`` of them are replaced by fewer.
 
     Raises:

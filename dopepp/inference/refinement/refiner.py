@@ -201,7 +201,7 @@ def _together(
 def _region(part: Part) -> RegionRefiner:
     if part.mesh is None:
         raise UserError(
-            f"refine=region and no mesh of {part.name}: an earlier version wrote this checkpoint",
+            f"refine=region and no mesh of {part.name} in the checkpoint",
             "a mesh of every part of the checkpoint",
             f"add --part {part.name}=FILE and its --unit (parts=… in Python), or train again",
         )

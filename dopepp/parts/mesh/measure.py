@@ -41,10 +41,6 @@ _NUM_NEIGHBOURS: Final = 6
 triangle along an edge."""
 
 
-_MANY_CAVITIES: Final = 1000
-"""More surfaces than a part's cavities have: what else faces inwards counts as a body."""
-
-
 class RawMesh(NamedTuple):
     """What a format's reader returns: a file's triangles, in the unit that it states, if any.
 
@@ -182,35 +178,6 @@ def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"
     index = np.empty(len(ranked), np.int64)
     index[order] = np.cumsum(new) - 1
     return ranked[new], index[faces]
-
-
-def body_extents(vertices: Vertices, faces: Faces) -> list[Float[np.ndarray, "3"]]:
-    """Return the sides of the box of each separate body, the largest body first.
-
-    A body is a connected surface (corners at one position are one) that bounds no cavity: one that
-    faces inwards and lies in another one's box is no body.
-    """
-    positions, corners = weld(vertices, faces)
-    one, other = corners.reshape(-1), corners[:, [1, 2, 0]].reshape(-1)
-    joined = scipy.sparse.coo_array(
-        (np.ones(len(one), bool), (one, other)), shape=(len(positions),) * 2
-    )
-    count, of_vertex = scipy.sparse.csgraph.connected_components(joined, directed=False)
-    if count == 1:
-        return [np.ptp(positions, axis=0)]
-    lower, upper = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(lower, of_vertex, positions)
-    np.maximum.at(upper, of_vertex, positions)
-    bodies = of_vertex[corners[:, 0]]
-    # From its own middle, so that an open surface's sign is its own as well.
-    a, b, c = (positions[corners] - ((lower + upper) / 2)[bodies][:, None]).swapaxes(0, 1)
-    volumes = np.bincount(bodies, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
-    is_body = np.ones(count, bool)
-    for body in np.flatnonzero(volumes < 0)[:_MANY_CAVITIES]:
-        around = (lower < lower[body]).all(axis=1) & (upper > upper[body]).all(axis=1)
-        is_body[body] = not around.any()
-    extents = (upper - lower)[is_body]
-    return list(extents[np.argsort(-extents.prod(axis=1), kind="stable")])
 
 
 class SurfaceTree:

@@ -22,8 +22,7 @@ from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
 from dopepp.data.formats.tolerances import rotation_problem
 from dopepp.geometry.rotation import is_rotation, nearest_rotation
 from dopepp.parts.mesh.read import read_mesh
-from dopepp.parts.part import Part, check_name, make_part
-from dopepp.parts.record import MAX_SYMMETRIES
+from dopepp.parts.part import MAX_SYMMETRIES, Part, check_name, make_part
 
 _log = logging.getLogger(__name__)
 

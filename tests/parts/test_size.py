@@ -1,6 +1,7 @@
-"""What a part is in words: its size, its unit, its bodies."""
+"""Sizes of parts: in the log, and as a network has seen them."""
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 import trimesh
 from trimesh.exchange.stl import export_stl
 
+from dopepp.core.errors import UserError
 from dopepp.parts import load_part, servoholder
-from dopepp.parts.mesh.measure import body_extents
-from dopepp.parts.wording import part_in_words, size_in_words
+from dopepp.parts.size import Seen, body_extents, part_in_words, size_in_words, widest
 
 
 def box(*extents: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
@@ -102,3 +103,22 @@ def test_a_built_in_part_and_a_checkpoints_have_no_unit():
     assert part_in_words(servoholder()) == "servoholder: 77 × 77 × 7.0 mm"
     assert part_in_words(replace(servoholder(), mesh=None)) == "servoholder: 77 × 77 × 7.0 mm"
     assert size_in_words(np.array([0.0031, 0.2, 0.04])) == "200 × 40 × 3.1 mm"
+
+
+def test_a_record_comes_back():
+    seen = Seen(20.0, 90.5, 0.3, 0.8)
+    assert Seen.parse(list(seen)) == seen
+
+
+@pytest.mark.parametrize(
+    "record",
+    [None, 4, [1, 2, 3], [9.0, 2.0, 0.1, 0.2], [1, 2, 0.2, 0.1], [1, 2, 0, 1], [1, "2", 0.1, 0.2],
+     [1, math.nan, 0.1, 0.2], [1, 2, 0.1, math.inf], [True, 2, 0.1, 0.2]],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(record):
+    with pytest.raises(UserError):
+        Seen.parse(record)
+
+
+def test_the_widest_range_holds_all():
+    assert widest([Seen(30, 40, 0.2, 0.3), Seen(10, 35, 0.25, 0.9)]) == Seen(10, 40, 0.2, 0.9)
