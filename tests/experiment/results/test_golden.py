@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from dopepp.experiment.sweep.sweep import CompareJobs
 from omegaconf import OmegaConf
 
 from dopepp.experiment.results import display, readme, record
@@ -26,6 +25,7 @@ from dopepp.experiment.results.entries import Entry
 from dopepp.experiment.results.protocols import record_breakdown
 from dopepp.experiment.results.release import release
 from dopepp.experiment.results.tables import ADD_01D, ADD_5CM
+from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
 from dopepp.models.checkpoint import Checkpoint, write_atomic
