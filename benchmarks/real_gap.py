@@ -29,7 +29,7 @@ from dopepp.experiment.assembly.renders import seen_preset
 from dopepp.experiment.assembly.sources import labelled_images
 from dopepp.experiment.assembly.system import build_system
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.results.record import CONFIG_FILE
+from dopepp.experiment.results.folder import CONFIG_FILE
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Parts
 from dopepp.training.system import PoseSystem

@@ -104,10 +104,10 @@ def run_job(config: DictConfig, job: Job) -> float | None:
 
 def _remove_unused(run_dir: Path) -> None:
     """Remove the folder of a refused run, unless it holds more than how it was started."""
-    from dopepp.experiment.results import record
+    from dopepp.experiment.results.folder import DIFFERENCE, OF_THE_START
 
     names = {path.name for path in run_dir.iterdir()}
-    if all(one in record.OF_THE_START or one.startswith(record.DIFFERENCE) for one in names):
+    if all(one in OF_THE_START or one.startswith(DIFFERENCE) for one in names):
         shutil.rmtree(run_dir)
         if not any(run_dir.parent.iterdir()):
             run_dir.parent.rmdir()
@@ -115,19 +115,20 @@ def _remove_unused(run_dir: Path) -> None:
 
 def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | None:
     """Run a job of a multirun, whose end stands in its folder."""
-    from dopepp.experiment.results import display, record
+    from dopepp.experiment.results import display
+    from dopepp.experiment.results.folder import FAILURE_FILE, OBJECTIVE, PRUNED_FILE, write_json
     from dopepp.experiment.results.report import Report
     from dopepp.experiment.sweep.multirun import compare_jobs
     from dopepp.training.callbacks.trial import PrunedError
 
-    for name in (record.FAILURE_FILE, record.PRUNED_FILE):  # of an attempt before this one
+    for name in (FAILURE_FILE, PRUNED_FILE):  # of an attempt before this one
         (run_dir / name).unlink(missing_ok=True)
     try:
         plain = _plain(config)
         if remote.goes_on(plain, run_dir):
             plain["resume"] = str(run_dir)
         result = job(plain, run_dir)
-        return result.details.get(record.OBJECTIVE) if isinstance(result, Report) else None
+        return result.details.get(OBJECTIVE) if isinstance(result, Report) else None
     except KeyboardInterrupt:
         if not remote.is_remote(str(HydraConfig.get().launcher._target_)):
             # What is finished: Hydra ends without its hook.
@@ -135,14 +136,14 @@ def _run_one_of_many(config: DictConfig, job: Job, run_dir: Path) -> float | Non
         raise
     except PrunedError as end:
         display.console.print(f"pruned {end}")
-        record.write_json(run_dir / record.PRUNED_FILE, {"reason": str(end)})
+        write_json(run_dir / PRUNED_FILE, {"reason": str(end)})
     except Exception as error:
         reason = " ".join(str(error).split()) or repr(error)
         expected = isinstance(error, (UserError, RunError))
         number = HydraConfig.get().job.num
         _log.error("job %s failed: %s", number, reason, exc_info=not expected)
         run_dir.mkdir(parents=True, exist_ok=True)
-        record.write_json(run_dir / record.FAILURE_FILE, {"reason": reason})
+        write_json(run_dir / FAILURE_FILE, {"reason": reason})
     return None
 
 
@@ -219,9 +220,9 @@ def _refuse_used_folder(arguments: Sequence[str]) -> None:
     folder = words.get("hydra.run.dir", "")
     if not folder or words.get("resume", "null") not in ("", "null"):
         return
-    from dopepp.experiment.results import record
+    from dopepp.experiment.results.folder import VERSIONS_FILE
 
-    if Path(folder, record.VERSIONS_FILE).is_file() and remote.is_first_process():
+    if Path(folder, VERSIONS_FILE).is_file() and remote.is_first_process():
         raise UserError(
             f"hydra.run.dir={folder}, which holds a run",
             "a folder without one",

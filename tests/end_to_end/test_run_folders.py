@@ -2,7 +2,7 @@
 
 import pytest
 
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import BEST_CHECKPOINT
 
 
 def test_the_same_command_twice_makes_two_folders(call, tiny, tmp_path):
@@ -18,7 +18,7 @@ def test_the_same_command_twice_makes_two_folders(call, tiny, tmp_path):
 def test_the_folder_of_a_run_is_refused_untouched(script, call, tiny, trained):
     run, _ = trained
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    options = tiny if script == "train.py" else (f"ckpt_path={run / record.BEST_CHECKPOINT}",)
+    options = tiny if script == "train.py" else (f"ckpt_path={run / BEST_CHECKPOINT}",)
     done = call(script, *options, f"hydra.run.dir={run}")
     assert f"got hydra.run.dir={run}, which holds a run" in done.line
     assert f"resume={run}" in done.line

@@ -42,7 +42,7 @@ import math, os, signal, time
 from pathlib import Path
 from types import SimpleNamespace
 import hydra, torch
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import METRICS_FILE, write_json
 from dopepp.experiment.command_line import entry, run_job
 from dopepp.experiment.assembly.registries import CALLBACKS
 from dopepp.training.callbacks.trial import raise_if_pruned
@@ -71,7 +71,7 @@ def train(config, run_dir):
         raise_if_pruned(trainer)
     else:
         end(run_dir, os.environ.get(f"END_{number}"))
-    record.write_json(run_dir / record.METRICS_FILE, {"objective": value})
+    write_json(run_dir / METRICS_FILE, {"objective": value})
 
 def end(run_dir, how):
     """Fail, die or be interrupted as the test asks, the first time."""

@@ -32,7 +32,8 @@ from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.assembly.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.results import display, record
+from dopepp.experiment.results import display
+from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
 from dopepp.experiment.results.readme import write_job_readme
 from dopepp.experiment.results.tables import read_csv
 from dopepp.geometry.camera import Letterbox
@@ -176,9 +177,9 @@ def measure_cost(config: RunConfig, run_dir: Path) -> NetworkCost:
         batch_size=config.cost.batch_size,
         frames_per_s=_frames_per_s(estimator, config.cost.batch_size, description.input_size),
     )
-    record.write_config(run_dir, config.plain)
-    record.write_json(run_dir / COST_FILE, asdict(cost))
-    record.write_json(run_dir / record.VERSIONS_FILE, record.environment(config.seed, ""))
+    write_config(run_dir, config.plain)
+    write_json(run_dir / COST_FILE, asdict(cost))
+    write_json(run_dir / VERSIONS_FILE, environment(config.seed, ""))
     rows = [
         {
             "frame": number,

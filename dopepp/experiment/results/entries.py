@@ -16,9 +16,17 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.results import record
 from dopepp.experiment.results.cost import COST_FILE
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import (
+    BEST_CHECKPOINT,
+    CONFIG_FILE,
+    FAILURE_FILE,
+    LAST_CHECKPOINT,
+    METRICS_FILE,
+    PRUNED_FILE,
+    read_json,
+)
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import shown_rows
 
@@ -26,8 +34,8 @@ BASELINE: Final = "dope"
 """A method of this name stands first, and every other one's Δ is against it."""
 
 _HYDRA: Final = Path(".hydra")
-_TRACES: Final = (_HYDRA, Path(record.CONFIG_FILE), Path(record.METRICS_FILE),
-                  Path(record.FAILURE_FILE))  # fmt: skip
+_TRACES: Final = (_HYDRA, Path(CONFIG_FILE), Path(METRICS_FILE),
+                  Path(FAILURE_FILE))  # fmt: skip
 """A run leaves at least one of these."""
 
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
@@ -152,8 +160,8 @@ def read_run(folder: Path) -> Run:
         cost = _cost(folder) if report is None else report.cost
     except _FailedError as error:
         failure, pruned = str(error), isinstance(error, _PrunedError)
-    config = _mapping(folder / record.CONFIG_FILE)
-    checkpoint = folder / record.BEST_CHECKPOINT
+    config = _mapping(folder / CONFIG_FILE)
+    checkpoint = folder / BEST_CHECKPOINT
     if report is not None and "checkpoint" in report.details:
         checkpoint = folder / str(report.details["checkpoint"])
     training, overrides = config, overrides_of(folder)
@@ -161,7 +169,7 @@ def read_run(folder: Path) -> Run:
     if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
         checkpoint = Path(str(config["ckpt_path"]))
         trained = checkpoint.parent.parent
-        training = _mapping(trained / record.CONFIG_FILE)
+        training = _mapping(trained / CONFIG_FILE)
         overrides = [*overrides_of(trained), *overrides]
         configs = [config, _as_asked(trained, training)] if training else []
     model = _model(training or _mapping(folder / _HYDRA / "config.yaml"), overrides, report)
@@ -216,15 +224,15 @@ class _PrunedError(_FailedError):
 
 def _result(folder: Path) -> Report | None:
     """Return a run's result; None of a job that was to measure its network's cost alone."""
-    failed, metrics = folder / record.FAILURE_FILE, folder / record.METRICS_FILE
+    failed, metrics = folder / FAILURE_FILE, folder / METRICS_FILE
     try:
         if failed.is_file():
-            raise _FailedError(record.read_json(failed).get("reason", "without a reason"))
-        if (folder / record.PRUNED_FILE).is_file():
-            reason = record.read_json(folder / record.PRUNED_FILE).get("reason", "")
+            raise _FailedError(read_json(failed).get("reason", "without a reason"))
+        if (folder / PRUNED_FILE).is_file():
+            reason = read_json(folder / PRUNED_FILE).get("reason", "")
             raise _PrunedError(reason)
         if metrics.is_file():
-            return Report.from_record(record.read_json(metrics))
+            return Report.from_record(read_json(metrics))
     except UserError as error:
         raise _FailedError(str(error)) from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -232,7 +240,7 @@ def _result(folder: Path) -> Report | None:
     if (folder / COST_FILE).is_file():
         return None
     unfinished = f"unfinished: it left no {metrics.name}"
-    if (folder / record.LAST_CHECKPOINT).is_file():
+    if (folder / LAST_CHECKPOINT).is_file():
         unfinished += f"; go on with resume={folder}"
     raise _FailedError(unfinished)
 
@@ -240,7 +248,7 @@ def _result(folder: Path) -> Report | None:
 def _cost(folder: Path) -> Cost:
     """Return what a job that measures costs has left."""
     try:
-        stored = record.read_json(folder / COST_FILE)
+        stored = read_json(folder / COST_FILE)
         return Cost(stored["parameters"], stored["gmacs"], stored["ms_per_frame"])
     except (UserError, KeyError) as error:
         raise _FailedError(f"{COST_FILE} is not of this version: {error}") from error

@@ -17,8 +17,9 @@ from dopepp.experiment.assembly.renders import scaled_test_renders
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig
 from dopepp.experiment.config.protocols import Protocols
-from dopepp.experiment.results import conditions, display, evaluators, record
+from dopepp.experiment.results import conditions, display, evaluators
 from dopepp.experiment.results.compare import compare_reports
+from dopepp.experiment.results.folder import METRICS_FILE, write_json
 from dopepp.experiment.results.protocols import record_breakdown
 from dopepp.experiment.results.report import Measured, Report, measure
 from dopepp.experiment.results.tables import reported_rates
@@ -92,7 +93,7 @@ def measure_and_record(
         main.refined = own[-1]
         share = main.details["made_worse"] = made_worse(main, main.refined)
         display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
-    record.write_json(run_dir / record.METRICS_FILE, main.to_record())
+    write_json(run_dir / METRICS_FILE, main.to_record())
     if bop_csv:
         _write_results(run_dir, measured.poses, data, numbers)
     _draw(run_dir, measured, len(source))

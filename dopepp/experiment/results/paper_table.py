@@ -23,7 +23,7 @@ from dopepp.core.files import write_csv, write_png, write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.config.parse import parse
-from dopepp.experiment.results import display, record, tables
+from dopepp.experiment.results import display, tables
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import (
     COST_FILE,
@@ -40,6 +40,7 @@ from dopepp.experiment.results.differences import (
     summary,
 )
 from dopepp.experiment.results.entries import Entry
+from dopepp.experiment.results.folder import read_json
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import COLUMNS
 
@@ -411,7 +412,7 @@ def _printed(layout: PaperTable, label: str, measure: str) -> str:
 def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[tables.Row]]:
     """Return what each method's network costs, and rows of those of which nobody knows."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
-    costs = {label: record.read_json(path) for label, path in paths.items() if path.is_file()}
+    costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}
     return costs, [{_METHOD: _failed(one, methods[one])} for one in methods if one not in costs]
 
 

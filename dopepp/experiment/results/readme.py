@@ -18,7 +18,7 @@ from dopepp.core.files import write_whole
 from dopepp.experiment import program
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.program import shown
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import markdown_text
 from dopepp.metrics.row import shown_columns
@@ -108,7 +108,7 @@ class RunReadme:
     def _what_next(self, state: str, report: Report | None) -> str:
         run = shlex.quote(shown(self._folder))
         details = {} if report is None else report.details
-        best = shlex.quote(shown(self._folder / details.get("checkpoint", record.BEST_CHECKPOINT)))
+        best = shlex.quote(shown(self._folder / details.get("checkpoint", BEST_CHECKPOINT)))
         if not self._config.keep_checkpoints:
             trial = "A trial of the program itself (`keep_checkpoints=false`)"
             return f"{trial}: nothing to go on with."
@@ -163,7 +163,7 @@ def _write(folder: Path, sections: Sequence[str]) -> None:
 
 def _commands(folder: Path) -> str:
     """Return the command, and those that went on with the run."""
-    present = record.read_json(folder / record.VERSIONS_FILE)
+    present = read_json(folder / VERSIONS_FILE)
     earlier = present.get("earlier", [])
     calls = [
         one["command"]

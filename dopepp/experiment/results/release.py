@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import read_json
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import markdown_text, shown_rows
 from dopepp.metrics.row import COLUMNS
@@ -32,7 +32,7 @@ def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Pa
     if not name.isidentifier():
         raise UserError(f"name {name!r}", "letters, digits and _", "choose another name")
     trained = read(checkpoint)
-    report = Report.from_record(record.read_json(results))
+    report = Report.from_record(read_json(results))
     size = 2 * sum(value.numel() for value in trained.state_dict.values())
     if size > MAX_BYTES:
         raise UserError(

@@ -15,7 +15,8 @@ from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import share_in_words
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig
-from dopepp.experiment.results import display, record
+from dopepp.experiment.results import display
+from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.measurement import measure_and_record, of_networks, refining
 from dopepp.experiment.results.readme import write_job_readme
 from dopepp.experiment.results.report import Report
@@ -38,7 +39,7 @@ def tune_and_record(
     """Tune a checkpoint (:func:`tune`), write it beside the old one, tell; return its path."""
     tuning = tune(estimator, data, parts, target)
     tuned = write_tuned(estimator.checkpoint, path, tuning.options)
-    record.write_json(run_dir / "tuning.json", asdict(tuning))
+    write_json(run_dir / "tuning.json", asdict(tuning))
     _show(tuning, tuned)
     return tuned
 
@@ -98,8 +99,8 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     measured = str(asked.results if own is None else paths[-1])
     stored = None if own is None else trained_on(own.data)
     data = chosen_data(asked.data, asked.virtual, stored, measured)
-    record.write_config(run_dir, asked.plain)
-    record.write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
+    write_config(run_dir, asked.plain)
+    write_environment(run_dir, data.eval_seed, "" if own is None else own.data_fingerprint)
     parts = parts_of(loaded, data)
     share = share_in_words(data)
     if share is not None:

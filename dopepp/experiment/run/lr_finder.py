@@ -28,7 +28,8 @@ from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import build_datamodule
 from dopepp.experiment.assembly.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
-from dopepp.experiment.results import display, record
+from dopepp.experiment.results import display
+from dopepp.experiment.results.folder import write_config, write_environment
 from dopepp.experiment.results.readme import write_job_readme
 from dopepp.training.system import PoseSystem
 
@@ -81,8 +82,8 @@ def find_learning_rate(config: RunConfig, run_dir: Path) -> Suggestion | None:
     short = _short_training(config)
     system = build_system(short, parts, "")
     trainer = build_trainer(short, run_dir)
-    record.write_config(run_dir, config.plain)
-    record.write_environment(run_dir, config.seed, "")
+    write_config(run_dir, config.plain)
+    write_environment(run_dir, config.seed, "")
     rates, losses = _sweep(trainer, system, datamodule, config.lr_finder)
     if len(rates) < _MIN_STEPS:
         raise RunError(

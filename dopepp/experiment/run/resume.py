@@ -23,7 +23,13 @@ from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.config.parse import below, flat
 from dopepp.experiment.config.run import RunConfig
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import (
+    BEST_CHECKPOINT,
+    CONFIG_FILE,
+    OVERRIDES_FILE,
+    read_json,
+    write_json,
+)
 from dopepp.experiment.run.images import differing_images
 from dopepp.models.checkpoint import Checkpoint
 
@@ -73,7 +79,7 @@ def check_resume(
     Returns the differences that are accepted. A :class:`UserError`: the network or the kind of
     optimiser differs, or what is learnt from does and ``resume_anyway`` is not set.
     """
-    path = run / record.CONFIG_FILE
+    path = run / CONFIG_FILE
     before = read_yaml(path) if path.is_file() else config.plain
     if not isinstance(before, Mapping):
         raise UserError(f"{path} with a {type(before).__name__}", "a config", "check the run")
@@ -86,7 +92,7 @@ def check_resume(
             if not state
             else f"resume={run} with another optimiser ({_listed(state)})",
             "the model, the number of objects and the optimiser of that run",
-            f"leave them as they were, or start anew with init_from={run / record.BEST_CHECKPOINT}"
+            f"leave them as they were, or start anew with init_from={run / BEST_CHECKPOINT}"
             " where the network is the same",
         )
     learnt = [one for one in found if below(one.key, LEARNT_FROM)]
@@ -153,9 +159,9 @@ def read_overrides(run: Path) -> list[str] | None:
 
     A file that holds something else is a :class:`UserError`.
     """
-    own, overrides, hydra = (run / path for path in (record.OVERRIDES_FILE, OVERRIDES, _HYDRA))
+    own, overrides, hydra = (run / path for path in (OVERRIDES_FILE, OVERRIDES, _HYDRA))
     if own.is_file():
-        return trusted_overrides(record.read_json(own).get("overrides"), own)
+        return trusted_overrides(read_json(own).get("overrides"), own)
     # Killed before it wrote its own file. Hydra writes the overrides last
     # and once more in another file: a file that was cut in the middle does not agree with it.
     if not overrides.is_file():
@@ -174,7 +180,7 @@ def remember_overrides(run: Path) -> None:
     if not HydraConfig.initialized():
         return
     overrides = [str(text) for text in HydraConfig.get().overrides.task]
-    record.write_json(run / record.OVERRIDES_FILE, {"overrides": overrides})
+    write_json(run / OVERRIDES_FILE, {"overrides": overrides})
     write_whole(run / OVERRIDES, yaml.safe_dump(overrides).encode())
 
 

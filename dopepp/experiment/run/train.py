@@ -33,9 +33,16 @@ from dopepp.experiment.assembly.system import (
     keep_freed_memory,
 )
 from dopepp.experiment.config.run import RunConfig, TrainerConfig
-from dopepp.experiment.results import display, readme, record
+from dopepp.experiment.results import display, readme
 from dopepp.experiment.results.conditions import check_masks
 from dopepp.experiment.results.cost import measure_cost
+from dopepp.experiment.results.folder import (
+    LAST_CHECKPOINT,
+    OBJECTIVE,
+    OVERRIDES_FILE,
+    write_config,
+    write_environment,
+)
 from dopepp.experiment.results.measurement import measure_and_record, refining
 from dopepp.experiment.results.paper_table import PaperTable
 from dopepp.experiment.results.report import FULL_SIZE_COST, Report, full_size_cost
@@ -147,8 +154,8 @@ def _train(
     for change in changes:
         display.console.print(f"changed since the run began: {change}")
     if not getattr(rank_zero_only, "rank", 0):
-        record.write_config(run_dir, config.plain)
-        record.write_environment(run_dir, config.seed, fingerprint, [str(one) for one in changes])
+        write_config(run_dir, config.plain)
+        write_environment(run_dir, config.seed, fingerprint, [str(one) for one in changes])
         if config.resume is not None:
             remember_overrides(run_dir)
         explanation.begin()
@@ -186,7 +193,7 @@ def _fit(
     except RunError as error:
         if not trainer.is_global_zero and not isinstance(error, ProcessDiedError):
             raise SystemExit(1) from error  # all end for one reason, and the first says it
-        kept = (run_dir / record.LAST_CHECKPOINT).is_file()
+        kept = (run_dir / LAST_CHECKPOINT).is_file()
         advice = f"go on with resume={run_dir}" if kept else "no checkpoint was saved yet"
         raise RunError(f"{error}; {advice}") from error
 
@@ -229,9 +236,9 @@ def _resume_path(
         return None, []
     run_dir = Path(resume)
     found = newest_checkpoint(run_dir)
-    if found is None and not (run_dir / record.OVERRIDES_FILE).is_file():
+    if found is None and not (run_dir / OVERRIDES_FILE).is_file():
         raise UserError(
-            f"resume={resume}, which has no {record.LAST_CHECKPOINT}",
+            f"resume={resume}, which has no {LAST_CHECKPOINT}",
             "the folder of an interrupted run",
             "pass that run's folder, or start anew without resume",
         )
@@ -244,8 +251,8 @@ def _resume_path(
 
 def _advice(run_dir: Path) -> str:
     """Say what an interrupted run has saved and how it goes on."""
-    step = saved_step(run_dir / record.LAST_CHECKPOINT)
-    saved = f"saved up to step {step} in {record.LAST_CHECKPOINT}" if step else "nothing saved yet"
+    step = saved_step(run_dir / LAST_CHECKPOINT)
+    saved = f"saved up to step {step} in {LAST_CHECKPOINT}" if step else "nothing saved yet"
     return f"{saved}; go on with resume={run_dir}"
 
 
@@ -254,7 +261,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     checkpoints = [one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint)]
     path = Path(checkpoints[0].best_model_path) if checkpoints else Path()
     if not path.is_file():
-        path = run_dir / record.LAST_CHECKPOINT
+        path = run_dir / LAST_CHECKPOINT
         _log.warning("the run ended before its first validation: measuring %s", path.name)
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
@@ -270,7 +277,7 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     details: dict[str, Any] = {"checkpoint": str(path.relative_to(run_dir))}
     score = checkpoints[0].best_model_score if checkpoints else None
     if score is not None and score.isfinite():
-        details[record.OBJECTIVE] = float(score)
+        details[OBJECTIVE] = float(score)
     if config.model.width != 1.0:
         cost = full_size_cost(estimator.checkpoint.spec, PAPER_INPUT_SIZE)
         details[FULL_SIZE_COST] = vars(cost)

@@ -21,7 +21,8 @@ from omegaconf import DictConfig, open_dict
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError, require
 from dopepp.core.futures import THREAD_LIMITS, available_cores, completed, connect, spread
-from dopepp.experiment.results import display, record
+from dopepp.experiment.results import display
+from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 
 _MOST: Final = 1024
 _IDLE_S: Final = 300
@@ -101,7 +102,7 @@ def _lost(folder: Path, error: Exception) -> JobReturn:
     """Write down, in place of the job itself, that it failed."""
     folder.mkdir(parents=True, exist_ok=True)
     reason = f"its process was lost: {type(error).__name__}: {' '.join(str(error).split())}"
-    record.write_json(folder / record.FAILURE_FILE, {"reason": reason})
+    write_json(folder / FAILURE_FILE, {"reason": reason})
     # To Hydra, it ended like any failed job: an error here would end the multirun.
     return JobReturn(status=JobStatus.COMPLETED)
 

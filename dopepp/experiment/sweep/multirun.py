@@ -62,12 +62,12 @@ def _node(config: DictConfig, key: str) -> dict[str, Any] | None:
 
 def _state(job: Path) -> str:
     """Say how a job stands, by what is in its folder."""
-    from dopepp.experiment.results import record
     from dopepp.experiment.results.cost import COST_FILE
+    from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, PRUNED_FILE, read_json
 
-    ends = {record.FAILURE_FILE: "failed", record.PRUNED_FILE: "stopped by the search"}
+    ends = {FAILURE_FILE: "failed", PRUNED_FILE: "stopped by the search"}
     for name, word in ends.items():
         if (job / name).is_file():
-            return f"{word}: {record.read_json(job / name).get('reason', '')}"
-    done = any((job / name).is_file() for name in (record.METRICS_FILE, COST_FILE))
+            return f"{word}: {read_json(job / name).get('reason', '')}"
+    done = any((job / name).is_file() for name in (METRICS_FILE, COST_FILE))
     return "finished" if done else "unfinished"

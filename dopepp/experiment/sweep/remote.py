@@ -93,13 +93,13 @@ def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
     So does a SLURM job that was queued again, and a search that was started again.
     """
     from dopepp.core.yaml import read_yaml
-    from dopepp.experiment.results import record
+    from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
     from dopepp.experiment.run.resume import config_differences
 
-    stored = run_dir / record.CONFIG_FILE
+    stored = run_dir / CONFIG_FILE
     if config.get("resume") is not None or not stored.is_file():
         return False
-    if not (run_dir / record.LAST_CHECKPOINT).is_file():
+    if not (run_dir / LAST_CHECKPOINT).is_file():
         return False
     before = read_yaml(stored)
     return isinstance(before, dict) and not config_differences(before, config)

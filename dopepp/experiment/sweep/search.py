@@ -37,7 +37,14 @@ from optuna.trial import FrozenTrial, TrialState
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
 from dopepp.experiment.config.parse import below, flat
-from dopepp.experiment.results import display, record
+from dopepp.experiment.results import display
+from dopepp.experiment.results.folder import (
+    FAILURE_FILE,
+    METRICS_FILE,
+    OBJECTIVE,
+    PRUNED_FILE,
+    read_json,
+)
 from dopepp.training.callbacks.trial import MOST, open_storage
 
 _FACTS: Final = "configuration"
@@ -337,13 +344,13 @@ def outcome(folder: Path) -> tuple[TrialState, float | None]:
 
     A job without a finite objective has failed as a trial.
     """
-    if (folder / record.PRUNED_FILE).is_file():
+    if (folder / PRUNED_FILE).is_file():
         return TrialState.PRUNED, None
-    if (folder / record.FAILURE_FILE).is_file():
+    if (folder / FAILURE_FILE).is_file():
         return TrialState.FAIL, None
-    if not (folder / record.METRICS_FILE).is_file():
+    if not (folder / METRICS_FILE).is_file():
         return TrialState.RUNNING, None
-    value = record.read_json(folder / record.METRICS_FILE).get(record.OBJECTIVE)
+    value = read_json(folder / METRICS_FILE).get(OBJECTIVE)
     if not isinstance(value, (int, float)) or not math.isfinite(value):
         return TrialState.FAIL, None
     return TrialState.COMPLETE, float(value)

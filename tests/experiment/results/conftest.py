@@ -10,8 +10,8 @@ import pytest
 import torch
 import yaml
 
-from dopepp.experiment.results import record
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
@@ -61,12 +61,12 @@ def write_run(
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
     if isinstance(result, Report):
-        record.write_json(folder / record.METRICS_FILE, result.to_record())
+        write_json(folder / METRICS_FILE, result.to_record())
         seed = next((int(text[5:]) for text in overrides if text.startswith("seed=")), 0)
         model = {"name": result.name, "width": 0.25}
-        record.write_config(folder, {"model": model, "seed": seed, **config})
+        write_config(folder, {"model": model, "seed": seed, **config})
     elif result is not None:
-        record.write_json(folder / record.FAILURE_FILE, {"reason": result})
+        write_json(folder / FAILURE_FILE, {"reason": result})
     return folder
 
 

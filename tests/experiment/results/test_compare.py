@@ -14,7 +14,6 @@ import yaml
 from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.results import record
 from dopepp.experiment.results.compare import (
     compare_paths,
     compare_reports,
@@ -33,6 +32,13 @@ from dopepp.experiment.results.entries import (
     with_refined,
 )
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import (
+    CONFIG_FILE,
+    FAILURE_FILE,
+    METRICS_FILE,
+    write_config,
+    write_json,
+)
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import DELTA, read_csv
 from dopepp.experiment.sweep.multirun import CompareJobs
@@ -78,11 +84,11 @@ def write_run(
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
     if isinstance(result, Report):
-        record.write_json(folder / record.METRICS_FILE, result.to_record())
+        write_json(folder / METRICS_FILE, result.to_record())
         model = {"name": result.name, "width": 0.25}
-        record.write_config(folder, {"model": model, "seed": seed, **config})
+        write_config(folder, {"model": model, "seed": seed, **config})
     elif result is not None:
-        record.write_json(folder / record.FAILURE_FILE, {"reason": result})
+        write_json(folder / FAILURE_FILE, {"reason": result})
     return folder
 
 
@@ -353,11 +359,11 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path):
         run = write_run(tmp_path / f"run{seed}", overrides, report("dopepp", BAD), seed, lr=2)
         folder = tmp_path / f"evaluation{seed}"
         write_run(folder, [f"ckpt_path={run}", "data.num_test=9"])
-        record.write_json(folder / record.METRICS_FILE, report("dopepp", GOOD).to_record())
+        write_json(folder / METRICS_FILE, report("dopepp", GOOD).to_record())
         checkpoint = run / "checkpoints" / "best.ckpt"
         shares = [0.4] if seed == 1 else None  # measured beside the result
         config = {"ckpt_path": str(checkpoint), "data": {"num_test": 9}, "shading": shares}
-        record.write_config(folder, config)
+        write_config(folder, config)
     evaluations = [tmp_path / "evaluation1", tmp_path / "evaluation2"]
     first = read_run(evaluations[0])
     assert (first.seed, first.model) == (1, "dopepp")
@@ -374,8 +380,8 @@ def test_an_evaluation_is_what_its_checkpoint_was_trained_as(tmp_path):
 )
 def test_a_damaged_result_is_a_row_with_the_reason(content, reason, tmp_path):
     run = write_run(tmp_path / "0")
-    (run / record.METRICS_FILE).write_text(content)
-    (run / record.CONFIG_FILE).write_text("a: [")
+    (run / METRICS_FILE).write_text(content)
+    (run / CONFIG_FILE).write_text("a: [")
     (one,) = group(find_runs([tmp_path]))
     assert reason in one.failure
     assert "\n" not in one.failure
@@ -383,7 +389,7 @@ def test_a_damaged_result_is_a_row_with_the_reason(content, reason, tmp_path):
 
 def test_a_job_that_measures_costs_has_nothing_else(tmp_path):
     stored = {"parameters": 1234, "gmacs": 2.5, "ms_per_frame": 12.0, "name": "dopepp"}
-    record.write_json(write_run(tmp_path / "0") / COST_FILE, stored)
+    write_json(write_run(tmp_path / "0") / COST_FILE, stored)
     (one,) = group(find_runs([tmp_path]))
     assert one.failure == ""
     for table in (headline(figures([one])), full(figures([one]))):
@@ -391,7 +397,7 @@ def test_a_job_that_measures_costs_has_nothing_else(tmp_path):
         assert (row["object"], row["parameters"], row["ms/frame"]) == ("cost only", "1,234", "12.0")
     write_comparison([entry("dope", report("dope", BAD)), one], tmp_path)
     assert read_csv(tmp_path / "compare.csv")[1]["GMACs"] == "2.500"
-    record.write_json(tmp_path / "0" / COST_FILE, {})
+    write_json(tmp_path / "0" / COST_FILE, {})
     assert "cost.json is not of this version" in read_run(tmp_path / "0").failure
 
 

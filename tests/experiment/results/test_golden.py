@@ -17,11 +17,12 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from dopepp.experiment.results import display, readme, record
+from dopepp.experiment.results import display, readme
 from dopepp.experiment.results.compare import compare_paths, write_comparison
 from dopepp.experiment.results.conditions import SCALE, SHADING, Level, record_condition
 from dopepp.experiment.results.cost import COST_FILE, NetworkCost
 from dopepp.experiment.results.entries import Entry
+from dopepp.experiment.results.folder import VERSIONS_FILE, write_json
 from dopepp.experiment.results.protocols import record_breakdown
 from dopepp.experiment.results.release import release
 from dopepp.experiment.results.tables import ADD_01D, ADD_5CM
@@ -77,9 +78,9 @@ def test_a_sweep_of_seeds_refined_failed_and_costs(compare_golden, report_of, wr
         result.details["full_size_cost"] = {"parameters": 7, "gmacs": 2.5, "ms_per_frame": None}
         write_run(Path("sweep", str(number)), overrides, result)
     write_run(Path("sweep", "4"), ["model=other", "seed=1"], "got x=[1] | y; allowed: [2]; fix: z")
-    record.write_json(write_run(Path("sweep", "5"), ["model=p"]) / "pruned.json", {"reason": "bad"})
+    write_json(write_run(Path("sweep", "5"), ["model=p"]) / "pruned.json", {"reason": "bad"})
     cost = {"parameters": 1234, "gmacs": 2.5, "ms_per_frame": 12.0}
-    record.write_json(write_run(Path("sweep", "6"), ["model=small"]) / COST_FILE, cost)
+    write_json(write_run(Path("sweep", "6"), ["model=small"]) / COST_FILE, cost)
     write_run(Path("sweep", "7"), ["model=dopepp", "seed=3"])
     end("sweep")
     compare_golden("sweep", "sweep/compare.md", "sweep/compare.csv", "sweep/README.md")
@@ -231,7 +232,7 @@ def test_paper_tables_of_cost(experiment, compare_golden, report_of, write_run):
     table = yaml.safe_load((EXPERIMENTS / f"{experiment}.yaml").read_text())["table"]
     for number, label in enumerate(table["labels"]):
         folder = write_run(Path("sweep", str(number)), [label])
-        record.write_json(folder / COST_FILE, {**COSTS, "parameters": 1000 ** (number + 1)})
+        write_json(folder / COST_FILE, {**COSTS, "parameters": 1000 ** (number + 1)})
         header = "frame,seconds,network_seconds,recovery_seconds\n"
         (folder / "frames.csv").write_text(header + "0,0.5,0.25,0.2\n1,0.25,0.2,0.04\n")
     write_run(Path("sweep", "7"), ["model=other"], report_of("other", BAD, refined=GOOD))
@@ -325,7 +326,7 @@ def test_the_readme_of_a_run(keep, report, compare_golden):
     folder = Path("a run")
     command = {"command": ["train.py", "data.parts=[a,b]"]}
     again = {"command": ["train.py", "resume=RUN"], "earlier": [command, {"other": 1}]}
-    record.write_json(folder / record.VERSIONS_FILE, again)
+    write_json(folder / VERSIONS_FILE, again)
     page = readme.RunReadme(config, folder)
     page.begin()
     texts = []
@@ -344,7 +345,7 @@ def test_the_readme_of_a_run(keep, report, compare_golden):
 
 def test_the_readmes_of_jobs_and_sweeps(report, compare_golden):
     folder = Path("run")
-    record.write_json(folder / record.VERSIONS_FILE, {"command": ["evaluate.py", "a=b c"]})
+    write_json(folder / VERSIONS_FILE, {"command": ["evaluate.py", "a=b c"]})
     (folder / "frame_rate.png").touch()
     texts = []
     for known in (None, report):
@@ -379,6 +380,6 @@ def test_the_card_of_a_release(is_refined, report_of, tiny_spec, compare_golden)
     )  # fmt: skip
     write_atomic(checkpoint.to_file(), Path("best.ckpt"))
     result = report_of("dopepp", {"pivconnector": BAD}, refined=GOOD if is_refined else None)
-    record.write_json(Path("metrics.json"), result.to_record())
+    write_json(Path("metrics.json"), result.to_record())
     release(Path("best.ckpt"), Path("metrics.json"), "bracket", Path("out"))
     compare_golden(f"card_{'refined' if is_refined else 'network'}", "out/bracket.md")

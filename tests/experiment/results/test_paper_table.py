@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.results import record
 from dopepp.experiment.results.compare import compare_paths
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, write_config, write_json
 from dopepp.experiment.results.paper_table import PaperTable
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import read_csv
@@ -38,18 +38,16 @@ def job(
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     if errors is None:
-        record.write_json(folder / record.FAILURE_FILE, {"reason": "no memory"})
+        write_json(folder / FAILURE_FILE, {"reason": "no memory"})
         return
     report = report_of("x", errors, part)
     report.refined = None if refined is None else report_of("x + region", refined, part)
-    record.write_json(folder / record.METRICS_FILE, report.to_record())
+    write_json(folder / METRICS_FILE, report.to_record())
     seed = next((int(text[5:]) for text in overrides if text.startswith("seed=")), 0)
     model = {"name": "x", "width": 1}
     of_a_data_set = any(text.startswith("data.objects=") for text in overrides)
     data = {"objects" if of_a_data_set else "parts": [part]}
-    record.write_config(
-        folder, {"model": model, "seed": seed, "data": data, "a": overrides[0], **config}
-    )
+    write_config(folder, {"model": model, "seed": seed, "data": data, "a": overrides[0], **config})
 
 
 def report_of(name: str, errors: list[float], part: str) -> Report:
@@ -244,7 +242,7 @@ def test_costs(composed, tmp_path):
     for number, name in enumerate(("dope", "dopepp")):
         folder = tmp_path / str(number)
         job(folder, [f"model={name}"], None)
-        (folder / record.FAILURE_FILE).unlink()
+        (folder / FAILURE_FILE).unlink()
         do_job(composed("experiment=table8_time", f"model={name}", *small), folder)
     printed = {"DOPE++": {"network": {"ms/frame": 33, "backbone weights": 1106696}}, "DRNet": {}}
     end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS, "paper": printed})

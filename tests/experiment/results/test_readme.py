@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 
 from dopepp.experiment import program
-from dopepp.experiment.results import readme, record
+from dopepp.experiment.results import readme
+from dopepp.experiment.results.folder import VERSIONS_FILE, write_json
 
 CONFIG: Any = SimpleNamespace(
     model=SimpleNamespace(name="dopepp"),
@@ -21,7 +22,7 @@ def run(tmp_path):
     folder = tmp_path / "a run"
     first = {"command": ["train.py", "data.parts=[a,b]"]}
     again = {"command": ["train.py", "resume=RUN"], "earlier": [first]}
-    record.write_json(folder / record.VERSIONS_FILE, again)
+    write_json(folder / VERSIONS_FILE, again)
     return folder
 
 

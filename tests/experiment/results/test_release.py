@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.results import record
 from dopepp.experiment.results import release as module
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import read_json, write_json
 from dopepp.experiment.results.release import release
 from dopepp.experiment.results.report import Report
 from dopepp.metrics.row import PoseRow
@@ -27,7 +27,7 @@ def run(tiny_spec, tmp_path):
     rows = {name: PoseRow(name, "dopepp", 300, 0.843) for name in ("pivconnector", "mean")}
     chance = {name: PoseRow(name, "chance", 300, 0.125) for name in rows}
     report = Report("dopepp", rows, {"chance": chance}, {}, Cost(), 300)
-    record.write_json(tmp_path / "metrics.json", report.to_record())
+    write_json(tmp_path / "metrics.json", report.to_record())
     return tmp_path
 
 
@@ -46,12 +46,12 @@ def test_the_card_says_what_it_can_do(run):
 
 
 def test_the_card_has_the_network_beside_its_refined_poses(run):
-    plain = record.read_json(run / "metrics.json")
+    plain = read_json(run / "metrics.json")
     rows = {
         name: {**row, "method": "dopepp + region", "add_01d": 0.97}
         for name, row in plain["objects"].items()
     }
-    record.write_json(run / "metrics.json", {**plain, "refined": {**plain, "objects": rows}})
+    write_json(run / "metrics.json", {**plain, "refined": {**plain, "objects": rows}})
     _, card = release(run / "best.ckpt", run / "metrics.json", "bracket", run / "out")
     text = card.read_text()
     assert text.index("| dopepp | 300 | 84.3 |") < text.index("| dopepp + region | 300 | 97.0 |")

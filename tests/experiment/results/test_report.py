@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.experiment.results import record
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import read_json, write_json
 from dopepp.experiment.results.report import FULL_SIZE_COST, Report
 from dopepp.metrics.row import PoseRow
 
@@ -61,7 +61,7 @@ def test_a_report_of_an_earlier_version_is_read():
 
 def test_json_that_nobody_else_could_read_is_not_written(tmp_path):
     path = tmp_path / "x.json"
-    record.write_json(path, {"a": 1})
+    write_json(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):
-        record.write_json(path, {"a": float("nan")})
-    assert record.read_json(path) == {"a": 1}
+        write_json(path, {"a": float("nan")})
+    assert read_json(path) == {"a": 1}

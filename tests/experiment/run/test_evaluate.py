@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from dopepp.experiment.results.evaluators import Cost
+from dopepp.experiment.results.folder import METRICS_FILE, read_json
 from dopepp.experiment.results.measurement import made_worse
-from dopepp.experiment.results.record import METRICS_FILE, read_json
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.evaluate import evaluate
 from dopepp.models.checkpoint import read, write_atomic

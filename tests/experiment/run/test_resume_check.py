@@ -11,7 +11,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample, SourceInfo
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import CONFIG_FILE, write_config
 from dopepp.experiment.run.images import describe_images, differing_images
 from dopepp.experiment.run.resume import (
     check_resume,
@@ -70,7 +70,7 @@ def resumed(tiny, tmp_path):
     """Resume a run with these overrides and say which differences are accepted."""
     (tmp_path / "run").mkdir()
     started = tiny()
-    record.write_config(tmp_path / "run", started.plain)
+    write_config(tmp_path / "run", started.plain)
     images = {split: describe_images(Pictures()) for split in ("train", "val", "test")}
 
     def go_on(*overrides: str, spec: str = "a", **splits: Pictures) -> list[str]:
@@ -160,7 +160,7 @@ def test_another_network_or_optimiser_is_refused_whatever_is_said(anyway, resume
 
 
 def test_a_run_that_wrote_no_config_is_compared_by_its_checkpoint(resumed, tmp_path):
-    (tmp_path / "run" / record.CONFIG_FILE).unlink()
+    (tmp_path / "run" / CONFIG_FILE).unlink()
     assert resumed("seed=1") == []
     with pytest.raises(UserError, match="network differs"):
         resumed(spec="b")

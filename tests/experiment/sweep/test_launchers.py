@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import LAST_CHECKPOINT, write_config
 from dopepp.experiment.sweep import remote
 from dopepp.experiment.sweep.jobs import on_joblib, on_slurm
 
@@ -156,10 +156,10 @@ def test_joblib_wants_a_number_of_processes():
 def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
     config = {"seed": 1, "model": {"width": 0.5}, "resume": None}
     assert not remote.goes_on(config, tmp_path)
-    record.write_config(tmp_path, {**config, "resume": "outputs/x"})
+    write_config(tmp_path, {**config, "resume": "outputs/x"})
     assert not remote.goes_on(config, tmp_path)  # it saved nothing
-    (tmp_path / record.LAST_CHECKPOINT).parent.mkdir()
-    (tmp_path / record.LAST_CHECKPOINT).touch()
+    (tmp_path / LAST_CHECKPOINT).parent.mkdir()
+    (tmp_path / LAST_CHECKPOINT).touch()
     assert remote.goes_on(config, tmp_path)
     assert not remote.goes_on({**config, "seed": 2}, tmp_path)
     assert not remote.goes_on({**config, "resume": "outputs/y"}, tmp_path)

@@ -6,7 +6,12 @@ import subprocess
 import pytest
 
 import dopepp
-from dopepp.experiment.results import record
+from dopepp.experiment.results.folder import (
+    VERSIONS_FILE,
+    environment,
+    read_json,
+    write_environment,
+)
 from dopepp.virtual.factory import code_hash
 
 
@@ -29,19 +34,19 @@ def working_tree(tmp_path, monkeypatch):
 def test_the_state_of_the_working_tree(working_tree, tmp_path):
     tree, git = working_tree
     # Installed below somebody's own repository, the package is no part of it.
-    record.write_environment(tmp_path / "installed", 7, "abc")
-    assert record.read_json(tmp_path / "installed" / record.VERSIONS_FILE)["git"] is None
+    write_environment(tmp_path / "installed", 7, "abc")
+    assert read_json(tmp_path / "installed" / VERSIONS_FILE)["git"] is None
     git("add", ".")
     git("commit", "-qm", "Begin")
-    record.write_environment(tmp_path / "clean", 7, "abc")
-    state = record.read_json(tmp_path / "clean" / record.VERSIONS_FILE)["git"]
+    write_environment(tmp_path / "clean", 7, "abc")
+    state = read_json(tmp_path / "clean" / VERSIONS_FILE)["git"]
     assert (state["dirty"], state["untracked"]) == (False, [])
     assert len(state["commit"]) == 40
 
     (tree / "dopepp" / "__init__.py").write_text("one = 2\n")
     (tree / "new.py").write_text("")
-    record.write_environment(tmp_path / "dirty", 7, "abc")
-    state = record.read_json(tmp_path / "dirty" / record.VERSIONS_FILE)["git"]
+    write_environment(tmp_path / "dirty", 7, "abc")
+    state = read_json(tmp_path / "dirty" / VERSIONS_FILE)["git"]
     assert (state["dirty"], state["untracked"]) == (True, ["new.py"])
     diff = tmp_path / "dirty" / state["diff"]
     assert hashlib.sha256(diff.read_bytes()).hexdigest() == state["diff_sha256"]
@@ -53,8 +58,8 @@ def test_the_state_of_the_working_tree(working_tree, tmp_path):
 
 def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path):
     for seed, changes in ((1, []), (2, ["seed: 1 → 2"]), (3, ["seed: 2 → 3", "a: b → c"])):
-        record.write_environment(tmp_path, seed, f"data{seed}", changes)
-    written = record.read_json(tmp_path / record.VERSIONS_FILE)
+        write_environment(tmp_path, seed, f"data{seed}", changes)
+    written = read_json(tmp_path / VERSIONS_FILE)
     assert (written["seed"], written["data_fingerprint"]) == (3, "data3")
     assert written["changes"] == ["seed: 2 → 3", "a: b → c"]
     assert [(one["seed"], one["changes"]) for one in written["earlier"]] == [
@@ -64,7 +69,7 @@ def test_a_run_that_goes_on_keeps_what_it_was_made_with(tmp_path):
 
 
 def test_packages_hardware_and_code():
-    facts = record.environment(7, "abc")
+    facts = environment(7, "abc")
     assert facts["rendering_code"] == code_hash()
     assert {"torch", "lightning", "numpy", "hydra-core"} <= set(facts["packages"])
     assert all(facts["packages"].values())
