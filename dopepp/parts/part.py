@@ -22,8 +22,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import is_rotation
 from dopepp.geometry.symmetry import ContinuousSymmetry
-from dopepp.parts.mesh.decimate import MAX_FACES, decimate
-from dopepp.parts.mesh.measure import (
+from dopepp.parts.mesh import (
     Colours,
     Faces,
     Points,
@@ -34,6 +33,7 @@ from dopepp.parts.mesh.measure import (
     sample_surface,
     weld,
 )
+from dopepp.parts.mesh.decimate import MAX_FACES, decimate
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Span, check
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh.measure import Faces, Vertices, weld
+from dopepp.parts.mesh import Faces, Vertices, weld
 from dopepp.parts.part import Part
 
 _PLAUSIBLE: Final = (0.01, 2.0)

@@ -23,7 +23,7 @@ from dopepp.geometry.rotation import (
     rotation_vector_to_matrix,
 )
 from dopepp.geometry.symmetry import SAME_TURN, ContinuousSymmetry, exact_group
-from dopepp.parts.mesh.measure import Points, SurfaceTree, half_sphere, largest_distance
+from dopepp.parts.mesh import Points, SurfaceTree, half_sphere, largest_distance
 from dopepp.parts.part import Mesh
 
 _ROUGH: Final = 0.06

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh.measure import Vertices
+from dopepp.parts.mesh import Vertices
 from dopepp.parts.part import Part
 from dopepp.virtual.scene import Triple, triple
 from dopepp.virtual.surface import Surface, make_surface

@@ -19,7 +19,7 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, check_camera, project
 from dopepp.geometry.rotation import RotationMatrix, Vector, is_rotation
-from dopepp.parts.mesh.measure import Points
+from dopepp.parts.mesh import Points
 
 BOX_TOLERANCE_PX: Final = 8.0
 BOX_TOLERANCE_SHARE: Final = 0.05

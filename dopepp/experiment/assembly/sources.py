@@ -20,9 +20,8 @@ from dopepp.data.formats.webdataset.source import WebdatasetSource
 from dopepp.data.formats.ycb_video.frame import read_image_set
 from dopepp.data.formats.ycb_video.source import YcbVideoSource
 from dopepp.data.sample import DescribedSource
-from dopepp.data.sources.hybrid import HybridSource
+from dopepp.data.sources.hybrid import HybridSource, WindowedSource
 from dopepp.data.sources.rendered import RenderedSource, Split
-from dopepp.data.sources.windowed import WindowedSource
 from dopepp.experiment.assembly.registries import AUGMENTATIONS, JITTERS, MASKINGS, build_optional
 from dopepp.experiment.assembly.renders import (
     held_out_renders,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from dopepp.parts.mesh import Faces, Vertices, face_areas, weld
 from dopepp.parts.mesh.decimate import decimate
-from dopepp.parts.mesh.measure import Faces, Vertices, face_areas, weld
 from dopepp.parts.part import MAX_LIGHT_FACES
 
 

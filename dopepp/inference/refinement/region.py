@@ -36,7 +36,7 @@ from dopepp.inference.refinement.rounds import Agreement, Round, Stage
 from dopepp.inference.refinement.silhouette import posed
 from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, UndecidedError
 from dopepp.inference.refinement.starts import drawn_poses
-from dopepp.parts.mesh.measure import Faces, Vertices, largest_distance
+from dopepp.parts.mesh import Faces, Vertices, largest_distance
 
 COARSE: Final = Stage(120, reach=1.0, steps=3, points=100, tiles=1, weights=FOUND)
 MIDDLE: Final = Stage(200, reach=0.5, steps=2, points=120, tiles=2, weights=FOUND)

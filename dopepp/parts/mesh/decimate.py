@@ -15,7 +15,7 @@ import numpy as np
 import scipy  # its parts load when they are used
 from jaxtyping import Float, Int
 
-from dopepp.parts.mesh.measure import Faces, Vertices, face_areas
+from dopepp.parts.mesh import Faces, Vertices, face_areas
 
 MAX_FACES: Final = 200_000
 """Triangles of a part's mesh: on a part that fills 640×480 pixels, over one for two pixels."""

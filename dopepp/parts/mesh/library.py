@@ -25,7 +25,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture, whole_picture
 from dopepp.geometry.camera import Transform
-from dopepp.parts.mesh.measure import RawMesh, Vertices, weld
+from dopepp.parts.mesh import RawMesh, Vertices, weld
 
 MAX_UNPACKED_BYTES: Final = 50_000_000
 """Of the text in a 3MF file: trimesh takes 17 times as much memory."""

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Int
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
-from dopepp.parts.mesh.measure import Faces, RawMesh, Vertices
+from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
 MAX_OFF_BYTES: Final = 50_000_000
 """Of an OFF file: its words take fifteen times as much memory."""

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dopepp.parts.mesh.measure import RawMesh
+from dopepp.parts.mesh import RawMesh
 from dopepp.parts.mesh.obj import companion_path, fans, read_texture
 
 TYPES: Final = {

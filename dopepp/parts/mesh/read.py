@@ -22,8 +22,8 @@ import scipy  # its parts load when they are used
 from jaxtyping import Bool, Float, Int
 
 from dopepp.core.errors import UserError
+from dopepp.parts.mesh import Faces, Points, RawMesh, Vertices, face_areas, weld
 from dopepp.parts.mesh.library import read_3mf, read_glb, read_stl
-from dopepp.parts.mesh.measure import Faces, Points, RawMesh, Vertices, face_areas, weld
 from dopepp.parts.mesh.obj import read_obj, read_off
 from dopepp.parts.mesh.ply import read_ply
 from dopepp.parts.part import UNITS, Mesh, Part, make_part

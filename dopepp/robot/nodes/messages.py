@@ -20,8 +20,8 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.overlay import COLOURS
+from dopepp.parts.mesh import face_areas
 from dopepp.parts.mesh.decimate import decimate
-from dopepp.parts.mesh.measure import face_areas
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 from dopepp.robot.nodes.worker import Answer, Stamp

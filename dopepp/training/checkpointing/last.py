@@ -31,7 +31,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from dopepp.core.interrupts import Interruption
 from dopepp.data.batch import Batch
-from dopepp.data.loader import PoseLoader
+from dopepp.data.datamodule import PoseLoader
 from dopepp.training.checkpointing import files
 
 _log = logging.getLogger(__name__)

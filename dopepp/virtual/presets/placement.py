@@ -22,7 +22,7 @@ from dopepp.geometry.rotation import (
     random_rotation,
     rotation_vector_to_matrix,
 )
-from dopepp.parts.mesh.measure import Points
+from dopepp.parts.mesh import Points
 
 _FARTHEST: Final = 1000.0
 """Metres; nothing that a camera is to see is farther away."""

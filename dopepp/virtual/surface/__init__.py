@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
-from dopepp.parts.mesh.measure import Faces, Points, Vertices
+from dopepp.parts.mesh import Faces, Points, Vertices
 from dopepp.parts.part import Mesh
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.parts.mesh.measure import Faces, Vertices
+from dopepp.parts.mesh import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
 _FINEST: Final = 1 / 96

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dopepp.data.sample import Sample, crop_sample, letterbox_sample
+from dopepp.data.sources.hybrid import WindowedSource
 from dopepp.data.sources.rendered import RenderedSource
-from dopepp.data.sources.windowed import WindowedSource
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector

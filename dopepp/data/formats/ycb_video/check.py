@@ -20,7 +20,7 @@ from dopepp.data.formats.ycb_video import frame as files
 from dopepp.data.formats.ycb_video.frame import FOLDERS, FrameMeta
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
-from dopepp.parts.mesh.measure import Points, largest_distance
+from dopepp.parts.mesh import Points, largest_distance
 
 _MAX_POINTS: Final = 100_000
 

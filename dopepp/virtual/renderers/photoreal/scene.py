@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32
 
 from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.parts.mesh.measure import face_areas
+from dopepp.parts.mesh import face_areas
 from dopepp.virtual.scene import NOISE_LIMITS, Ambient, Light, Material, Scene, SceneObject
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.surface.texture import Texture
