@@ -28,6 +28,10 @@ from jaxtyping import UInt8
 
 from dopepp.core.errors import UserError
 
+_SHIPPED: Final = Path(__file__).parents[1] / "conf"
+CONF: Final = _SHIPPED if _SHIPPED.is_dir() else Path(__file__).parents[2] / "conf"
+"""The files that users choose from: inside the package of a wheel, beside that of a checkout."""
+
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 """Suffixes of the pictures that :func:`write_picture` writes."""
 

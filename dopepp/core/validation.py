@@ -108,6 +108,12 @@ class Span(Range):
         return bool(self.lowest <= smallest <= largest <= self.highest)
 
 
+Pair = tuple[float, float]
+"""Smallest and largest number of a :class:`Span`."""
+
+Share = Annotated[float, Range(0.0, 1.0, "share")]
+
+
 class Mistake(NamedTuple):
     """A value that its type does not allow.
 
@@ -147,7 +153,8 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
     try:
         typed: T = _validated(kind, value, name)
     except ValidationError as error:
-        raise _user_error(next(_mistakes(kind, value, error)), name, fix) from None
+        cause = _cause(error.errors()[0])  # of a __post_init__
+        raise cause or _user_error(next(_mistakes(kind, value, error)), name, fix) from None
     return typed
 
 
@@ -205,10 +212,26 @@ def check_fields(instance: object) -> None:
         check(name, getattr(instance, name), kind, of=instance)
 
 
+class Checked:
+    """Base of a frozen dataclass whose ranges hold however it is made, from plain values or code.
+
+    It refuses unknown fields.
+    """
+
+    __pydantic_config__ = STRICT
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
 @cache
 def _ranged_fields(kind: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if typing.get_origin(hint) is Annotated}
+    return {
+        name: hint
+        for name, hint in hints.items()
+        if any(isinstance(limits, Range) for limits in getattr(hint, "__metadata__", ()))
+    }
 
 
 def shown(value: object, most: int = 100) -> str:
@@ -253,7 +276,7 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
         details = [detail for _, detail in group]
         first = details[0]
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            fields = ", ".join(_fields(kind, location[:-1])) or "no field"
+            fields = ", ".join(_fields(kind, location[:-1], value)) or "no field"
             yield Mistake(location, shown(first["input"]), fields, is_unknown=True)
         elif first["type"] in ("missing", "missing_argument"):
             yield Mistake(location, "", "a value")
@@ -276,8 +299,19 @@ def _location(value: object, steps: Sequence[str | int]) -> tuple[str | int, ...
     return tuple(location)
 
 
+def _cause(detail: ErrorDetails) -> UserError | None:
+    """Return the error that a dataclass raised itself."""
+    cause = detail.get("ctx", {}).get("error")
+    return cause if isinstance(cause, UserError) else None
+
+
 def _allowed(detail: ErrorDetails) -> str:
     context = detail.get("ctx", {})
+    if cause := _cause(detail):
+        return cause.allowed
+    if "discriminator" in context:
+        kinds = str(context.get("expected_tags", "…")).replace("'", "")
+        return f"a mapping with {context['discriminator']}: {kinds}".replace("'", "")
     if "expected" in context:
         return str(context["expected"]).replace("'", "").replace(" or ", ", ")
     if "pattern" in context:
@@ -286,18 +320,26 @@ def _allowed(detail: ErrorDetails) -> str:
     return _WORDS.get(detail["type"].partition("_")[0], words)
 
 
-def _fields(kind: Any, location: Sequence[str | int]) -> list[str]:
+def _fields(kind: Any, location: Sequence[str | int], value: Any) -> list[str]:
     """Return the names of the fields of the dataclass at a location below ``kind``."""
     for step in location:
         if isinstance(step, int):
             kind = typing.get_args(kind)[0]
         else:
-            kind = typing.get_type_hints(_dataclass(kind)).get(step)
-    owner = _dataclass(kind)
+            kind = typing.get_type_hints(_dataclass(kind, value)).get(step)
+        value = value[step]
+    owner = _dataclass(kind, value)
     return [field.name for field in dataclasses.fields(owner)] if owner is not None else []
 
 
-def _dataclass(kind: Any) -> Any:
-    """Return a type, or the member of a union, that is a dataclass."""
-    members = (kind, *typing.get_args(kind))
-    return next((member for member in members if dataclasses.is_dataclass(member)), None)
+def _dataclass(kind: Any, value: Any) -> Any:
+    """Return a type that is a dataclass, or the member of a union that stands for the value.
+
+    The members of a tagged union have a field ``kind``, whose default is their tag.
+    """
+    members = [
+        member for member in (kind, *typing.get_args(kind)) if dataclasses.is_dataclass(member)
+    ]
+    tag = value.get("kind") if isinstance(value, Mapping) else None
+    tagged = (member for member in members if getattr(member, "kind", None) == tag)
+    return next(tagged, members[0] if members else None)

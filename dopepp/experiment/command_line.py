@@ -24,8 +24,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import dopepp
 from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import CONF
 from dopepp.core.interrupts import NO_SPACE, Interruption, interruptible
 from dopepp.experiment import program
 from dopepp.experiment.sweep import remote
@@ -35,11 +35,6 @@ from dopepp.experiment.sweep import remote
 _log = logging.getLogger(__name__)
 
 Job = Callable[[dict[str, Any], Path], object]
-
-_PACKAGE: Final = Path(dopepp.__file__).parent
-_SHIPPED: Final = _PACKAGE / "conf"
-CONF: Final = _SHIPPED if _SHIPPED.is_dir() else _PACKAGE.parent / "conf"
-"""Inside the package that a wheel has installed; of a checkout, beside it."""
 
 SHORT_NAMES: Final = {
     "camera": "virtual.camera",

@@ -9,7 +9,7 @@ from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 
-from dopepp.experiment.command_line import CONF
+from dopepp.core.files import CONF
 
 
 def complete(name: str, words: Sequence[str], incomplete: str) -> list[str]:

@@ -16,7 +16,8 @@ from hydra import version
 from hydra._internal.utils import _run_hydra, get_args_parser
 from omegaconf import DictConfig
 
-from dopepp.experiment.command_line import CONF, EVALUATION_SHORT_NAMES, SHORT_NAMES, entry, run_job
+from dopepp.core.files import CONF
+from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, SHORT_NAMES, entry, run_job
 from dopepp.experiment.sweep import remote
 
 

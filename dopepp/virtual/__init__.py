@@ -12,7 +12,7 @@ from dopepp.virtual.presets.placement import (
     FreeTurning,
     OffsetPlacement,
 )
-from dopepp.virtual.presets.preset import PRESETS, Preset, customised_preset
+from dopepp.virtual.presets.preset import PRESETS, Preset, preset_of
 from dopepp.virtual.presets.table import Table
 from dopepp.virtual.renderers.raster.rasteriser import (
     Silhouette,
@@ -63,8 +63,8 @@ __all__ = [
     "Surface",
     "Table",
     "capture",
-    "customised_preset",
     "make_surface",
+    "preset_of",
     "random_scene",
     "render",
     "silhouette",

@@ -11,18 +11,20 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
-from typing import Final
+from typing import Annotated, Final
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.random import Generator
 
-from dopepp.core.checks import check_number, check_range
 from dopepp.core.compiled import Array, compiled
+from dopepp.core.validation import Checked, Pair, Range, Span
 from dopepp.drawing.pictures import Picture
 from dopepp.virtual.scene import Sensor
 from dopepp.virtual.tone import decode_srgb, encode_srgb
+
+Probability = Annotated[float, Range(0.0, 1.0, "probability")]
 
 _NOISE_VALUES: Final = 65536
 """Length of the table of normal values that noise is read from; a power of two."""
@@ -32,7 +34,7 @@ _NOISE_RUN: Final = 1024
 
 
 @dataclass(frozen=True)
-class Sensors:
+class Sensors(Checked):
     """Probabilities and ranges of what a camera does to the light.
 
     Blur and motion belong to the preset's image size and follow it when it is resized.
@@ -46,28 +48,17 @@ class Sensors:
         jpeg_quality: Its quality, 1 to 100.
     """
 
-    exposure_probability: float = 0.5
-    exposure_ev: tuple[float, float] = (-0.4, 0.4)
-    blur_probability: float = 0.2
-    blur_px: tuple[float, float] = (0.3, 1.0)
-    motion_probability: float = 0.1
-    motion_px: tuple[float, float] = (1.0, 5.0)
-    noise_probability: float = 0.5
-    read_noise: tuple[float, float] = (0.5, 2.0)
-    shot_noise: tuple[float, float] = (0.5, 3.0)
-    jpeg_probability: float = 0.15
-    jpeg_quality: tuple[int, int] = (70, 95)
-
-    def __post_init__(self) -> None:
-        for step in ("exposure", "blur", "motion", "noise", "jpeg"):
-            name = f"{step}_probability"
-            check_number(name, getattr(self, name), 0.0, 1.0, "probability", of=self)
-        check_range("exposure_ev", self.exposure_ev, -8.0, 8.0, "stops", of=self)
-        check_range("blur_px", self.blur_px, 0.0, 50.0, "pixels", of=self)
-        check_range("motion_px", self.motion_px, 0.0, 200.0, "pixels", of=self)
-        check_range("read_noise", self.read_noise, 0.0, 127.0, "grey levels", of=self)
-        check_range("shot_noise", self.shot_noise, 0.0, 127.0, "grey levels", of=self)
-        check_range("jpeg_quality", self.jpeg_quality, 1, 100, "JPEG quality", of=self)
+    exposure_probability: Probability = 0.5
+    exposure_ev: Annotated[Pair, Span(-8.0, 8.0, "stops")] = (-0.4, 0.4)
+    blur_probability: Probability = 0.2
+    blur_px: Annotated[Pair, Span(0.0, 50.0, "pixels")] = (0.3, 1.0)
+    motion_probability: Probability = 0.1
+    motion_px: Annotated[Pair, Span(0.0, 200.0, "pixels")] = (1.0, 5.0)
+    noise_probability: Probability = 0.5
+    read_noise: Annotated[Pair, Span(0.0, 127.0, "grey levels")] = (0.5, 2.0)
+    shot_noise: Annotated[Pair, Span(0.0, 127.0, "grey levels")] = (0.5, 3.0)
+    jpeg_probability: Probability = 0.15
+    jpeg_quality: Annotated[tuple[int, int], Span(1, 100, "JPEG quality")] = (70, 95)
 
     def resized(self, scale: float) -> Sensors:
         """Return the same camera for a picture that is ``scale`` times as large."""

@@ -12,7 +12,7 @@ from PIL import Image
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import read_picture
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual import Factory, Preset, customised_preset
+from dopepp.virtual import Factory, Preset, preset_of
 from dopepp.virtual.backgrounds import (
     PhotoBackgrounds,
     ProceduralBackgrounds,
@@ -317,11 +317,11 @@ def test_a_backgrounds_contrast_is_changed_about_its_mean():
 
 def test_a_preset_without_clutter_draws_as_if_there_were_none():
     def render(clutter):
-        preset = customised_preset("quickstart", {"clutter": clutter})
+        preset = preset_of("quickstart", {"clutter": clutter})
         return Factory([pivconnector()], preset, 3).render(0, 0)
 
     plain, some = render([0, 0]), render([20, 20])
-    reference = Factory([pivconnector()], customised_preset("quickstart", {}), 3).render(0, 0)
+    reference = Factory([pivconnector()], preset_of("quickstart", {}), 3).render(0, 0)
     np.testing.assert_array_equal(plain.image, reference.image)
     assert (some.image != plain.image).any(axis=2).mean() > 0.1
     with pytest.raises(UserError, match="clutter"):

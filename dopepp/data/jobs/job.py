@@ -14,7 +14,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -32,7 +32,7 @@ from dopepp.parts.mesh.read import ASSUMED_UNIT
 from dopepp.parts.part import Part, check_name
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import Preset, customised_preset
+from dopepp.virtual.presets.preset import Preset, preset_of
 from dopepp.virtual.presets.view import View, read_lens
 
 _log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ def make_job(
         working_distance: ``NEAREST,FARTHEST`` of the parts from this camera, metres.
     """
     _find_writer(layout)
-    scenes = customised_preset(preset, _nested(changes))
+    scenes = preset_of(preset, _nested(changes))
     targets = [named_part(text, unit) for text in parts]
     if camera is not None or working_distance is not None:
         scenes = _in_camera(scenes, targets, camera, working_distance)
@@ -127,7 +127,7 @@ def make_job(
         "parts": [_part_record(part) for part in factory.parts],
         "negatives": [_part_record(part) for part in factory.negatives],
         "backgrounds": factory.backgrounds.identity(),
-        "preset": _plain(factory.preset),
+        "preset": asdict(factory.preset),
         "rendering_code": code_hash()[:_HASH_DIGITS],
     }
     return Job(factory, layout, record)
@@ -216,16 +216,6 @@ def _part_record(part: Part) -> dict[str, Any]:
         "mesh_hash": part.mesh_hash,
         "texture_hash": appearance.hexdigest(),
     }
-
-
-def _plain(value: Any) -> Any:
-    """Turn a preset into what JSON can write; groups of ranges keep their kind."""
-    if is_dataclass(value):
-        content = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
-        return {"kind": type(value).__name__} | content
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return value
 
 
 _MAX_RECORD_BYTES: Final = 4_000_000

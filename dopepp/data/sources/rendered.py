@@ -13,7 +13,7 @@ import math
 import mmap
 import os
 import zlib
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -85,10 +85,6 @@ class RenderedSource:
         # What was rendered before there were these keeps its identity.
         if self.scale != 1:
             identity["scale"] = self.scale
-        for one in fields(self.factory.preset):
-            value = getattr(self.factory.preset, one.name)
-            if not one.repr and value != one.default:
-                identity[one.name] = list(value)
         return [SourceInfo(self.name, self._num_items, identity)]
 
 

@@ -18,7 +18,7 @@ from dopepp.parts.catalogue import with_meshes
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import Preset, customised_preset
+from dopepp.virtual.presets.preset import Preset, preset_of
 
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
@@ -112,7 +112,7 @@ def seen_preset(data: DataConfig) -> Preset:
 
 
 def _customised(data: DataConfig) -> Preset:
-    return customised_preset(_preset_name(data), data.virtual.scene or {})
+    return preset_of(_preset_name(data), data.virtual.scene, "virtual.scene")
 
 
 def _preset_name(data: DataConfig) -> str:

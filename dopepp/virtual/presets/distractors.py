@@ -9,19 +9,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 from numpy.random import Generator
 
-from dopepp.core.checks import check_number, check_range
+from dopepp.core.validation import Checked, Pair, Share, Span
 from dopepp.parts.part import Mesh
 from dopepp.virtual.body import Body
 from dopepp.virtual.surface import Surface, make_surface
 
 
 @dataclass(frozen=True)
-class Distractors:
+class Distractors(Checked):
     """Random objects around the targets.
 
     Attributes:
@@ -35,18 +36,11 @@ class Distractors:
         lookalike_scale: Size of a negative over its real size.
     """
 
-    number: tuple[int, int] = (0, 2)
-    image_share: tuple[float, float] = (0.12, 0.5)
-    depth: tuple[float, float] = (0.6, 1.6)
-    lookalike_share: float = 0.3
-    lookalike_scale: tuple[float, float] = (0.7, 1.3)
-
-    def __post_init__(self) -> None:
-        check_range("number", self.number, 0, 100, "a count", of=self)
-        check_range("image_share", self.image_share, 1e-3, 10.0, "image widths", of=self)
-        check_range("depth", self.depth, 0.01, 100.0, "depths of the first target", of=self)
-        check_number("lookalike_share", self.lookalike_share, 0.0, 1.0, "share", of=self)
-        check_range("lookalike_scale", self.lookalike_scale, 0.01, 100.0, "factor", of=self)
+    number: Annotated[tuple[int, int], Span(0, 100, "a count")] = (0, 2)
+    image_share: Annotated[Pair, Span(1e-3, 10.0, "image widths")] = (0.12, 0.5)
+    depth: Annotated[Pair, Span(0.01, 100.0, "depths of the first target")] = (0.6, 1.6)
+    lookalike_share: Share = 0.3
+    lookalike_scale: Annotated[Pair, Span(0.01, 100.0, "factor")] = (0.7, 1.3)
 
     def draw(self, rng: Generator, width_at_depth: float, negatives: Sequence[Body]) -> Body:
         """Draw a distractor for a depth at which the image's width shows so many metres."""

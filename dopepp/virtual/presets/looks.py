@@ -8,22 +8,28 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.random import Generator
 
-from dopepp.core.checks import check_number, check_range
+from dopepp.core.validation import Checked, Pair, Range, Share, Span
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.virtual.scene import Ambient, Grooves, Light, Material, Triple, triple
 from dopepp.virtual.surface import Surface
+
+Shares = Annotated[Pair, Span(0.0, 1.0, "share")]
+Roughness = Annotated[Pair, Span(0.02, 1.0, "GGX roughness")]
+Pitch = Annotated[Pair, Span(1e-6, 0.1, "metres")]
+Slope = Annotated[Pair, Span(0.0, 2.0, "tangent")]
+Intensity = Annotated[Pair, Span(0.0, 10.0, "1 = white")]
 
 _GREY_CAST: Final = 0.05
 """Largest relative deviation of a grey's channels: real greys are not quite grey."""
 
 
 @dataclass(frozen=True)
-class Materials:
+class Materials(Checked):
     """Ranges of what surfaces are made of; a textured or coloured one keeps its colours.
 
     Attributes:
@@ -48,43 +54,26 @@ class Materials:
         alike_share: Chance that all instances of a part in an image are made of the same.
     """
 
-    albedo: tuple[float, float] = (0.02, 0.9)
-    coloured_share: float = 0.55
-    saturation: tuple[float, float] = (0.2, 1.0)
-    roughness: tuple[float, float] = (0.25, 0.9)
-    specular: tuple[float, float] = (0.02, 0.07)
-    texture_gain: tuple[float, float] = (0.7, 1.2)
-    texture_tint: float = 0.0
-    texture_noise: tuple[float, float] = (0.0, 0.0)
-    noise: tuple[float, float] = (0.0, 0.12)
-    noise_pitch: tuple[float, float] = (0.02, 0.2)
-    metal_share: float = 0.15
-    metal_albedo: tuple[float, float] = (0.35, 0.95)
-    metal_roughness: tuple[float, float] = (0.2, 0.6)
-    brushed_share: float = 0.4
-    brush_pitch: tuple[float, float] = (0.0001, 0.0005)
-    brush_slope: tuple[float, float] = (0.05, 0.25)
-    print_share: float = 0.4
-    layer_pitch: tuple[float, float] = (0.0001, 0.0003)
-    layer_slope: tuple[float, float] = (0.1, 0.5)
-    alike_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_number("texture_tint", self.texture_tint, 0.0, 1.0, "share", of=self)
-        for kind in ("coloured", "metal", "brushed", "print", "alike"):
-            name = f"{kind}_share"
-            check_number(name, getattr(self, name), 0.0, 1.0, "share", of=self)
-        for name in ("albedo", "saturation", "specular", "metal_albedo", "noise"):
-            check_range(name, getattr(self, name), 0.0, 1.0, "share", of=self)
-        for name in ("roughness", "metal_roughness"):
-            check_range(name, getattr(self, name), 0.02, 1.0, "GGX roughness", of=self)
-        check_range("texture_gain", self.texture_gain, 0.0, 4.0, "factor", of=self)
-        check_range("texture_noise", self.texture_noise, 0.0, 10.0, "factor", of=self)
-        check_range("noise_pitch", self.noise_pitch, 1e-3, 10.0, "radii", of=self)
-        for name in ("brush_pitch", "layer_pitch"):
-            check_range(name, getattr(self, name), 1e-6, 0.1, "metres", of=self)
-        for name in ("brush_slope", "layer_slope"):
-            check_range(name, getattr(self, name), 0.0, 2.0, "tangent", of=self)
+    albedo: Shares = (0.02, 0.9)
+    coloured_share: Share = 0.55
+    saturation: Shares = (0.2, 1.0)
+    roughness: Roughness = (0.25, 0.9)
+    specular: Shares = (0.02, 0.07)
+    texture_gain: Annotated[Pair, Span(0.0, 4.0, "factor")] = (0.7, 1.2)
+    texture_tint: Share = 0.0
+    texture_noise: Annotated[Pair, Span(0.0, 10.0, "factor")] = (0.0, 0.0)
+    noise: Shares = (0.0, 0.12)
+    noise_pitch: Annotated[Pair, Span(1e-3, 10.0, "radii")] = (0.02, 0.2)
+    metal_share: Share = 0.15
+    metal_albedo: Shares = (0.35, 0.95)
+    metal_roughness: Roughness = (0.2, 0.6)
+    brushed_share: Share = 0.4
+    brush_pitch: Pitch = (0.0001, 0.0005)
+    brush_slope: Slope = (0.05, 0.25)
+    print_share: Share = 0.4
+    layer_pitch: Pitch = (0.0001, 0.0003)
+    layer_slope: Slope = (0.1, 0.5)
+    alike_share: Share = 0.5
 
     def draw(self, rng: Generator, surface: Surface) -> Material:
         """Draw what a surface is made of."""
@@ -171,7 +160,7 @@ _RGB_FROM_XYZ: Final = np.array(
 
 
 @dataclass(frozen=True)
-class Lighting:
+class Lighting(Checked):
     """Ranges of light; intensities are what a white surface facing the light reflects, 1 clips.
 
     Attributes:
@@ -187,26 +176,16 @@ class Lighting:
         ground_share: Light from below over the light from above.
     """
 
-    num_lights: tuple[int, int] = (1, 3)
-    key_intensity: tuple[float, float] = (0.45, 1.3)
-    fill_intensity: tuple[float, float] = (0.1, 0.4)
-    ambient_intensity: tuple[float, float] = (0.08, 0.4)
-    max_angle_deg: float = 75.0
-    distance: tuple[float, float] = (1.0, 5.0)
-    temperature_k: tuple[float, float] = (4000.0, 8500.0)
-    tint: float = 0.06
-    ground_share: tuple[float, float] = (0.3, 0.9)
-
-    def __post_init__(self) -> None:
-        check_range("num_lights", self.num_lights, 0, 8, "a count", of=self)
-        for name in ("key_intensity", "fill_intensity", "ambient_intensity"):
-            check_range(name, getattr(self, name), 0.0, 10.0, "1 = white", of=self)
-        check_number("max_angle_deg", self.max_angle_deg, 0.0, 180.0, "degrees", of=self)
-        check_range("distance", self.distance, 0.1, 1000.0, "camera distances", of=self)
-        # Where the approximation of the Planckian locus holds.
-        check_range("temperature_k", self.temperature_k, 1667.0, 25000.0, "kelvin", of=self)
-        check_number("tint", self.tint, 0.0, 0.9, "share", of=self)
-        check_range("ground_share", self.ground_share, 0.0, 1.0, "share", of=self)
+    num_lights: Annotated[tuple[int, int], Span(0, 8, "a count")] = (1, 3)
+    key_intensity: Intensity = (0.45, 1.3)
+    fill_intensity: Intensity = (0.1, 0.4)
+    ambient_intensity: Intensity = (0.08, 0.4)
+    max_angle_deg: Annotated[float, Range(0.0, 180.0, "degrees")] = 75.0
+    distance: Annotated[Pair, Span(0.1, 1000.0, "camera distances")] = (1.0, 5.0)
+    # Where the approximation of the Planckian locus holds.
+    temperature_k: Annotated[Pair, Span(1667.0, 25000.0, "kelvin")] = (4000.0, 8500.0)
+    tint: Annotated[float, Range(0.0, 0.9, "share")] = 0.06
+    ground_share: Shares = (0.3, 0.9)
 
     def draw(
         self, rng: Generator, centre: Vector, normal: Vector | None = None

@@ -1,19 +1,20 @@
 """How targets are turned and where they stand: the typed choices a preset makes.
 
-To add one, write a frozen dataclass with a ``draw`` method, a placement on :class:`Placement`, and
-name it in a preset.
+To add a choice, write a frozen dataclass with a ``draw`` method and a ``kind``, and name it in
+:data:`Turning` or :data:`Placement`; a preset's file chooses it by its ``kind``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.random import Generator
+from pydantic import Discriminator
 
-from dopepp.core.checks import check_number, check_range
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Checked, Pair, Range, Span
 from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, project
 from dopepp.geometry.rotation import (
@@ -24,44 +25,22 @@ from dopepp.geometry.rotation import (
 )
 from dopepp.parts.mesh import Points
 
-_FARTHEST: Final = 1000.0
-"""Metres; nothing that a camera is to see is farther away."""
+Angle = Annotated[float, Range(0.0, 180.0, "degrees")]
+Metres = Annotated[float, Range(0.0, 1000.0, "metres")]
+Depth = Annotated[float, Range(1e-6, 1000.0, "metres")]
+ImageShare = Annotated[float, Range(1e-3, 1.0, "share of the image")]
 
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation that turns an object's +z face towards the camera, +x staying on the right."""
 
-
 _AXES: Final = ("x", "y", "z")
 
 
-class Turning(Protocol):
-    """Draws a target's orientation."""
-
-    def draw(self, rng: Generator) -> RotationMatrix:
-        """Return a rotation from the object to the camera frame."""
-
-
-class Placement(Protocol):
-    """Draws a target's position."""
-
-    def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
-        """Return the object's origin in the camera frame, metres.
-
-        ``rotated_hull``: its extreme vertices, already turned into camera axes, metres.
-        """
-
-    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
-        """Return what to try after a place at which the object is not well in the frame.
-
-        What a placement keeps of such a place has the distribution it was drawn from, however often
-        the camera does not see the object there. None draws the orientation anew, too.
-        """
-        return None
-
-
 @dataclass(frozen=True)
-class FreeTurning:
+class FreeTurning(Checked):
     """Any rotation, uniform over SO(3)."""
+
+    kind: Literal["free"] = "free"
 
     def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
@@ -69,7 +48,7 @@ class FreeTurning:
 
 
 @dataclass(frozen=True)
-class FacingTurning:
+class FacingTurning(Checked):
     """The part's +z face looks at the camera, tilted a little, then turned in the image plane.
 
     ``R = R_z(in-plane) · R_(axis in the image plane)(tilt) · diag(1, −1, −1)``; the tilted axis is
@@ -80,12 +59,9 @@ class FacingTurning:
         tilt_deg: Largest angle between the part's +z and the direction against the optical axis.
     """
 
-    in_plane_deg: float = 45.0
-    tilt_deg: float = 40.0
-
-    def __post_init__(self) -> None:
-        for name in ("in_plane_deg", "tilt_deg"):
-            check_number(name, getattr(self, name), 0.0, 180.0, "degrees", of=self)
+    in_plane_deg: Angle = 45.0
+    tilt_deg: Angle = 40.0
+    kind: Literal["facing"] = "facing"
 
     def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
@@ -98,7 +74,7 @@ class FacingTurning:
 
 
 @dataclass(frozen=True)
-class UprightTurning:
+class UprightTurning(Checked):
     """The part stands, turned any way about the vertical, and a camera looks down at it.
 
     ``R = R_z(roll) · R_(camera above the plane) · R_z(azimuth) · R_(up to z)``; elevation, roll and
@@ -110,15 +86,10 @@ class UprightTurning:
         roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
     """
 
-    up: str = "z"
-    elevation_deg: tuple[float, float] = (20.0, 85.0)
-    roll_deg: float = 45.0
-
-    def __post_init__(self) -> None:
-        if self.up not in _AXES:
-            raise UserError(f"up={self.up!r} of UprightTurning", ", ".join(_AXES), "name an axis")
-        check_range("elevation_deg", self.elevation_deg, -90.0, 90.0, "degrees", of=self)
-        check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
+    up: Literal["x", "y", "z"] = "z"
+    elevation_deg: Annotated[Pair, Span(-90.0, 90.0, "degrees")] = (20.0, 85.0)
+    roll_deg: Angle = 45.0
+    kind: Literal["upright"] = "upright"
 
     def draw(self, rng: Generator) -> RotationMatrix:
         """Return a rotation from the object to the camera frame."""
@@ -133,6 +104,10 @@ class UprightTurning:
         return np.asarray(rolled @ looking_down(elevation) @ turned @ standing)
 
 
+Turning = Annotated[FreeTurning | FacingTurning | UprightTurning, Discriminator("kind")]
+"""Draws a target's orientation."""
+
+
 def looking_down(elevation: float) -> RotationMatrix:
     """Return the rotation from a frame whose z is up to a level camera that looks along its +y.
 
@@ -142,8 +117,20 @@ def looking_down(elevation: float) -> RotationMatrix:
     return np.array([[1, 0, 0], [0, -sine, -cosine], [0, cosine, -sine]])
 
 
+class _Placement(Checked):
+    """Base of the placements."""
+
+    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
+        """Return what to try after a place at which the object is not well in the frame.
+
+        What a placement keeps of such a place has the distribution it was drawn from, however often
+        the camera does not see the object there. None draws the orientation anew, too.
+        """
+        return None
+
+
 @dataclass(frozen=True)
-class OffsetPlacement(Placement):
+class OffsetPlacement(_Placement):
     """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
 
     Where the camera does not see all of the box, a place is moved along the optical axis until it
@@ -155,13 +142,13 @@ class OffsetPlacement(Placement):
         lateral: Largest offset along image x and along image y to either side, metres.
     """
 
-    distance: float = 0.20
-    axial: float = 0.10
-    lateral: float = 0.15
+    distance: Metres = 0.20
+    axial: Metres = 0.10
+    lateral: Metres = 0.15
+    kind: Literal["offset"] = "offset"
 
     def __post_init__(self) -> None:
-        for name in ("distance", "axial", "lateral"):
-            check_number(name, getattr(self, name), 0.0, _FARTHEST, "metres", of=self)
+        super().__post_init__()
         if not self.axial < self.distance:
             raise UserError(
                 f"distance={self.distance} and axial={self.axial} of OffsetPlacement",
@@ -183,7 +170,7 @@ class OffsetPlacement(Placement):
 
 
 @dataclass(frozen=True)
-class DistancePlacement(Placement):
+class DistancePlacement(_Placement):
     """Uniform in depth and, laterally, over the image.
 
     Attributes:
@@ -191,13 +178,14 @@ class DistancePlacement(Placement):
         margin: Share of the image's width and height that the origin keeps from the border.
     """
 
-    nearest: float = 0.5
-    farthest: float = 1.2
-    margin: float = 0.1
+    nearest: Depth = 0.5
+    farthest: Depth = 1.2
+    margin: Annotated[float, Range(0.0, 0.49, "share")] = 0.1
+    kind: Literal["distance"] = "distance"
 
     def __post_init__(self) -> None:
-        _check_ends(self, "nearest", "farthest", 1e-6, _FARTHEST, "metres", "in metres")
-        check_number("margin", self.margin, 0.0, 0.49, "share", of=self)
+        super().__post_init__()
+        _check_order(self, "nearest", "farthest", "in metres")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -207,19 +195,20 @@ class DistancePlacement(Placement):
 
 
 @dataclass(frozen=True)
-class FillPlacement(Placement):
+class FillPlacement(_Placement):
     """The part fills a drawn share of the image and lies inside it.
 
     The share is the larger of bounding-box width over image width and bounding-box height over
     image height. The distance follows from it by iteration.
     """
 
-    smallest: float = 0.60
-    largest: float = 0.95
+    smallest: ImageShare = 0.60
+    largest: ImageShare = 0.95
+    kind: Literal["fill"] = "fill"
 
     def __post_init__(self) -> None:
-        unit = "share of the image"
-        _check_ends(self, "smallest", "largest", 1e-3, 1.0, unit, "shares of the image")
+        super().__post_init__()
+        _check_order(self, "smallest", "largest", "shares of the image")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -243,7 +232,7 @@ class FillPlacement(Placement):
 
 
 @dataclass(frozen=True)
-class WorkingPlacement(Placement):
+class WorkingPlacement(_Placement):
     """Uniform in the depth of the part's middle and, across, wherever the part fits in the picture.
 
     The middle is that of the turned part's extent along each axis, wherever its file has the
@@ -253,11 +242,13 @@ class WorkingPlacement(Placement):
         nearest: Smallest depth of the middle, metres.
     """
 
-    nearest: float
-    farthest: float
+    nearest: Depth
+    farthest: Depth
+    kind: Literal["working"] = "working"
 
     def __post_init__(self) -> None:
-        _check_ends(self, "nearest", "farthest", 1e-6, _FARTHEST, "metres", "in metres")
+        super().__post_init__()
+        _check_order(self, "nearest", "farthest", "in metres")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -282,14 +273,15 @@ class WorkingPlacement(Placement):
         return np.asarray(middle - (lower + upper) / 2)
 
 
-def _check_ends(
-    of: object, first: str, last: str, lowest: float, highest: float, unit: str, units: str
-) -> None:
-    """Refuse the two ends of a placement's range outside of bounds or in the wrong order."""
-    low, high = (
-        check_number(name, getattr(of, name), lowest, highest, unit, of=of)
-        for name in (first, last)
-    )
+Placement = Annotated[
+    OffsetPlacement | DistancePlacement | FillPlacement | WorkingPlacement, Discriminator("kind")
+]
+"""Draws a target's position."""
+
+
+def _check_order(of: object, first: str, last: str, units: str) -> None:
+    """Refuse a range whose two ends are in the wrong order."""
+    low, high = getattr(of, first), getattr(of, last)
     if low > high:
         raise UserError(
             f"{first}={low} and {last}={high} of {type(of).__name__}",

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
-from dopepp.core.checks import check_number, check_range
+from dopepp.core.validation import Checked, Pair, Share, Span
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 from dopepp.geometry.rotation import Vector, rotation_to_z, rotation_vector_to_matrix
 from dopepp.virtual.backgrounds import Backgrounds
 from dopepp.virtual.body import Hull
-from dopepp.virtual.presets.placement import looking_down
+from dopepp.virtual.presets.placement import Angle, looking_down
 from dopepp.virtual.scene import Plane, triple
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Checked):
     """A supporting plane before a robot's camera.
 
     Attributes:
@@ -36,23 +37,14 @@ class Table:
             distances; beyond it the picture is mirrored.
     """
 
-    distance: tuple[float, float] = (0.25, 0.60)
-    elevation_deg: tuple[float, float] = (30.0, 85.0)
-    roll_deg: float = 20.0
-    tilted_share: float = 0.2
-    tilt_deg: tuple[float, float] = (5.0, 30.0)
+    distance: Annotated[Pair, Span(0.02, 100.0, "metres")] = (0.25, 0.60)
+    elevation_deg: Annotated[Pair, Span(10.0, 90.0, "degrees")] = (30.0, 85.0)
+    roll_deg: Angle = 20.0
+    tilted_share: Share = 0.2
+    tilt_deg: Annotated[Pair, Span(0.0, 90.0, "degrees")] = (5.0, 30.0)
     heaped: bool = False
-    heap_radius: tuple[float, float] = (0.3, 0.8)
-    picture_width: tuple[float, float] = (1.2, 2.4)
-
-    def __post_init__(self) -> None:
-        check_range("distance", self.distance, 0.02, 100.0, "metres", of=self)
-        check_range("elevation_deg", self.elevation_deg, 10.0, 90.0, "degrees", of=self)
-        check_number("roll_deg", self.roll_deg, 0.0, 180.0, "degrees", of=self)
-        check_number("tilted_share", self.tilted_share, 0.0, 1.0, "share", of=self)
-        check_range("tilt_deg", self.tilt_deg, 0.0, 90.0, "degrees", of=self)
-        check_range("heap_radius", self.heap_radius, 0.0, 10.0, "diameters", of=self)
-        check_range("picture_width", self.picture_width, 0.1, 20.0, "camera distances", of=self)
+    heap_radius: Annotated[Pair, Span(0.0, 10.0, "diameters")] = (0.3, 0.8)
+    picture_width: Annotated[Pair, Span(0.1, 20.0, "camera distances")] = (1.2, 2.4)
 
     def draw_view(self, rng: Generator) -> Transform:
         """Draw T_cam_table: the table's origin lies on the optical axis, its z points up."""

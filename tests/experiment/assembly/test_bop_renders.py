@@ -22,7 +22,7 @@ from dopepp.geometry.camera import project_keypoints
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Mesh, make_part
 from dopepp.virtual import Factory
-from dopepp.virtual.presets.preset import customised_preset
+from dopepp.virtual.presets.preset import preset_of
 
 SCENE = {"width": 96, "height": 64, "intrinsics_px": [210.0, 211.0, 47.0, 30.0],
          "placement": {"nearest": 0.42, "farthest": 0.58}, "targets_per_image": [2, 2]}  # fmt: skip
@@ -38,7 +38,7 @@ def root(tmp_path_factory):
         shades = np.full((8, 3), (200, 30, 30) if name == "red" else (20, 40, 190), np.uint8)
         mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int32), colours=shades)
         parts.append(make_part(name, mesh))
-    source = RenderedSource(Factory(parts, customised_preset("upright", SCENE), 3), 4, "test")
+    source = RenderedSource(Factory(parts, preset_of("upright", SCENE), 3), 4, "test")
     writer = BopWriter(folder, parts, split="test")
     writer.prepare()
     for index in range(4):

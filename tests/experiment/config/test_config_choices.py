@@ -41,8 +41,8 @@ OF_HYDRA = ("hydra/launcher", "hydra/sweeper")
 CHOICES = [
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in FILES
-    # A search composes within a multirun alone, see test_search.py.
-    if path.parent != CONF and path.parent.name != "search"
+    # A search composes within a multirun alone, see test_search.py; a preset is read as it is.
+    if path.parent != CONF and path.parent.name not in ("search", "preset")
 ]
 
 

@@ -11,7 +11,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual import Factory, Scene, SceneObject
 from dopepp.virtual.arrange.random_scene import approach
-from dopepp.virtual.presets.preset import customised_preset
+from dopepp.virtual.presets.preset import preset_of
 from dopepp.virtual.scene import NEAR
 
 NUM_SCENES = 6
@@ -31,9 +31,9 @@ class Waves:
 
 
 PRESETS = {
-    "wide": customised_preset("wide", {}),
-    "paper": customised_preset("paper", {}).resized(160, 120),
-    "table": customised_preset("table", {}).resized(160, 120),
+    "wide": preset_of("wide", {}),
+    "paper": preset_of("paper", {}).resized(160, 120),
+    "table": preset_of("table", {}).resized(160, 120),
 }
 
 
@@ -132,7 +132,7 @@ def test_what_the_camera_reaches_is_no_longer_in_the_scene():
 
 def test_a_camera_stays_above_the_table(sized_box):
     low = {"distance": [0.3, 0.3], "elevation_deg": [10.0, 10.0]}
-    preset = customised_preset("table", {"table": low, "min_visible_fraction": 0.1})
+    preset = preset_of("table", {"table": low, "min_visible_fraction": 0.1})
     factory = Factory([sized_box("high", 8.0)], preset, 0)
     factory.scene(0, 0)
     with pytest.raises(UserError, match=r"scale 0\.25 of a scene .*choose a larger scale"):

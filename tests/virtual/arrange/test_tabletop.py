@@ -13,7 +13,7 @@ from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
 from dopepp.virtual import Distractors, Factory, Scene, SceneObject, Table, visible_fractions
 from dopepp.virtual.arrange.tabletop import HeightMap
-from dopepp.virtual.presets.preset import PRESETS, Preset, customised_preset
+from dopepp.virtual.presets.preset import PRESETS, Preset, preset_of
 
 NUM_SCENES = 25
 CONTACT = 1e-4
@@ -36,7 +36,7 @@ class Ramp:
 
 
 def small(name: str, **changes: object) -> Preset:
-    return customised_preset(name, changes).resized(160, 120)
+    return preset_of(name, changes).resized(160, 120)
 
 
 def heights(scene: Scene, item: SceneObject) -> np.ndarray:
@@ -133,7 +133,7 @@ def test_the_cameras_place_keeps_to_its_ranges(tables):
 
 def test_the_background_is_a_picture_that_lies_on_the_plane(parts):
     wide = {"picture_width": (8.0, 8.0), "elevation_deg": (45.0, 85.0)}
-    preset = replace(customised_preset("table", {"table": wide}), width=256, height=256)
+    preset = replace(preset_of("table", {"table": wide}), width=256, height=256)
     factory = Factory(parts, preset, 4, Ramp())
     for index in range(4):
         scene = factory.scene(0, index)
