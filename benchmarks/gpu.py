@@ -29,7 +29,7 @@ import torch
 from runtimes import config_of
 
 from dopepp.core.files import write_whole
-from dopepp.core.futures import available_cores
+from dopepp.core.pool import available_cores
 from dopepp.data.batch import Batch, collate
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment.assembly.parts import build_parts

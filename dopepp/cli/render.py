@@ -82,7 +82,7 @@ def render(
     """
     with resumable():
         from dopepp.data.jobs.job import make_job
-        from dopepp.data.jobs.render_dataset import RenderRequest, run
+        from dopepp.data.jobs.rendering import run
 
         job = make_job(
             parts, unit=unit, preset=preset, changes=changes or (), size=size, seed=seed,
@@ -94,5 +94,4 @@ def render(
 
             typer.echo(write_preview(job, out))
         else:
-            request = RenderRequest(out, num, shard, workers, engine, ray_address)
-            typer.echo(run(job, request))
+            typer.echo(run(job, out, num, shard, workers, engine, ray_address))

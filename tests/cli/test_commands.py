@@ -341,18 +341,17 @@ from typer.testing import CliRunner
 from dopepp.cli import app
 from dopepp.data.jobs.job import make_job
 from dopepp.data.jobs.preview import write_preview
-from dopepp.data.jobs.work import Task, Worker
+from dopepp.data.jobs.rendering import RenderTasks, Task
 from pathlib import Path
-import pickle
 out = {str(tmp_path / "out")!r}
 arguments = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24",
              "--format", {layout!r}, "--workers", "1", "-n", "2", "--out", out]
 done = CliRunner().invoke(app, arguments)
 assert done.exit_code == 0, done.output
 job = make_job(["servoholder"], preset="quickstart", size="32x24", layout={layout!r})
-worker = Worker(pickle.dumps((job, Path(out))))
+perform = RenderTasks(job, Path(out))
 for task in (Task(0, range(2)), Task(0, range(2), finalizes=True)):
-    assert worker.perform(task).error is None
+    perform(task)
 write_preview(job, Path(out))
 done = CliRunner().invoke(app, ["check", out])
 assert done.exit_code == 0, done.output

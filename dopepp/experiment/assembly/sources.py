@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.core.futures import available_cores
+from dopepp.core.pool import available_cores
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.ndds.source import NddsSource

@@ -17,7 +17,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from dopepp.core.errors import UserError
-from dopepp.core.futures import cpu_fact
+from dopepp.core.pool import cpu_fact
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory

@@ -19,8 +19,8 @@ import yaml
 import dopepp
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.core.futures import cpu_fact
 from dopepp.core.json import read_json as read_strict_json
+from dopepp.core.pool import cpu_fact
 from dopepp.experiment import program
 from dopepp.training.checkpointing.files import BEST, FOLDER, LAST
 from dopepp.virtual.factory import code_hash

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +19,18 @@ from omegaconf import DictConfig, open_dict
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError, require
-from dopepp.core.futures import THREAD_LIMITS, available_cores, completed, connect, spread
+from dopepp.core.pool import (
+    THREAD_LIMITS,
+    ClusterPool,
+    LostWorkerError,
+    Pool,
+    ProcessPool,
+    available_cores,
+)
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 
 _MOST: Final = 1024
-_IDLE_S: Final = 300
-"""How long a process waits for its next job."""
 
 _ANYWHERE: Final = ("timeout_min", "nodes", "tasks_per_node", "cpus_per_task", "gpus_per_node",
                     "mem_gb", "name")  # fmt: skip
@@ -70,6 +74,13 @@ class Jobs:
             job_subdir_key="hydra.sweep.subdir",
             hydra_context=self.context,
         )
+
+    def __call__(self, job: tuple[int, list[str]]) -> JobReturn:
+        """Run one job, as a pool's item of number and overrides."""
+        result = self.run(*job)
+        # Configs hold classes that Hydra imports twice, so that they cannot be sent back.
+        result.cfg = result.hydra_cfg = None
+        return result
 
 
 Ended = Iterator[tuple[int, JobReturn | Exception]]
@@ -116,26 +127,11 @@ def on_joblib(n_jobs: int) -> Runner:
     require("joblib", "hydra/launcher=joblib", "joblib")
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
-        import joblib
-        from joblib.externals.loky import get_reusable_executor
-        from joblib.externals.loky.process_executor import TerminatedWorkerError
+        from joblib.externals.loky.cloudpickle_wrapper import dumps  # also of scripts' objects
 
-        # Of concurrent.futures' kind, and it pickles what belongs to a script.
-        share = str(max(joblib.cpu_count() // n_jobs, 1))
+        share = str(max(available_cores() // n_jobs, 1))
         limits = {name: os.environ.get(name, share) for name in THREAD_LIMITS}
-
-        def submit(item: tuple[int, list[str]]) -> Future[JobReturn]:
-            # A new one after a process was lost, which takes those at work beside it along.
-            pool = get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits)
-            future: Future[JobReturn] = pool.submit(jobs.run, *item)
-            return future
-
-        try:
-            for (number, _), future in completed(submit, overrides.items(), lambda: n_jobs):
-                yield number, _result(future, TerminatedWorkerError)
-        except BaseException:
-            get_reusable_executor(n_jobs, timeout=_IDLE_S, env=limits).shutdown(kill_workers=True)
-            raise
+        return _run(ProcessPool(dumps(jobs), n_jobs, limits), overrides)
 
     return run
 
@@ -148,27 +144,26 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
     """
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:
-        ray = connect(address, available_cores(), "hydra/launcher=ray", "hydra.launcher.address")
-        try:
+        require("ray", "hydra/launcher=ray", "ray")
+        from ray import cloudpickle
+
+        pool = ClusterPool(
+            cloudpickle.dumps(jobs), address, available_cores(),
+            "hydra/launcher=ray", "hydra.launcher.address",
             # Not repeated: a job that took its process down once would do so again.
-            submit = spread(ray, Jobs.run, max_retries=0, num_cpus=num_cpus, num_gpus=num_gpus)
-            items = overrides.items()
-            for (number, _), future in completed(
-                lambda item: submit(jobs, *item), items, lambda: len(items)
-            ):
-                yield number, _result(future, ray.exceptions.RayError)
-        finally:
-            ray.shutdown()
+            max_retries=0, num_cpus=num_cpus, num_gpus=num_gpus,
+        )  # fmt: skip
+        return _run(pool, overrides)
 
     return run
 
 
-def _result(future: Future[JobReturn], lost: type[Exception]) -> JobReturn | Exception:
-    """Return a job's result, or what its process was lost by."""
-    try:
-        return future.result()
-    except lost as error:
-        return error
+def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
+    """Yield the results of jobs, or the loss of their process."""
+    with pool:
+        for outcome in pool.run(overrides.items()):
+            lost = outcome.error if isinstance(outcome.error, LostWorkerError) else None
+            yield outcome.item[0], lost or outcome.result()
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
-from dopepp.core.futures import physical_cores
+from dopepp.core.pool import physical_cores
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.inference.runtimes.description import Export
 from dopepp.models.checkpoint import Checkpoint

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import signal
+import pickle
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from importlib.metadata import version
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +16,7 @@ import numpy as np
 from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import check_target
-from dopepp.core.futures import available_cores, one_thread_each
+from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.cell import Cell
 from dopepp.robot.grasping.film import show
@@ -130,66 +129,32 @@ def _facts(task: Task, records: Sequence[Record], seconds: float) -> dict[str, o
 def run_trials(task: Task, count: int, workers: int) -> Iterator[Record]:
     """Make trials and yield their records as they come.
 
-    A RunError: a process has died. What a trial refuses is the :class:`UserError` it is.
+    Raises:
+        RunError: A process has died.
+        UserError: A trial refuses the task.
     """
+    attempts = _Attempts(task)
     if workers == 1:
-        yield from _records(task, range(count))
+        for number in range(count):
+            yield from attempts(number)
         return
-    context = get_context("spawn")
-    pipes: list[Connection] = []
-    processes = []
-    with one_thread_each():
-        for number in range(min(workers, count)):
-            here, there = context.Pipe(duplex=False)
-            share = range(number, count, workers)
-            process = context.Process(target=_serve, args=(there, task, share), daemon=True)
-            process.start()
-            there.close()  # so that the pipe ends when the process does
-            pipes.append(here)
-            processes.append(process)
-    try:
-        yield from _gathered(pipes)
-    finally:
-        for process in processes:
-            process.terminate()
-            process.join()
+    with ProcessPool(pickle.dumps(attempts), min(workers, count)) as pool:
+        for outcome in pool.run(range(count)):
+            if isinstance(outcome.error, LostWorkerError):
+                raise RunError(str(outcome.error)) from outcome.error
+            yield from outcome.result()
 
 
-def _records(task: Task, numbers: range) -> Iterator[Record]:
-    trials = Trials(task)
-    for number in numbers:
-        scene = trials.scene(number)
-        for source in task.sources:
-            yield trials.attempt(scene, source).record
+class _Attempts:
+    """Attempts a trial with every source of the task."""
 
+    def __init__(self, task: Task) -> None:
+        self._task = task
 
-def _serve(pipe: Connection, task: Task, numbers: range) -> None:
-    """Make trials in a process of their own, until they or the pipe end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent decides what it means
-    try:
-        for record in _records(task, numbers):
-            pipe.send(record)
-        pipe.send(None)
-    except UserError as error:
-        pipe.send(error)
-    except BrokenPipeError:  # there is nobody left to work for
-        return
+    @cached_property
+    def _trials(self) -> Trials:
+        return Trials(self._task)
 
-
-def _gathered(pipes: list[Connection]) -> Iterator[Record]:
-    open_pipes = list(pipes)
-    while open_pipes:
-        for pipe in wait(open_pipes):
-            assert isinstance(pipe, Connection)
-            try:
-                message = pipe.recv()
-            except EOFError as error:
-                raise RunError(
-                    "a process died; if memory was short, use fewer --workers"
-                ) from error
-            if isinstance(message, UserError):
-                raise message
-            if message is None:
-                open_pipes.remove(pipe)
-            else:
-                yield message
+    def __call__(self, number: int) -> list[Record]:
+        scene = self._trials.scene(number)
+        return [self._trials.attempt(scene, source).record for source in self._task.sources]

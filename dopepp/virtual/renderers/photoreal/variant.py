@@ -30,7 +30,7 @@ from typing import Any, Final
 
 from dopepp.core.errors import UserError, require
 from dopepp.core.files import cache_folder
-from dopepp.core.futures import available_cores
+from dopepp.core.pool import available_cores
 
 _log = logging.getLogger(__name__)
 

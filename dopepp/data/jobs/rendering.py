@@ -1,27 +1,42 @@
-"""Make a data set: render what is missing, finalize what is complete, and show how far it is."""
+"""Make a data set: render what is missing, finalize what is complete, and show how far it is.
+
+A job's images lie in chunks, which are finalized when they are complete. A shard is a contiguous
+part of the job; it may begin and end within a chunk.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import pickle
+import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import cv2
 from rich import progress as shown
 from rich.console import Console
 from rich.text import Text
 
 from dopepp.core.errors import UserError
-from dopepp.core.futures import available_cores
-from dopepp.core.interrupts import stopped
+from dopepp.core.interrupts import StoppedError, stopped
+from dopepp.core.pool import (
+    ClusterPool,
+    LostWorkerError,
+    Outcome,
+    Pool,
+    ProcessPool,
+    available_cores,
+)
+from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.jobs.job import Job, begin, is_begun
-from dopepp.data.jobs.pools import ClusterPool, Pool, ProcessPool
-from dopepp.data.jobs.work import Chunk, Outcome, Shard, Task, plan
-from dopepp.data.sources.rendered import MAX_ITEMS
+from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
+from dopepp.virtual.factory import Factory
+from dopepp.virtual.renderers.photoreal.variant import THREADS_SETTING
 
 _log = logging.getLogger(__name__)
 
@@ -32,30 +47,11 @@ MAX_WORKERS: Final = 1024
 
 _LINE_EVERY_S: Final = 30.0
 
-OpenPool = Callable[[bytes, int], Pool]
-"""From a pickled job with its folder and a number of tasks to a pool."""
+OpenPool = Callable[[bytes], Pool]
+"""From the pickled :class:`RenderTasks` of a job to a pool."""
 
 OnProgress = Callable[[int, int], None]
 """Told how many of how many images are there, once at the start and then whenever some came."""
-
-
-@dataclass(frozen=True)
-class RenderRequest:
-    """How much of a job is done here, and by whom; it decides none of the bytes.
-
-    Attributes:
-        num: Images of the whole job.
-        shard: ``i/n``.
-        workers: Processes; None for one per core.
-        engine: One of :data:`ENGINES`.
-    """
-
-    out: Path
-    num: int | None
-    shard: str = "0/1"
-    workers: int | None = None
-    engine: str = "local"
-    ray_address: str | None = None
 
 
 @dataclass
@@ -87,30 +83,155 @@ class RenderReport:
         )
 
 
-def run(job: Job, request: RenderRequest) -> RenderReport:
-    """Render what is missing and show the progress on stderr."""
-    if request.num is None:
+def run(
+    job: Job,
+    out: Path,
+    num: int | None,
+    shard: str = "0/1",
+    workers: int | None = None,
+    engine: str = "local",
+    ray_address: str | None = None,
+) -> RenderReport:
+    """Render what is missing and show the progress on stderr.
+
+    Args:
+        job: What to render.
+        out: Folder of the data set.
+        num: Number of images of the whole job.
+        shard: Part of the job, ``i/n``.
+        workers: Number of processes; None for one per core.
+        engine: One of :data:`ENGINES`.
+        ray_address: ``host:port`` of a Ray cluster; None for one on this machine.
+    """
+    if num is None:
         raise UserError("no -n", "the number of images, or --preview", "add -n 1000")
-    shard, open_pool = Shard.parse(request.shard), _engine(request)
+    part, open_pool = Shard.parse(shard), _engine(engine, workers, ray_address)
     with ProgressDisplay(Console(stderr=True)) as progress:
-        return render_dataset(job, request.out, request.num, open_pool, shard, progress)
+        return render_dataset(job, out, num, open_pool, part, progress)
 
 
-def _engine(request: RenderRequest) -> OpenPool:
+def _engine(engine: str, workers: int | None, ray_address: str | None) -> OpenPool:
     """Return what opens the pool, after checking what can be checked without it."""
-    workers = available_cores() if request.workers is None else request.workers
+    workers = available_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise UserError(f"--workers {workers}", f"1 to {MAX_WORKERS}", "change --workers")
-    if request.engine not in ENGINES:
-        raise UserError(f"--engine {request.engine}", ", ".join(ENGINES), "choose one of them")
-    if request.engine == "ray":
-        return lambda content, _: ClusterPool(content, request.ray_address, workers)
-    if request.ray_address is not None:
+    if engine not in ENGINES:
+        raise UserError(f"--engine {engine}", ", ".join(ENGINES), "choose one of them")
+    if engine == "ray":
+        return lambda content: ClusterPool(content, ray_address, workers)
+    if ray_address is not None:
         raise UserError(
-            f"--ray-address {request.ray_address} with --engine local", "it goes with ray",
+            f"--ray-address {ray_address} with --engine local", "it goes with ray",
             "add --engine ray",
         )  # fmt: skip
-    return lambda content, num_tasks: ProcessPool(content, min(workers, max(num_tasks, 1)))
+    return lambda content: ProcessPool(content, workers)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several equal, contiguous parts of a job."""
+
+    number: int = 0
+    total: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read ``i/n``, i from 0 to n − 1; anything else is a :class:`UserError`."""
+        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+        if match is None or int(match[1]) >= int(match[2]):
+            raise UserError(
+                f"shard {text!r}",
+                "i/n with 0 <= i < n: 0/2 and 1/2 are the two halves",
+                "count the shards from 0",
+            )
+        return cls(int(match[1]), int(match[2]))
+
+    def span(self, num_items: int) -> range:
+        """Return the shard's indices of a job of ``num_items`` images."""
+        return range(
+            num_items * self.number // self.total, num_items * (self.number + 1) // self.total
+        )
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What a shard has to do with a chunk.
+
+    Attributes:
+        required: All of the job's images in it, also those of other shards: with these it is
+            finalized.
+        missing: The shard's images in it that are not there yet.
+    """
+
+    number: int
+    required: range
+    missing: Sequence[int]
+
+
+def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
+    """Yield the chunks that a shard touches, in order, also those that are complete."""
+    span, size = shard.span(num_items), writer.chunk_size
+    if not span:
+        return
+    for number in range(span[0] // size, span[-1] // size + 1):
+        required = range(number * size, min((number + 1) * size, num_items))
+        own = range(max(span.start, required.start), min(span.stop, required.stop))
+        written = writer.written(number)
+        missing = [index for index in own if index not in written] if written else own
+        yield Chunk(number, required, missing)
+
+
+@dataclass(frozen=True)
+class Task:
+    """Images to render and write, or a chunk to finalize.
+
+    Attributes:
+        indices: The images; for finalizing, those without which it must not happen.
+        finalizes: Whether the chunk is to be finalized.
+    """
+
+    chunk: int
+    indices: Sequence[int]
+    finalizes: bool = False
+
+
+class RenderTasks:
+    """A pool's function: performs tasks of a job in one process, on one thread."""
+
+    def __init__(self, job: Job, root: Path) -> None:
+        self._job, self._root = job, root
+        self._opened: tuple[Factory, Writer] | None = None
+
+    def __call__(self, task: Task) -> tuple[float, float]:
+        """Perform a task; return the CPU seconds of rendering and of encoding and writing."""
+        factory, writer = self._open()
+        if task.finalizes:
+            written = writer.written(task.chunk)
+            if written.issuperset(task.indices):  # else images of it are still to come
+                writer.finalize(task.chunk, sorted(written))
+            return 0.0, 0.0
+        render_s = write_s = 0.0
+        for index in task.indices:
+            start = time.process_time()
+            sample = rendered_sample(factory.render(0, index), "virtual", str(index))
+            middle = time.process_time()
+            writer.write(index, sample)
+            render_s += middle - start
+            write_s += time.process_time() - middle
+        return render_s, write_s
+
+    def _open(self) -> tuple[Factory, Writer]:
+        if self._opened is None:
+            cv2.setNumThreads(1)
+            os.environ.setdefault(THREADS_SETTING, "1")
+            if not is_begun(self._root):
+                raise UserError(
+                    f"{self._root} without {RECORD_FILE}, as one of the workers sees it",
+                    "a folder that every machine of the cluster sees under the same path",
+                    "choose --out on a shared file system",
+                )
+            self._opened = self._job.factory, self._job.writer(self._root)
+        return self._opened
 
 
 def render_dataset(
@@ -140,12 +261,14 @@ def render_dataset(
         writer.prepare()
         run = _Run(list(plan(writer, shard, num_items)), RenderReport(len(shard.span(num_items))))
         on_progress(run.num_there, run.report.num_images)
-        with open_pool(pickle.dumps((job, root)), run.num_tasks) as pool:
+        with open_pool(pickle.dumps(RenderTasks(job, root))) as pool:
             # Renders and, between them, finalizes; then the finalizes of what was rendered last.
-            for tasks in (run.tasks(pool.images_per_task), run.finalizes()):
+            for tasks in (run.tasks(pool.batch_size), run.finalizes()):
                 for outcome in pool.run(tasks):
                     run.note(outcome)
                     on_progress(run.num_there, run.report.num_images)
+    except LostWorkerError as error:
+        raise StoppedError(str(error)) from error
     except OSError as error:
         raise stopped(error, root) from error
     run.report.wall_s = time.monotonic() - start
@@ -161,7 +284,6 @@ class _Run:
         self._left = {chunk.number: len(chunk.missing) for chunk in chunks}
         # Complete already, but maybe not finalized: finalizing is idempotent.
         self._complete = deque(number for number, left in self._left.items() if not left)
-        self.num_tasks = sum(self._left.values()) + len(self._complete)
         self.num_there = report.num_images - sum(self._left.values())
 
     def tasks(self, images_per_task: int) -> Iterator[Task]:
@@ -177,16 +299,14 @@ class _Run:
             number = self._complete.popleft()
             yield Task(number, self._chunks[number].required, finalizes=True)
 
-    def note(self, outcome: Outcome) -> None:
-        """Count an outcome."""
-        task, report = outcome.task, self.report
-        if outcome.error is not None:
-            raise outcome.error
+    def note(self, outcome: Outcome[Task, tuple[float, float]]) -> None:
+        """Count an outcome, or raise its error."""
+        task, (render_s, write_s) = outcome.item, outcome.result()
         if task.finalizes:
             return
-        report.render_s += outcome.render_s
-        report.write_s += outcome.write_s
-        report.num_rendered += len(task.indices)
+        self.report.render_s += render_s
+        self.report.write_s += write_s
+        self.report.num_rendered += len(task.indices)
         self.num_there += len(task.indices)
         self._left[task.chunk] -= len(task.indices)
         if not self._left[task.chunk]:

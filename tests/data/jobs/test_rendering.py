@@ -19,12 +19,17 @@ from rich.console import Console
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
+from dopepp.core.pool import PickledFunction, Pool
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.jobs.job import WRITERS, make_job, named_part
-from dopepp.data.jobs.pools import Pool
-from dopepp.data.jobs.render_dataset import ProgressDisplay, RenderReport, render_dataset
-from dopepp.data.jobs.work import Outcome, Shard, Task, Worker, plan
+from dopepp.data.jobs.rendering import (
+    ProgressDisplay,
+    RenderReport,
+    Shard,
+    plan,
+    render_dataset,
+)
 
 NUM = 10
 
@@ -32,27 +37,23 @@ NUM = 10
 class InlinePool(Pool):
     """Does every task at once, here; dies after some."""
 
-    images_per_task = 2
+    batch_size = 2
 
     def __init__(self, content: bytes, dies_after: int | None = None) -> None:
-        self._worker, self._left = Worker(content), dies_after
+        self._function, self._left = PickledFunction(content), dies_after
 
     def __exit__(self, *_: object) -> None: ...
 
     def room(self) -> int:
         return 1
 
-    def submit(self, task: Task) -> Future[Outcome]:
+    def submit(self, item: object) -> Future[bytes]:
         if self._left == 0:
             raise KeyboardInterrupt
         self._left = None if self._left is None else self._left - 1
-        future: Future[Outcome] = Future()
-        future.set_result(self._worker.perform(task))
+        future: Future[bytes] = Future()
+        future.set_result(self._function(item))
         return future
-
-
-def inline(content: bytes, num_tasks: int) -> Pool:
-    return InlinePool(content)
 
 
 @pytest.fixture(scope="module", params=WRITERS)
@@ -73,7 +74,7 @@ def job(layout, small_job):
 def whole(job, contents, tmp_path_factory):
     """Read the files of a job that nobody stopped."""
     root = tmp_path_factory.mktemp("whole")
-    report = render_dataset(job, root, NUM, inline)
+    report = render_dataset(job, root, NUM, InlinePool)
     assert (report.num_images, report.num_rendered) == (NUM, NUM)
     return contents(root)
 
@@ -81,11 +82,11 @@ def whole(job, contents, tmp_path_factory):
 def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, contents, whole):
     for dies_after in (0, 2, 3):
         with pytest.raises(KeyboardInterrupt):
-            render_dataset(job, tmp_path, NUM, lambda work, _: InlinePool(work, dies_after))  # noqa: B023
-    last = render_dataset(job, tmp_path, NUM, inline)
+            render_dataset(job, tmp_path, NUM, lambda work: InlinePool(work, dies_after))  # noqa: B023
+    last = render_dataset(job, tmp_path, NUM, InlinePool)
     assert 0 < last.num_rendered < NUM
     assert contents(tmp_path) == whole
-    again = render_dataset(job, tmp_path, NUM, inline)
+    again = render_dataset(job, tmp_path, NUM, InlinePool)
     assert again.num_rendered == 0
     assert str(again) == f"all {NUM} images were there"
     assert contents(tmp_path) == whole
@@ -93,7 +94,7 @@ def test_whatever_stops_a_job_it_ends_with_the_same_files(job, tmp_path, content
 
 def test_a_job_grows(job, tmp_path, contents, whole):
     for num in (2, 5, 3, NUM):
-        render_dataset(job, tmp_path, num, inline)
+        render_dataset(job, tmp_path, num, InlinePool)
     assert contents(tmp_path) == whole
 
 
@@ -105,18 +106,18 @@ def test_shards_share_a_folder_at_the_same_time(job, tmp_path, contents, whole):
         if done == 2 and not others:  # the first shard has begun
             for number in (2, 1):
                 others.append(RenderReport(0))
-                others[-1] = render_dataset(job, tmp_path, NUM, inline, Shard(number, 3))
+                others[-1] = render_dataset(job, tmp_path, NUM, InlinePool, Shard(number, 3))
 
-    first = render_dataset(job, tmp_path, NUM, inline, Shard(0, 3), run_others)
+    first = render_dataset(job, tmp_path, NUM, InlinePool, Shard(0, 3), run_others)
     assert [report.num_rendered for report in (first, *others)] == [3, 4, 3]
     assert contents(tmp_path) == whole
 
 
 def test_shards_of_separate_folders_are_merged_by_copying(job, tmp_path, contents, whole):
     for number in range(2):  # each finalizes a chunk of its own, and they share one
-        render_dataset(job, tmp_path / str(number), NUM, inline, Shard(number, 2))
+        render_dataset(job, tmp_path / str(number), NUM, InlinePool, Shard(number, 2))
         shutil.copytree(tmp_path / str(number), tmp_path / "merged", dirs_exist_ok=True)
-    assert render_dataset(job, tmp_path / "merged", NUM, inline).num_rendered == 0
+    assert render_dataset(job, tmp_path / "merged", NUM, InlinePool).num_rendered == 0
     assert contents(tmp_path / "merged") == whole
 
 
@@ -138,15 +139,15 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
         patch.setattr(Path, "write_bytes", write_what_fits)
         message = rf"no space left for {tmp_path}: free some; the same comm"
         with pytest.raises(StoppedError, match=message):
-            render_dataset(job, tmp_path, NUM, inline)
+            render_dataset(job, tmp_path, NUM, InlinePool)
     assert len(contents(tmp_path)) > 2
     assert not list(tmp_path.rglob("*.partial"))
-    assert 0 < render_dataset(job, tmp_path, NUM, inline).num_rendered < NUM
+    assert 0 < render_dataset(job, tmp_path, NUM, InlinePool).num_rendered < NUM
     assert contents(tmp_path) == whole
 
 
 def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path, small_job, contents):
-    render_dataset(small_job("ndds"), tmp_path, 2, inline)
+    render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
     before = contents(tmp_path)
     for change, field in (
         ({"seed": 1}, "seed is 0 there and 1 now"),
@@ -157,7 +158,7 @@ def test_another_job_in_the_folder_is_refused_by_its_field(tmp_path, small_job, 
         ({"negatives": ["x=pivconnector"]}, r"negatives"),
     ):
         with pytest.raises(UserError, match=f"{RECORD_FILE} of another job: .*{field}"):
-            render_dataset(small_job(**{"layout": "ndds"} | change), tmp_path, 2, inline)
+            render_dataset(small_job(**{"layout": "ndds"} | change), tmp_path, 2, InlinePool)
     assert contents(tmp_path) == before
 
 
@@ -172,7 +173,7 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
     def render(unit="mm"):
         options = {"preset": "quickstart", "size": "32x24", "layout": "ndds", "unit": unit}
         job = make_job([str(mesh)], backgrounds=photos, **options)
-        render_dataset(job, tmp_path / "out", 1, inline)
+        render_dataset(job, tmp_path / "out", 1, InlinePool)
 
     write_mesh(1)
     cv2.imwrite(str(photos / "a.png"), picture)
@@ -194,19 +195,19 @@ def test_changed_photos_and_meshes_are_another_job(tmp_path, small_job):
 def test_a_damaged_record_is_a_user_error(content, tmp_path, small_job):
     (tmp_path / RECORD_FILE).write_text(content)
     with pytest.raises(UserError, match=RECORD_FILE):
-        render_dataset(small_job(), tmp_path, 2, inline)
+        render_dataset(small_job(), tmp_path, 2, InlinePool)
 
 
 def test_a_folder_with_something_else_is_refused(tmp_path, small_job):
     (file := tmp_path / "thesis.pdf").touch()
     for folder, message in (tmp_path, r"holds 'thesis\.pdf' and no"), (file / "x", "Not a dir"):
         with pytest.raises(UserError, match=message):
-            render_dataset(small_job(), folder, 2, inline)
+            render_dataset(small_job(), folder, 2, InlinePool)
 
 
 def test_only_abandoned_partial_files_are_removed(tmp_path, small_job):
     job = small_job("ndds")
-    render_dataset(job, tmp_path, 2, inline)
+    render_dataset(job, tmp_path, 2, InlinePool)
     mine = partial_path(tmp_path / "000009.png")
     dead = mine.with_name(mine.name.replace(f"-{os.getpid()}.", "-999999999."))
     elsewhere = tmp_path / f".000009.png.0123abcd-{os.getpid()}.partial"
@@ -214,7 +215,7 @@ def test_only_abandoned_partial_files_are_removed(tmp_path, small_job):
     for path in (mine, dead, elsewhere, old):
         path.touch()
     os.utime(old, (0, 0))
-    render_dataset(job, tmp_path, 2, inline)
+    render_dataset(job, tmp_path, 2, InlinePool)
     # Of the first one the process runs; on another machine somebody may be writing the third.
     assert [path.exists() for path in (mine, dead, elsewhere, old)] == [True, False, True, False]
 
@@ -249,7 +250,7 @@ def test_a_shard_that_is_none(text):
 @pytest.mark.parametrize("num", [0, -5, 10**9 + 1])
 def test_a_count_that_cannot_be(num, tmp_path, small_job):
     with pytest.raises(UserError, match=f"-n {num}; allowed: 1 to 1,000,000,000"):
-        render_dataset(small_job(), tmp_path / "out", num, inline)
+        render_dataset(small_job(), tmp_path / "out", num, InlinePool)
     assert not (tmp_path / "out").exists()
 
 
@@ -288,15 +289,15 @@ def test_changes_reach_the_preset(small_job):
 
 def test_a_defect_comes_with_its_traceback(tmp_path, monkeypatch, small_job):
     monkeypatch.setattr(NddsWriter, "write", lambda *_: dict[str, str]()["defect"])
-    with pytest.raises(RuntimeError, match=r"(?s)test_render_dataset\.py.*KeyError: 'defect'"):
-        render_dataset(small_job("ndds"), tmp_path, 2, inline)
+    with pytest.raises(RuntimeError, match=r"(?s)test_rendering\.py.*KeyError: 'defect'"):
+        render_dataset(small_job("ndds"), tmp_path, 2, InlinePool)
 
 
 def test_a_part_that_the_preset_cannot_show_is_one_line(tmp_path, small_job):
     small = ["horizontal_fov_deg=5", "placement.lateral=0", "min_visible_fraction=0.95"]
     job = small_job(preset="paper", changes=small)
     with pytest.raises(UserError, match="part servoholder"):
-        render_dataset(job, tmp_path / "out", 2, inline)
+        render_dataset(job, tmp_path / "out", 2, InlinePool)
     assert not (tmp_path / "out").exists()
 
 

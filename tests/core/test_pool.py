@@ -1,0 +1,171 @@
+"""Pools: order, errors, lost processes, interruptions; clusters that are not there."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+
+import pytest
+
+from dopepp.core import pool as pool_module
+from dopepp.core.errors import UserError
+from dopepp.core.pool import ClusterPool, LostWorkerError, PickledFunction, Pool, ProcessPool
+
+EVALUATE = pickle.dumps(eval)
+posix = pytest.mark.skipif(os.name != "posix", reason="signals are asked of POSIX")
+
+
+class InlinePool(Pool):
+    """Applies the function here, to as many items at a time as there is room."""
+
+    def __init__(self, room: int) -> None:
+        self._room, self.flying = room, list[tuple[Future[bytes], object]]()
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def room(self) -> int:
+        return self._room
+
+    def submit(self, item: object) -> Future[bytes]:
+        self.flying.append((Future(), item))
+        assert len(self.flying) <= self._room
+        if len(self.flying) == self._room or item == 9:
+            while self.flying:
+                future, item = self.flying.pop()
+                future.set_result(PickledFunction(pickle.dumps(abs))(item))
+        return self.flying[-1][0] if self.flying else future
+
+
+def test_what_is_done_may_decide_what_comes_next():
+    handed_out, values = [], [1]
+
+    def items() -> Iterator[int]:
+        while values and values[-1] < 1000:
+            handed_out.append(values.pop())
+            yield handed_out[-1]
+
+    for outcome in InlinePool(1).run(items()):
+        values.append(2 * outcome.result())
+    assert handed_out == [2**power for power in range(10)]
+
+
+def test_no_more_is_handed_out_than_there_is_room():
+    read = []
+
+    def items() -> Iterator[str]:
+        for number in range(50):
+            read.append(number)
+            yield f"{number} + 1"
+
+    with ProcessPool(EVALUATE, 2) as pool:
+        done = []
+        for outcome in pool.run(items()):
+            done.append(outcome.result())
+            assert len(read) <= len(done) + pool.room()
+        assert list(pool.run([])) == []
+    assert sorted(done) == list(range(1, 51))
+
+
+def test_an_error_and_a_lost_process_cost_one_item_each():
+    died = "a worker process died ({}); if memory was short, use fewer --workers"
+    errors = {
+        "1 / 0": "ZeroDivisionError",
+        "open('/nowhere')": "No such file",
+        "__import__('os')._exit(3)": died.format("code 3"),
+    }
+    if os.name == "posix":
+        errors["__import__('os').kill(__import__('os').getpid(), 9)"] = died.format("signal 9")
+    items = [*errors, "6 * 7", "__import__('os').environ['OMP_NUM_THREADS']"]
+    with ProcessPool(EVALUATE, 2) as pool:
+        outcomes = {outcome.item: outcome for outcome in pool.run(items)}
+    assert [outcomes[item].result() for item in items[-2:]] == [42, "1"]
+    for item, message in errors.items():
+        assert message in str(outcomes[item].error)
+    kinds = [type(outcomes[item].error) for item in items[:3]]
+    assert kinds == [RuntimeError, FileNotFoundError, LostWorkerError]
+
+
+def test_a_function_that_cannot_be_unpickled_is_the_items_error():
+    with ProcessPool(b"no pickle", 1) as pool:
+        (outcome,) = pool.run(["1"])
+    with pytest.raises(RuntimeError, match="UnpicklingError"):
+        outcome.result()
+
+
+@posix
+def test_a_stopped_pool_completes_its_items(tmp_path):
+    item = f"__import__('time').sleep(0.5), open('{tmp_path}/done', 'x')"
+    started = []
+
+    def stop_in_the_middle() -> None:
+        with ProcessPool(EVALUATE, 1) as pool:
+            assert next(pool.run(["1", item])).result() == 1
+            started.extend(pool._processes)
+            for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C reaches it, and it goes on
+                os.kill(started[0].pid, number)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stop_in_the_middle()
+    assert [process.exitcode for process in started] == [0]
+    assert (tmp_path / "done").exists()
+
+
+def test_an_item_that_takes_too_long_is_killed_when_the_pool_is_stopped(monkeypatch):
+    monkeypatch.setattr(pool_module, "_PATIENCE_S", 0.2)
+
+    def stop_in_the_middle() -> None:
+        with ProcessPool(EVALUATE, 1) as pool:
+            next(pool.run(["1", "__import__('time').sleep(60)"]))
+            raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        stop_in_the_middle()
+    assert time.monotonic() - start < 30
+
+
+@posix
+def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+    code = """
+import pickle
+from dopepp.core.pool import ProcessPool
+if __name__ == "__main__":
+    with ProcessPool(pickle.dumps(eval), 2) as pool:
+        for _ in pool.run(["1", "1", *["__import__('time').sleep(1)"] * 2]):
+            print("done", flush=True)
+"""
+    (script := tmp_path / "script.py").write_text(code)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == b"done\n"
+    parent.kill()
+    parent.wait()
+    for _ in range(200):
+        try:
+            os.killpg(parent.pid, 0)
+        except ProcessLookupError:  # nobody of its group is left
+            return
+        time.sleep(0.05)
+    pytest.fail("processes outlive their parent")
+
+
+def test_without_ray_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("dopepp.core.errors.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"--engine ray without .* pip install 'dopepp\[ray\]'"):
+        ClusterPool(EVALUATE, None, 1)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "127.0.0.1:99999999", "a:b"])
+def test_an_address_without_a_cluster_is_refused_at_once(address):
+    pytest.importorskip("ray")
+    with pytest.raises(UserError, match=f"--ray-address {address}: .*ray start --head"):
+        ClusterPool(EVALUATE, address, 1)
