@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from dopepp.data.formats.ycb_video.frame import read_classes
-from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
 from dopepp.inference.refinement.refiner import PartRefiner
@@ -163,7 +163,7 @@ def real(root: Path, draws: int, seed: int) -> Iterator[str]:
         str(path.relative_to(root / "data"))[: -len("-color.png")]
         for path in (root / "data").rglob("*-color.png")
     )
-    source = YcbVideoSource(root, list(parts.values()), frames=frames)
+    source = YcbVideoReader(root, list(parts.values()), frames=frames)
     refiners = {name: PartRefiner(part, ["depth"]) for name, part in parts.items()}
     for number in range(len(source)):
         sample = source.sample(number)

@@ -40,20 +40,20 @@ def module_of(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleTy
 
 
 def test_the_documented_format_works(monkeypatch, tmp_path):
-    module = module_of("adding-a-data-format.md", "dopepp.data.formats.posed.source", monkeypatch)
+    module = module_of("adding-a-data-format.md", "dopepp.data.formats.posed.reader", monkeypatch)
     part, K = servoholder(), camera_matrix(100, 100, 31.5, 23.5)
     T_cam_obj = make_transform(Rotation.random(random_state=0).as_matrix(), np.array([0, 0, 0.4]))
     record = {"K": K.ravel().tolist(), "object": part.name, "T_cam_obj": T_cam_obj.ravel().tolist()}
     (tmp_path / "a.json").write_text(json.dumps(record))
     write_png(tmp_path / "a.png", np.full((48, 64, 3), 7, np.uint8))
-    source = module.PosedSource(tmp_path, [part])
+    source = module.PosedReader(tmp_path, [part])
     assert (len(source), source.contains(part.name), source.contains("other")) == (1, True, False)
     sample = source.sample(0)
     np.testing.assert_array_equal(sample.instances[0].T_cam_obj, T_cam_obj)
     assert (sample.image == 7).all()
     (tmp_path / "a.json").write_text(json.dumps(record | {"T_cam_obj": [2.0] * 16}))
     with pytest.raises(UserError, match=r"a\.json: T_cam_obj: no rotation"):
-        module.PosedSource(tmp_path, [part])
+        module.PosedReader(tmp_path, [part])
 
 
 def test_the_documented_backbone_works(monkeypatch):

@@ -15,12 +15,12 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.model_writer import model_info
 from dopepp.data.formats.bop.models import (
     SYMMETRY_FIELDS,
     Continuous,
     Discrete,
     ModelInfo,
+    model_info,
     parse_models,
     parse_symmetries,
 )

@@ -30,14 +30,14 @@ from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
 from dopepp.data.archive import Limits, safe_extract
 from dopepp.data.check import check_dataset
-from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.results import read_results
-from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.bop.writer import BopWriter
-from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
+from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.data.sample import Instance, Sample
@@ -271,9 +271,9 @@ def _datasets(root: Path) -> dict[str, Target]:
             writer.write(index, sample)
         writer.finalize(0, range(2))
     readers: dict[str, Callable[[Path], object]] = {
-        "bop": lambda folder: read_all(BopSource(folder, bop_parts(folder), "train_pbr")),
-        "ndds": lambda folder: read_all(NddsSource(folder, [part])),
-        "shards": lambda folder: read_all(WebdatasetSource(folder, bop_parts(folder), "train_pbr")),
+        "bop": lambda folder: read_all(BopReader(folder, bop_parts(folder), "train_pbr")),
+        "ndds": lambda folder: read_all(NddsReader(folder, [part])),
+        "shards": lambda folder: read_all(WebdatasetReader(folder, bop_parts(folder), "train_pbr")),
     }
     made = {}
     for name, read in readers.items():

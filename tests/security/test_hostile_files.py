@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 from dopepp.cli import app
 from dopepp.core.errors import UserError
 from dopepp.data.archive import safe_extract
-from dopepp.data.formats.bop.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.bop.models import read_models
 from dopepp.data.formats.bop.results import read_results
-from dopepp.data.formats.webdataset.shards import index_shard
+from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
+from dopepp.data.formats.webdataset import index_shard
 from dopepp.data.formats.ycb_video.frame import read_meta
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.parts import read_mesh

@@ -1,30 +1,26 @@
-"""Where the problems of a data set's files go, and what every reader of them reads.
+"""Problems of a data set's files: raised one by one, or collected by a check.
 
-A reader is handed a :class:`Problems`: at each :class:`Place` it reports what is wrong and goes on
-with a neutral value (NaN, None, an empty list). A source hands it :data:`STRICT`, which raises the
-first problem; a check hands it a :class:`CheckReport`, which keeps them all. So both parse alike,
-and what a check passes, a source reads. To add a layout, see :mod:`dopepp.data.check`.
+A reader reports what is wrong at a :class:`Place` and goes on with a neutral value (NaN, None, an
+empty list). :class:`Problems` raises the first problem: a data source reads like this.
+:class:`CheckReport` keeps all problems: ``dopepp check`` runs the same reader with it, so a data
+set that passes a check can be read.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NoReturn, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
-from PIL import Image
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES, parse_json, read_json
-from dopepp.drawing.pictures import MAX_PIXELS, Shape, read_content, read_image, whole_picture
 
 _log = logging.getLogger(__name__)
 
@@ -34,50 +30,35 @@ MAX_KEPT: Final = 10_000
 _LOG_EVERY: Final = 1000
 """Images between two lines of the log."""
 
-FORMATS: Final = ("PNG", "JPEG", "TIFF")
-"""Of BOP's images."""
-
-COLOUR_MODES: Final = ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr")
-"""Pillow's names of the pixels that BOP's colour and grey images may have."""
-
 FARTHEST: Final = 1e9
-"""No number of a label is larger in any unit, and squares of such numbers stay exact enough."""
+"""Largest number of a label in any unit; squares of such numbers stay exact enough."""
 
 T = TypeVar("T")
 
 
-class Problems(Protocol):
-    """Takes what a reader finds wrong."""
+class Problems:
+    """Raises the first problem."""
 
     def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
-        """Take a problem at a :class:`Place`; ``allowed`` is empty where ``got`` says it."""
-
-    def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Take a problem that a reader below has raised."""
-
-
-class Strict:
-    """Raises the first problem: what a source does."""
-
-    def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> NoReturn:
-        """Raise a :class:`~dopepp.core.errors.UserError`."""
+        """Take a problem at a :class:`Place`; ``allowed`` is empty where ``got`` implies it."""
         fix = "correct the file or get it again; `dopepp check` lists all problems of a data set"
         raise UserError(": ".join(filter(None, (str(path), where.lstrip("."), got))), allowed, fix)
 
-    def take(self, path: Path | str, where: str, error: UserError) -> NoReturn:
-        """Raise the error as it is."""
+    def take(self, path: Path | str, where: str, error: UserError) -> None:
+        """Take a problem that a function of another package has raised."""
         raise error
 
 
-STRICT: Final = Strict()
+STRICT: Final = Problems()
 
 
 @dataclass(frozen=True)
 class Defect:
-    """One thing that is wrong.
+    """One problem of a data set.
 
-    ``path`` is below the data set's folder, a tar's member as ``TAR/MEMBER``; ``field`` is what in
-    it, e.g. ``3[0].cam_R_m2c`` or ``size``.
+    Attributes:
+        path: File below the data set's folder; a member of a tar file as ``TAR/MEMBER``.
+        field: Field in the file, e.g. ``3[0].cam_R_m2c`` or ``size``.
     """
 
     path: str
@@ -89,12 +70,12 @@ class Defect:
 
 
 @dataclass
-class CheckReport:
-    """Keeps all problems, as defects: what a check does.
+class CheckReport(Problems):
+    """Collects all problems as defects.
 
     Attributes:
-        defects: The first ``MAX_KEPT`` of them, in the order in which they were found.
-        counts: Defects by kind, which is the field's last part.
+        defects: The first ``MAX_KEPT`` defects, in the order in which they were found.
+        counts: Numbers of defects by the last part of their field.
     """
 
     root: Path
@@ -107,7 +88,7 @@ class CheckReport:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no defect."""
         return self.num_defects == 0
 
     def report(self, path: Path | str, where: str, got: str, allowed: str = "") -> None:
@@ -123,18 +104,17 @@ class CheckReport:
             self.defects.append(Defect(shown, where, message))
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
-        """Keep an error as a defect; it need not name the file again."""
+        """Keep an error as a defect, without the file's name in its message."""
         got = error.got.rpartition(str(path))[2].lstrip(" ,:") or error.got
-        got = "missing" if where == "file" else got
-        self.report(path, where, got, error.allowed)
+        self.report(path, where, "missing" if where == "file" else got, error.allowed)
 
     def note(self, text: str) -> None:
-        """Add what is worth knowing and no defect, once."""
+        """Add, once, something that is worth knowing and no defect."""
         if text not in self.notes:
             self.notes.append(text)
 
     def count_image(self) -> None:
-        """Count an image; the log tells how far it is."""
+        """Count an image, and log the progress now and then."""
         self.num_images += 1
         if self.num_images % _LOG_EVERY == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
@@ -154,11 +134,11 @@ class CheckReport:
 
 @dataclass(frozen=True)
 class Place:
-    """A file or something in it, and who takes what is wrong there.
+    """A file or a field of it, with the receiver of its problems.
 
     Attributes:
-        path: The file; a tar's member as ``TAR/MEMBER``.
-        where: What in it, e.g. ``3[0].cam_R_m2c`` or ``size``.
+        path: The file; a member of a tar file as ``TAR/MEMBER``.
+        where: The field, e.g. ``3[0].cam_R_m2c`` or ``size``; empty for the whole file.
     """
 
     problems: Problems
@@ -166,7 +146,7 @@ class Place:
     where: str = ""
 
     def __getitem__(self, key: str | int) -> Place:
-        """Return the place of an object's field, or of a list's entry."""
+        """Return the place of a mapping's field, or of a list's entry."""
         step = f"[{key}]" if isinstance(key, int) else f".{key}"
         return Place(self.problems, self.path, self.where + step)
 
@@ -175,7 +155,7 @@ class Place:
         self.problems.report(self.path, self.where, got, allowed)
 
     def attempt(self, read: Callable[[], T]) -> T | None:
-        """Return what a reader returns; what it raises is a problem, and None the answer."""
+        """Return the result of ``read``, or None where it raises, which is reported."""
         is_missing = isinstance(self.path, Path) and not self.path.is_file()
         try:
             return read()
@@ -186,31 +166,35 @@ class Place:
     def load(
         self, allowed: str = "a JSON object { }", max_bytes: int = MAX_BYTES
     ) -> dict[str, Any] | None:
-        """Read a JSON file whose top level is an object, None where that is impossible.
+        """Read a JSON file whose top level is an object; return None where that is impossible.
 
-        A number that is not finite, or a key twice, is a problem that does not hide the rest.
+        A number that is not finite, or a key twice, is reported, and the rest is read still.
         """
         path = Path(self.path)
-        found = self["JSON"].attempt(lambda: [read_json(path, max_bytes)])
-        if found is None:
-            readable = path.is_file() and path.stat().st_size <= max_bytes
-            content = _leniently(path.read_bytes()) if readable else None
-            return content if isinstance(content, dict) else None
-        if isinstance(found[0], dict):
-            return found[0]
-        self["top level"].report(f"{found[0]!r:.60}", allowed)
+        strict = self["JSON"].attempt(lambda: [read_json(path, max_bytes)])
+        if strict is not None:
+            content = strict[0]
+        elif path.is_file() and path.stat().st_size <= max_bytes:
+            content = _leniently(path.read_bytes())
+        else:
+            return None
+        if isinstance(content, dict):
+            return content
+        if strict is not None:
+            self["top level"].report(f"{content!r:.60}", allowed)
         return None
 
     def decode(self, content: bytes) -> Any:
-        """Parse JSON as :meth:`load` does, whatever it holds."""
-        found = self["JSON"].attempt(lambda: [parse_json(content, str(self.path))])
-        return _leniently(content) if found is None else found[0]
+        """Parse JSON like :meth:`load`, with any top level."""
+        strict = self["JSON"].attempt(lambda: [parse_json(content, str(self.path))])
+        return _leniently(content) if strict is None else strict[0]
 
     def numbers(self, value: object, *shape: int) -> Float[np.ndarray, "..."]:
-        """Return a field's numbers in a shape.
+        """Return a field's numbers as an array; NaN where they are reported.
 
-        ``value`` is a number, or (nested) lists of as many as ``shape`` has, None where it is
-        missing. Anything else, or what is not finite, becomes NaNs.
+        Args:
+            value: A number or (nested) lists of numbers; None where the field is missing.
+            shape: Shape of the array. Lists of another shape with as many numbers are accepted.
         """
         try:
             array = np.array(value)
@@ -227,18 +211,18 @@ class Place:
         return np.full(shape, np.nan)
 
     def scalar(self, value: object) -> float:
-        """Return a field's number, NaN where it holds anything else."""
+        """Return a field's number; NaN where it is reported."""
         return float(self.numbers(value, 1)[0])
 
     def entries(self, value: object) -> list[Any]:
-        """Return a list's entries; empty ones in place of those that are no JSON objects."""
+        """Return a list's JSON objects; an empty one in place of an entry that is reported."""
         if not isinstance(value, list):
             self.report("missing" if value is None else f"{value!r:.60}", "a list")
             return []
         for number, entry in enumerate(value):
             if not isinstance(entry, dict):
                 self[number].report(f"{entry!r:.60}", "a JSON object")
-        return [entry if isinstance(entry, dict) else {} for entry in value]
+        return [mapping(entry) for entry in value]
 
 
 def _leniently(content: bytes) -> Any:
@@ -249,90 +233,5 @@ def _leniently(content: bytes) -> Any:
 
 
 def mapping(value: object) -> Mapping[str, Any]:
-    """Return a JSON object, an empty one for anything else."""
+    """Return a JSON object, or an empty one for any other value."""
     return value if isinstance(value, dict) else {}
-
-
-def picture(
-    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
-) -> Image.Image | None:
-    """Decode a BOP image, None where it is missing, damaged, too large or of another format.
-
-    ``content`` are its bytes, where they do not lie on the disk by themselves; ``modes`` Pillow's
-    names of the pixels it may have, none for any.
-    """
-    if content is None:
-        content = place["image"].attempt(lambda: read_content(Path(place.path)))
-    if content is None:
-        return None
-    try:
-        image = whole_picture(content, FORMATS)
-    except ValueError as error:
-        got = f"unreadable or truncated, {len(content):,} bytes ({error})"
-        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
-        place["image"].report(got, allowed)
-        return None
-    if modes and image.mode not in modes:
-        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
-        return None
-    return image
-
-
-def picture_shape(
-    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
-) -> tuple[int, int] | None:
-    """Return a picture's (height, width) after reading all of it, as :func:`picture` does.
-
-    A truncated file still states its size, so that other images can be held against it; None where
-    it does not.
-    """
-    picture(place, content, modes)
-    file = Path(place.path) if content is None else io.BytesIO(content)
-    try:
-        with Image.open(file, formats=FORMATS) as stated:
-            width, height = stated.size
-    except Exception:  # said above
-        return None
-    return (height, width) if 0 < width * height <= MAX_PIXELS else None
-
-
-def read_map(path: Path, shape: Shape) -> NDArray[Any]:
-    """Read a frame's map of numbers (depth, labels), of the colour image's (height, width).
-
-    A UserError: it is missing, damaged, has several channels or another size.
-    """
-    image = check_map(Place(STRICT, path), shape)
-    assert image is not None
-    return image
-
-
-def check_map(place: Place, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
-    """Read a map of YCB-Video, NDDS or FAT, None where that is impossible.
-
-    ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
-    map of several channels, whose meaning no file states, gives None.
-    """
-    image = place["image"].attempt(lambda: read_image(Path(place.path)))
-    if image is not None and image.ndim > 2 and colour:
-        one_channel(place, image[..., 0], shape)
-        return None
-    return one_channel(place, image, shape)
-
-
-def one_channel(
-    place: Place, image: NDArray[Any] | None, shape: tuple[int, ...] | None
-) -> NDArray[Any] | None:
-    """Return a map of numbers (depth, mask, labels), None where it cannot be the image's.
-
-    ``shape`` is the colour image's (height, width); None for any.
-    """
-    if image is None:
-        return None
-    if image.ndim != 2:
-        place["channels"].report(f"an image of {image.shape[2]}", "one channel")
-        return None
-    if shape is not None and image.shape != tuple(shape[:2]):
-        got = f"{image.shape[1]}×{image.shape[0]} pixels"
-        place["size"].report(got, f"{shape[1]}×{shape[0]}, the colour image's size")
-        return None
-    return image

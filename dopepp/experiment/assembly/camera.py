@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.experiment.assembly.sources import labelled_images
 from dopepp.experiment.config.data import LensConfig
 from dopepp.experiment.config.run import RunConfig
@@ -66,7 +66,7 @@ def _with_camera_of_pictures(config: RunConfig, parts: Parts) -> RunConfig:
     ):
         return config
     source = labelled_images(data, parts, data.eval_seed, "test")
-    if not isinstance(source, BopSource):
+    if not isinstance(source, BopReader):
         return config
     (width, height), K, annotated = source.view()
     distance = virtual.working_distance or annotated

@@ -14,11 +14,11 @@ from typing import Final
 from dopepp.core.errors import UserError
 from dopepp.core.pool import available_cores
 from dopepp.data.datamodule import PoseDataModule
-from dopepp.data.formats.bop.source import BopSource
-from dopepp.data.formats.ndds.source import NddsSource
-from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.bop.reader import BopReader
+from dopepp.data.formats.ndds.reader import NddsReader
+from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.data.formats.ycb_video.frame import read_image_set
-from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource, WindowedSource
 from dopepp.data.sources.rendered import RenderedSource, Split
@@ -157,7 +157,7 @@ def synthetic_companions(
     image_set = data.image_sets["train"]
     if image_set is None or not read_image_set(data.root, image_set, "synthetic"):
         return None
-    return YcbVideoSource(
+    return YcbVideoReader(
         data.root, parts, image_set, "synthetic",
         backgrounds=backgrounds, seed=seed, read_depth=False,
     )  # fmt: skip
@@ -183,19 +183,19 @@ Opener = Callable[[DataConfig, Path, Parts, int, Split], DescribedSource]
 
 FORMATS: Final[dict[str, Opener]] = {
     # An image set of real frames, or the listed frames, the same for every split.
-    "ycb_video": lambda data, root, parts, seed, split: YcbVideoSource(
+    "ycb_video": lambda data, root, parts, seed, split: YcbVideoReader(
         root, parts, data.image_set(split) if data.frames is None else None,
         frames=data.frames, seed=seed, read_depth=split == "test",
     ),
-    "bop": lambda data, root, parts, seed, split: BopSource(
+    "bop": lambda data, root, parts, seed, split: BopReader(
         root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
         targets=data.targets if split == "test" else None, read_depth=split == "test",
     ),
-    "ndds": lambda data, root, parts, seed, split: NddsSource(
+    "ndds": lambda data, root, parts, seed, split: NddsReader(
         root / data.image_set(split), parts, part_of=share_of(data.image_sets, split),
         classes=data.classes, read_depth=split == "test",
     ),
-    "webdataset": lambda data, root, parts, seed, split: WebdatasetSource(
+    "webdataset": lambda data, root, parts, seed, split: WebdatasetReader(
         root, parts, data.image_set(split), part_of=share_of(data.image_sets, split),
         download_dir=data.download_dir, read_depth=split == "test",
     ),

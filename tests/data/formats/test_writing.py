@@ -23,14 +23,14 @@ def test_written_sets_are_clean(tmp_path, parts, samples, writer_class, write_se
 
 def test_data_sets_are_read_written_and_checked_without_torch(tmp_path):
     modules = (
-        "check", "formats.bop.source", "formats.bop.writer", "formats.ndds.source",
-        "formats.ndds.writer", "formats.ycb_video.source", "sources.hybrid", "sources.rendered",
+        "check", "formats.bop.reader", "formats.bop.writer", "formats.ndds.reader",
+        "formats.ndds.writer", "formats.ycb_video.reader", "sources.hybrid", "sources.rendered",
         "transforms.masking", "transforms.augment",
     )  # fmt: skip
     code = (
         f"import sys, {', '.join(f'dopepp.data.{name}' for name in modules)}\n"
         "import numpy as np\n"
-        "from dopepp.data.formats.webdataset.source import WebdatasetSource\n"
+        "from dopepp.data.formats.webdataset.reader import WebdatasetReader\n"
         "from dopepp.data.formats.webdataset.writer import WebdatasetWriter\n"
         "from dopepp.data.sample import Sample\n"
         "from dopepp.parts.catalogue import servoholder\n"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.data.sample import Instance, Sample
 from dopepp.data.transforms.shading import TOLERANCE, shade
 from dopepp.parts.mesh.read import ycb_part
@@ -194,6 +194,6 @@ def test_a_share_outside_0_to_1_is_refused(share):
 def test_real_frames_are_shaded_to_the_share(ycb_root):
     names = ["003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle"]
     parts = [ycb_part(ycb_root, name) for name in names]
-    sample = YcbVideoSource(ycb_root, parts, frames=["0050/000003"]).sample(0)
+    sample = YcbVideoReader(ycb_root, parts, frames=["0050/000003"]).sample(0)
     for shaded in shade(sample, SHARES, 17, 0):
         assert shaded.reached == pytest.approx((shaded.share,) * 3, abs=0.001)

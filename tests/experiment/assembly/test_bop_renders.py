@@ -10,8 +10,8 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.results import PoseResult, write_results
-from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sources.rendered import RenderedSource
 from dopepp.experiment.assembly.camera import fitted_to_camera
@@ -74,7 +74,7 @@ def test_renders_are_as_the_pictures_camera_sees_the_models(config, caplog):
     module = build_datamodule(chosen.data, parts, 0)
     names = [(split, info.name) for split, info in module.summary()]
     assert names == [("train", "virtual"), ("val", "virtual"), ("test", "bop/test")]
-    assert isinstance(module.test_source, BopSource)
+    assert isinstance(module.test_source, BopReader)
     assert module.test_source.sample(0).K[0, 0] == 210.0
     said = config("virtual.working_distance=[0.4,0.7]")
     assert fitted_to_camera(said, parts).data.virtual.working_distance == (0.4, 0.7)
@@ -173,7 +173,7 @@ def test_validation_is_on_renders_where_pictures_show_no_object(config, root, tm
 
 
 def test_true_poses_from_a_file_have_full_marks_in_every_score(call, root, tmp_path):
-    source = BopSource(root, bop_parts(root), "test", targets="auto")
+    source = BopReader(root, bop_parts(root), "test", targets="auto")
     numbers = {"red": 1, "blue": 2}
     rows = [
         PoseResult(0, index, numbers[one.label], 1.0, one.T_cam_obj)

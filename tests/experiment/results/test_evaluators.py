@@ -11,8 +11,8 @@ import pytest
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.results import PoseResult, read_results, write_results
-from dopepp.data.formats.bop.source import BopSource
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
@@ -47,7 +47,7 @@ def results(root: Path, offset: float = 0.0) -> list[PoseResult]:
     """Return the truth, moved along x, with scores and times."""
     parts = bop_parts(root)
     numbers = {part.name: number for number, part in enumerate(parts, 1)}
-    source = BopSource(root, parts, "train_pbr")
+    source = BopReader(root, parts, "train_pbr")
     poses = []
     for index in range(len(source)):
         for one in source.sample(index).instances:

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
-from dopepp.data.formats.bop.records import MM
+from dopepp.data.formats.bop import MM
 from dopepp.geometry.camera import Transform
 from dopepp.geometry.rotation import is_rotation
 
@@ -39,8 +39,12 @@ _FARTHEST: Final = 1e9
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
 """The median distance of objects from the camera: outside, t is hardly in millimetres."""
 
-_LARGEST_ENTRY: Final = 2.0
-"""No rotation has a number as large."""
+_COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
+_COLUMNS: Final = 18
+"""A line's number and its 17 numbers."""
+
+Row = Float[np.ndarray, "18"]
+Table = Float[np.ndarray, "rows 18"]
 
 _ID: Final = re.compile(r"\d{1,9}", re.ASCII)
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -73,11 +77,11 @@ def results_name(method: str, dataset: str, split: str) -> str:
 def write_results(path: Path, results: Sequence[PoseResult]) -> None:
     """Write a results file, whole, every number with all of its digits."""
     lines = [",".join(FIELDS)]
-    for one in results:
-        R = " ".join(repr(float(value)) for value in one.T_cam_obj[:3, :3].ravel())
-        t = " ".join(repr(float(value)) for value in one.T_cam_obj[:3, 3] * MM)
-        ids = f"{one.scene_id},{one.im_id},{one.obj_id}"
-        lines.append(f"{ids},{float(one.score)!r},{R},{t},{float(one.seconds)!r}")
+    for result in results:
+        R = " ".join(repr(float(value)) for value in result.T_cam_obj[:3, :3].ravel())
+        t = " ".join(repr(float(value)) for value in result.T_cam_obj[:3, 3] * MM)
+        ids = f"{result.scene_id},{result.im_id},{result.obj_id}"
+        lines.append(f"{ids},{float(result.score)!r},{R},{t},{float(result.seconds)!r}")
     write_whole(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -91,24 +95,23 @@ def read_results(path: Path, objects: Collection[int]) -> list[PoseResult]:
             another form, a number that is not finite or an unknown object; R is no rotation within
             1e-3; a line comes twice; or t is so small or large that it is not in millimetres.
     """
-    ids, values = array("q"), array("d")
+    values = array("d")
     for number, text in _lines(path):
-        place = f"{path}: line {number}"
-        ids.extend((number, *_row(text, place, objects, values)))
-        if len(ids) > 4 * MAX_ROWS:
-            raise _bad(f"{place}", f"at most {MAX_ROWS:,} poses", "split the file by scene")
-    table = np.array(ids, np.int64).reshape(-1, 4)
-    rows = np.array(values, np.float64).reshape(-1, 14)
-    _check_repeats(path, table, rows)
-    _check_unit(path, table[:, 0], rows[:, 10:13])
-    return [_result(key, row) for key, row in zip(table[:, 1:].tolist(), rows, strict=True)]
+        where = f"{path}: line {number}"
+        values.extend((number, *_row(text, where, objects)))
+        if len(values) > _COLUMNS * MAX_ROWS:
+            raise _bad(where, f"at most {MAX_ROWS:,} poses", "split the file by scene")
+    table = np.array(values, np.float64).reshape(-1, _COLUMNS)
+    _check_repeats(path, table)
+    _check_unit(path, table)
+    return [_result(row) for row in table]
 
 
-def _result(key: list[int], row: Float[np.ndarray, "14"]) -> PoseResult:
+def _result(row: Row) -> PoseResult:
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = row[1:10].reshape(3, 3), row[10:13] / MM
-    scene_id, im_id, obj_id = key
-    return PoseResult(scene_id, im_id, obj_id, float(row[0]), T, float(row[13]))
+    T[:3, :3], T[:3, 3] = row[5:14].reshape(3, 3), row[14:17] / MM
+    scene_id, im_id, obj_id = map(int, row[1:4])
+    return PoseResult(scene_id, im_id, obj_id, float(row[4]), T, float(row[17]))
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -134,77 +137,71 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise _bad(f"{path}, which is empty", allowed)
 
 
-def _row(text: str, place: str, objects: Collection[int], values: array[float]) -> tuple[int, ...]:
-    """Append score, R, t and time to the values and return the three numbers before them."""
+def _row(text: str, where: str, objects: Collection[int]) -> list[float]:
+    """Return the 17 numbers of a line."""
     fields = [field.strip() for field in text.split(",")]
     if len(fields) != len(FIELDS):
-        raise _bad(f"{place} with {len(fields)} fields", f"7: {','.join(FIELDS)}")
-    ids = []
-    for name, field in zip(FIELDS, fields[:3], strict=False):
-        if not _ID.fullmatch(field):
-            raise _bad(f"{place}: {name} {field!r:.40}", "a whole number 0 – 999999999")
-        ids.append(int(field))
-    if ids[2] not in objects:
-        known = ", ".join(map(str, sorted(objects)))
-        raise _bad(f"{place}: obj_id {ids[2]}", f"the data set's objects: {known:.400}")
-    for name, field, count in zip(FIELDS[3:], fields[3:], (1, 9, 3, 1), strict=True):
-        numbers = _numbers(field, count, f"{place}: {name}")
-        _check(name, numbers, place, field)
-        values.extend(numbers)
-    return tuple(ids)
+        raise _bad(f"{where} with {len(fields)} fields", f"7: {','.join(FIELDS)}")
+    numbers: list[float] = []
+    for name, field in zip(FIELDS, fields, strict=True):
+        if not name.endswith("_id"):
+            numbers += _numbers(name, field, where)
+        elif _ID.fullmatch(field):
+            numbers.append(int(field))
+        else:
+            raise _bad(f"{where}: {name} {field!r:.40}", "a whole number 0 – 999999999")
+        if name == "obj_id" and numbers[-1] not in objects:
+            known = ", ".join(map(str, sorted(objects)))
+            raise _bad(f"{where}: obj_id {field}", f"the data set's objects: {known:.400}")
+    return numbers
 
 
-def _numbers(field: str, count: int, where: str) -> list[float]:
-    words = field.split()
+def _numbers(name: str, field: str, where: str) -> list[float]:
+    """Return the numbers of a field after checking their count and values."""
+    words, count = field.split(), _COUNTS[name]
     if len(words) != count:
         noun = "number" if count == 1 else "numbers between spaces"
-        raise _bad(f"{where} with {len(words)}: {field!r:.60}", f"{count} {noun}")
+        raise _bad(f"{where}: {name} with {len(words)}: {field!r:.60}", f"{count} {noun}")
     for word in words:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise _bad(f"{where}: {word!r:.40}", "finite numbers")
-    return [float(word) for word in words]
-
-
-def _check(name: str, numbers: list[float], place: str, field: str) -> None:
-    where = f"{place}: {name} {field!r:.90}"
+            raise _bad(f"{where}: {name}: {word!r:.40}", "finite numbers")
+    numbers = [float(word) for word in words]
+    largest, allowed = max(map(abs, numbers)), ""
     # Bounded before it is squared: numbers like 1e200 overflow.
-    if name == "R" and not (
-        max(map(abs, numbers)) < _LARGEST_ENTRY and is_rotation(np.array(numbers).reshape(3, 3))
-    ):
-        raise _bad(where, "a rotation matrix within 1e-3, row by row")
-    if name == "t" and max(map(abs, numbers)) > _FARTHEST:
-        raise _bad(where, "millimetres")
-    if name == "time" and numbers[0] < 0 and numbers[0] != UNKNOWN_TIME:
-        raise _bad(where, "seconds, or -1 where unknown")
+    if name == "R" and not (largest < 2 and is_rotation(np.array(numbers).reshape(3, 3))):
+        allowed = "a rotation matrix within 1e-3, row by row"
+    elif name == "t" and largest > _FARTHEST:
+        allowed = "millimetres"
+    elif name == "time" and numbers[0] < 0 and numbers[0] != UNKNOWN_TIME:
+        allowed = "seconds, or -1 where unknown"
+    if allowed:
+        raise _bad(f"{where}: {name} {field!r:.90}", allowed)
+    return numbers
 
 
-def _check_repeats(
-    path: Path, table: Int[np.ndarray, "rows 4"], rows: Float[np.ndarray, "rows 14"]
-) -> None:
+def _check_repeats(path: Path, table: Table) -> None:
     """Refuse the same pose of the same object twice; time may differ."""
-    keys = np.column_stack([table[:, 1:], rows[:, :13]])
+    keys = table[:, 1:17]
     order = np.lexsort(keys.T[::-1])  # stable: of equal rows the earlier line stands first
     same = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
     if same.any():
         first, second = table[order[:-1][same][0], 0], table[order[1:][same][0], 0]
         raise _bad(
-            f"{path}: line {second}, which repeats line {first}", "each pose once",
+            f"{path}: line {second:.0f}, which repeats line {first:.0f}", "each pose once",
             "remove one: the second would count as a false positive",
         )  # fmt: skip
 
 
-def _check_unit(
-    path: Path, numbers: Int[np.ndarray, "rows"], t: Float[np.ndarray, "rows 3"]
-) -> None:
-    if not len(t):
+def _check_unit(path: Path, table: Table) -> None:
+    if not len(table):
         return
-    distances = np.linalg.norm(t, axis=1)
+    distances = np.linalg.norm(table[:, 14:17], axis=1)
     middle = int(np.argsort(distances, kind="stable")[len(distances) // 2])
     low, high = _PLAUSIBLE_MM
     if not low <= distances[middle] <= high:
         raise _bad(
-            f"{path}: line {numbers[middle]}: t of length {distances[middle]:.4g}, half of all "
-            f"lines have {'less' if distances[middle] < low else 'more'}",
+            f"{path}: line {table[middle, 0]:.0f}: t of length {distances[middle]:.4g}, half of "
+            f"all lines have {'less' if distances[middle] < low else 'more'}",
             f"millimetres: a median of {low:g} – {high:g}",
             "multiply t by 1000 if it is in metres; otherwise correct its unit",
         )

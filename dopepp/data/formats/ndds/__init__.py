@@ -1,1 +1,318 @@
-"""NDDS and FAT: JSON annotations beside images."""
+"""The files of an NDDS or FAT data set: which belong together, and what they hold.
+
+An item is ``STEM.json`` with its image ``STEM.png`` or ``STEM.jpg`` beside it; ``STEM`` is
+``000000`` (NDDS) or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
+``_object_settings.json`` and ``_camera_settings.json``; if not, those of the data set's folder
+count. Formats: the readme of the Falling Things data set (Tremblay et al., 2018).
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from dopepp.data.formats.images import one_channel, read_map
+from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
+from dopepp.drawing.pictures import DepthMap, Shape, read_image
+from dopepp.geometry.camera import CameraMatrix, camera_matrix
+from dopepp.geometry.rotation import Vector
+
+MAX_ITEM_BYTES: Final = 16_000_000
+"""Of one image's annotation; a hundred objects take 0.5 MB."""
+
+_NORM_TOLERANCE: Final = 0.1
+"""Of a quaternion's norm from 1."""
+
+Objects = list[tuple[Place, Mapping[str, Any], str]]
+"""(place, object, class) of every object of an annotation."""
+
+
+@dataclass(frozen=True)
+class NddsObject:
+    """One object as an annotation states it, units and orders still unknown; NaN where damaged.
+
+    Attributes:
+        quaternion: The four numbers under ``quaternion_xyzw``, in whatever order.
+        corners_px: ``projected_cuboid`` without its centroid; None where it is not given.
+        cuboid: The same corners in space; None where they are not given.
+        centroid: ``cuboid_centroid`` or, without one, the mean of ``cuboid``; None without both.
+        visibility: In [0, 1], or −1 for unknown; None where it is not given.
+    """
+
+    place: Place
+    label: str
+    location: Vector
+    quaternion: Float[np.ndarray, "4"]
+    corners_px: Float[np.ndarray, "8 2"] | None
+    cuboid: Float[np.ndarray, "8 3"] | None
+    centroid: Vector | None
+    visibility: float | None
+
+
+def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
+    """Read an annotation or a settings file, None where that is impossible."""
+    return Place(problems, path).load(max_bytes=MAX_ITEM_BYTES)
+
+
+def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
+    """Return the objects of an annotation; each needs a class."""
+    found: Objects = []
+    place = Place(problems, path, "objects")
+    for number, item in enumerate(place.entries(record.get("objects"))):
+        label = item.get("class")
+        if not isinstance(label, str):
+            place[number]["class"].report(f"{label!r:.60}", "a name")
+        found.append((place[number], item, label if isinstance(label, str) else ""))
+    return found
+
+
+def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
+    """Read the fields of one object; it needs a location and a quaternion."""
+
+    def take(name: str, *shape: int) -> NDArray[np.float64]:
+        return place[name].numbers(item.get(name), *shape)
+
+    quaternion = take("quaternion_xyzw", 4)
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > _NORM_TOLERANCE:
+        place["quaternion_xyzw"].report(f"no rotation: norm {norm:.4g}", "a quaternion of norm 1")
+        quaternion = np.full(4, np.nan)
+    corners_px, cuboid = (
+        # A writer may have appended the centroid as the ninth point.
+        take(name, 9 if isinstance(item[name], list) and len(item[name]) == 9 else 8, axes)[:8]
+        if item.get(name) not in (None, [])
+        else None
+        for name, axes in (("projected_cuboid", 2), ("cuboid", 3))
+    )
+    centroid = None if cuboid is None else cuboid.mean(axis=0)
+    if item.get("cuboid_centroid") is not None:
+        centroid = take("cuboid_centroid", 3)
+    visibility = None if item.get("visibility") is None else float(take("visibility", 1)[0])
+    if visibility is not None and (visibility > 1 or (visibility < 0 and visibility != -1)):
+        place["visibility"].report(f"{visibility:g}", "0 … 1, or −1 for unknown")
+        visibility = None
+    return NddsObject(
+        place,
+        str(item.get("class", "")),
+        take("location", 3),
+        quaternion,
+        corners_px,
+        cuboid,
+        centroid,
+        visibility,
+    )
+
+
+def stated(record: Mapping[str, Any], name: str) -> object:
+    """Return what an annotation states about itself (our writer's ``conventions``), else None."""
+    return mapping(record.get("conventions")).get(name)
+
+
+def has_own_ids(record: Mapping[str, Any]) -> bool:
+    """Tell whether an annotation states that labels in ``.seg.png`` are objects', not classes'."""
+    return stated(record, "segmentation") == "segmentation_id"
+
+
+OBJECT_SETTINGS: Final = "_object_settings.json"
+CAMERA_SETTINGS: Final = "_camera_settings.json"
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+
+
+def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the annotations that have an image and those that have none, sorted.
+
+    Settings (``_*.json``) and hidden files are none.
+    """
+    with_image: list[Path] = []
+    without: list[Path] = []
+    for parent, folders, names in os.walk(folder):
+        folders.sort()
+        present = set(names)
+        for name in sorted(present):
+            if name.endswith(".json") and not name.startswith(("_", ".")):
+                stem = name.removesuffix(".json")
+                found = any(stem + suffix in present for suffix in IMAGE_SUFFIXES)
+                (with_image if found else without).append(Path(parent, name))
+    return with_image, without
+
+
+def companion(annotation: Path, suffix: str) -> Path:
+    """Return a file beside an annotation: its stem with a suffix such as ``.seg.png``."""
+    return annotation.with_name(annotation.name.removesuffix(".json") + suffix)
+
+
+def image_of(annotation: Path) -> Path | None:
+    """Return an annotation's image, None where there is none."""
+    paths = [companion(annotation, suffix) for suffix in IMAGE_SUFFIXES]
+    return next((path for path in paths if path.is_file()), None)
+
+
+class Settings:
+    """The settings files of a data set, each read once and only when it is needed."""
+
+    def __init__(self, root: Path, problems: Problems = STRICT) -> None:
+        self._root, self._problems = root, problems
+        self._files: dict[Path, Mapping[str, Any] | None] = {}
+
+    def read(self, path: Path) -> Mapping[str, Any] | None:
+        """Return what a settings file holds, None where there is none or it is damaged."""
+        if path not in self._files:
+            is_there = path.is_file()
+            self._files[path] = read_record(path, self._problems) if is_there else None
+        return self._files[path]
+
+    def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
+        """Return the settings of the annotation's folder or else of the data set's, or nothing."""
+        for path in self._places(annotation, name):
+            content = self.read(path)
+            if content is not None:
+                return path, content
+        return annotation.with_name(name), {}
+
+    def _places(self, annotation: Path, name: str) -> tuple[Path, Path]:
+        return annotation.with_name(name), self._root / name
+
+    def camera(
+        self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
+    ) -> CameraMatrix:
+        """Return K: the annotation's own ``camera_data.intrinsics`` or the camera settings'.
+
+        Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
+        and ``right``). It is a problem (and NaN) if neither file has them, or if it is unclear
+        which camera's they are.
+        """
+        place = Place(problems, annotation, "camera_data.intrinsics")
+        own = mapping(record.get("camera_data")).get("intrinsics")
+        if isinstance(own, dict):
+            return _intrinsics(own, place)
+        path, settings = self._of(annotation, CAMERA_SETTINGS)
+        side = annotation.name.removesuffix(".json").rpartition(".")[2]
+        cameras = list(_entries(settings, "camera_settings"))
+        cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
+        if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
+            there = Place(problems, path, "camera_settings[].intrinsic_settings")
+            return _intrinsics(cameras[0]["intrinsic_settings"], there)
+        # A settings file that cannot be read is one problem, not one for every image.
+        places = self._places(annotation, CAMERA_SETTINGS)
+        if not any(place.is_file() and self.read(place) is None for place in places):
+            allowed = f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in "
+            place.report(f"{len(cameras)} cameras' to take", allowed + path.name)
+        return np.full((3, 3), np.nan)
+
+    def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
+        """Return a class's ``fixed_model_transform`` as a rigid 4×4 matrix for column vectors.
+
+        It maps the mesh into the object frame. The file holds the transpose, scaled by the mesh's
+        unit over the file's (100 for metres and centimetres); the translation is in the file's
+        unit. None where there is none, or nothing that is a rotation, a scale and a translation.
+        """
+        for stored in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
+            matrix = stored.T
+            linear = matrix[:3, :3]
+            scale = float(np.cbrt(np.linalg.det(linear)))
+            if scale > 0 and np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-2:
+                matrix[:3, :3] = linear / scale
+                return matrix
+        return None
+
+    def dimensions(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
+        """Return a class's ``cuboid_dimensions`` (x, y, z), file's unit; None where not usable."""
+        for sides in self._arrays(annotation, label, "cuboid_dimensions", 3):
+            if np.isfinite(sides).all() and (sides >= 0).all() and sides.any():
+                return sides
+        return None
+
+    def class_id(self, annotation: Path, label: str) -> int | None:
+        """Return a class's ``segmentation_class_id``, the value of its pixels in ``.seg.png``."""
+        ids = [entry.get("segmentation_class_id") for entry in self._objects(annotation, label)]
+        return next((value for value in ids if isinstance(value, int) and value > 0), None)
+
+    def classes(self, annotation: Path) -> set[str] | None:
+        """Return the names of the exported classes, None where no settings name them."""
+        listed = self._of(annotation, OBJECT_SETTINGS)[1].get("exported_object_classes")
+        return {str(name) for name in listed} if isinstance(listed, list) else None
+
+    def _arrays(
+        self, annotation: Path, label: str, name: str, *shape: int
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield a field of a class's entries, where it has such numbers."""
+        for entry in self._objects(annotation, label):
+            with suppress(KeyError, TypeError, ValueError, OverflowError):
+                yield np.array(entry[name], np.float64).reshape(shape)
+
+    def _objects(self, annotation: Path, label: str) -> Iterator[Mapping[str, Any]]:
+        settings = self._of(annotation, OBJECT_SETTINGS)[1]
+        for entry in _entries(settings, "exported_objects"):
+            if entry.get("class") == label:
+                yield entry
+
+
+def _entries(settings: Mapping[str, Any], name: str) -> Iterator[dict[str, Any]]:
+    listed = settings.get(name)
+    rows = listed if isinstance(listed, list) else []
+    return (entry for entry in rows if isinstance(entry, dict))
+
+
+def _intrinsics(values: Mapping[str, Any], place: Place) -> CameraMatrix:
+    """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
+    return camera_matrix(*place.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
+
+
+DEPTH_UNIT: Final = 0.0001
+"""Metres per value of a 16-bit ``.depth.png``: FAT's unit, and what we write; 0 is unknown."""
+
+
+def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
+    """Read depth in metres along z, or None where there is none or its unit is not known.
+
+    The unit is known where the annotation states it, or from FAT's naming. ``shape`` is the
+    image's (height, width).
+    """
+    unit = stated(record, "depth_unit_m")
+    if unit is None and annotation.name.endswith((".left.json", ".right.json")):
+        unit = DEPTH_UNIT
+    path = companion(annotation, ".depth.png")
+    if not isinstance(unit, (int, float)) or not 0 < unit <= 1 or not path.is_file():
+        return None
+    values = read_map(Place(STRICT, path), shape)
+    assert values is not None
+    return values.astype(np.float32) * np.float32(unit)
+
+
+def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
+    """Read ``STEM.seg.png``; None where there is none, or colours, which no file explains."""
+    path = companion(annotation, ".seg.png")
+    image = read_image(path) if path.is_file() else None
+    return (
+        None if image is None or image.ndim > 2 else one_channel(Place(STRICT, path), image, shape)
+    )
+
+
+def label_values(
+    objects: Objects, own_ids: bool, annotation: Path, settings: Settings
+) -> dict[str, int | None]:
+    """Return the value of each object's pixels in ``STEM.seg.png``, by where the object stands.
+
+    None where it is unknown or not only this object's. Unless the labels are known to be
+    ``segmentation_id`` (``own_ids``), an object without one may have its class's.
+    """
+    ids = [item.get("segmentation_id") for _, item, _ in objects]
+    own = [value if isinstance(value, int) and value > 0 else None for value in ids]
+    of_class = [settings.class_id(annotation, label) for _, _, label in objects]
+    counts, class_counts = Counter(own), Counter(of_class)
+    values: dict[str, int | None] = {}
+    for (place, _, _), value, class_id in zip(objects, own, of_class, strict=True):
+        is_alone = counts[value] == 1
+        if value is None and not own_ids:
+            value, is_alone = class_id, class_counts[class_id] == 1
+        values[place.where] = value if is_alone else None
+    return values

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ndds.files import NddsObject
+from dopepp.data.formats.ndds import NddsObject
 from dopepp.geometry.camera import CameraMatrix, Transform, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import RotationMatrix, quaternion_to_matrix

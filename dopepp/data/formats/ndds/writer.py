@@ -29,9 +29,9 @@ from jaxtyping import Float, Integer
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.json import read_json
-from dopepp.data.formats.bop.images import encode_png
-from dopepp.data.formats.ndds.files import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
-from dopepp.data.formats.tolerances import Box
+from dopepp.data.formats.images import encode_png
+from dopepp.data.formats.invariants import Box
+from dopepp.data.formats.ndds import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, transform

@@ -1,1 +1,198 @@
-"""BOP-WebDataset: tar shards of which any image can be read at random."""
+"""BOP-WebDataset: tar shards of ``KEY.rgb.jpg``, ``KEY.gt.json``, … and where each member lies.
+
+Only headers are read, so any image can be read without those before it. A shard comes from a
+stranger: names that lead out of it, links, holes, members that are too large or cut off, and names
+that come twice are refused.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from dopepp.core.errors import UserError
+from dopepp.data.archive import Bounded
+from dopepp.data.formats.problems import STRICT, Place, Problems
+
+FIELDS: Final = ("image", "depth", "camera", "gt", "gt_info", "mask_visib")
+"""What is read of an image."""
+
+MAX_MEMBER_BYTES: Final = 256_000_000
+MAX_MEMBERS: Final = 1_000_000
+"""Of a shard; one of BOP's has 1,000 images of seven members each."""
+
+KEY_FILE: Final = "key_to_shard.json"
+"""Beside the shards: in which of them a key is."""
+
+_IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
+_DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
+_ALLOWED: Final = (
+    f"a whole uncompressed tar of plain files KEY.EXTENSION, each once and of at most "
+    f"{MAX_MEMBER_BYTES / 1e6:.0f} MB, with rgb (or gray) and camera.json for every key"
+)
+
+
+class TarMember(NamedTuple):
+    """A file in a shard: ``KEY.EXTENSION``, its first byte and its size."""
+
+    key: str
+    extension: str
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True)
+class ShardIndex:
+    """The images of a shard, in its order.
+
+    ``spans`` has first byte and size of every image's :data:`FIELDS`, −1 where it has none.
+    """
+
+    path: Path
+    keys: list[str]
+    spans: Int64[np.ndarray, "images 6 2"]
+
+    def read(self, image: int, field: str) -> bytes | None:
+        """Return a member's content; None where the image has none."""
+        offset, size = self.spans[image, FIELDS.index(field)].tolist()
+        return None if offset < 0 else read_span(self.path, offset, size)
+
+
+def read_span(path: Path, offset: int, size: int) -> bytes:
+    """Return a part of a file; a UserError where it has become shorter or has gone."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            content = file.read(size)
+    except OSError as error:
+        raise _gone(path, str(error.strerror)) from error
+    if len(content) < size:
+        raise _gone(path, f"cut short within the member at byte {offset}")
+    return content
+
+
+def _gone(path: Path, got: str) -> UserError:
+    return UserError(f"shard {path}: {got}", _ALLOWED, "copy, unzip or download the shard again")
+
+
+def index_shard(path: Path) -> ShardIndex:
+    """Find a shard's images.
+
+    A UserError: the archive is refused (see :func:`members`), or an image lacks its picture or its
+    camera, or has one of them twice.
+    """
+    place = Place(STRICT, path, "archive")
+    rows: dict[str, int] = {}
+    found: list[tuple[int, int, int, int]] = []
+    for member in members(path):
+        field = field_of(member.extension)
+        if field is not None:
+            row = rows.setdefault(member.key, len(rows))
+            found.append((row, FIELDS.index(field), member.offset, member.size))
+    spans = np.full((len(rows), len(FIELDS), 2), -1, np.int64)
+    table = np.array(found, np.int64).reshape(-1, 4)
+    spans[table[:, 0], table[:, 1]] = table[:, 2:]
+    keys = list(rows)
+    filled = np.bincount(table[:, 0] * len(FIELDS) + table[:, 1], minlength=spans[..., 0].size)
+    for slot in np.flatnonzero(filled > 1).tolist():
+        key, field = keys[slot // len(FIELDS)], FIELDS[slot % len(FIELDS)]
+        place.report(f"{key} with two members for its {field}", _ALLOWED)
+    for name in ("image", "camera"):
+        for row in np.flatnonzero(spans[:, FIELDS.index(name), 0] < 0).tolist():
+            got = f"{keys[row]} without {'rgb or gray' if name == 'image' else name}"
+            place.report(got, _ALLOWED)
+    return ShardIndex(path, keys, spans)
+
+
+def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
+    """Yield the files of a shard; folders and WebDataset's own ``__meta__`` are passed over.
+
+    What cannot be taken is a problem and passed over: an archive that is compressed, cut short or
+    damaged, and a member that is no plain file, leads out of the archive, has no extension, comes
+    twice or is too large.
+    """
+    place = Place(problems, path, "archive")
+    try:
+        with path.open("rb") as file:
+            if file.read(2) == b"\x1f\x8b":
+                place.report("a compressed archive, in which no member can be found", _ALLOWED)
+                return
+            size = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            yield from _walk(place, file, size)
+    except UserError:
+        raise
+    except OSError as error:
+        place.report(str(error.strerror or error), _ALLOWED)
+    except (tarfile.TarError, ValueError, OverflowError) as error:
+        place.report(f"damaged: {error}", _ALLOWED)
+
+
+def _walk(place: Place, file: io.BufferedReader, size: int) -> Iterator[TarMember]:
+    names: set[str] = set()
+    with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
+        while (info := archive.next()) is not None:
+            archive.members = []  # type: ignore[attr-defined]  # it keeps every header it has read
+            if _is_passed_over(info):
+                continue
+            if len(names) == MAX_MEMBERS:
+                place.report(f"over {MAX_MEMBERS:,} members", _ALLOWED)
+                return
+            got = "twice" if info.name in names else _refusal(info, size)
+            if got:
+                place.report(f"member {info.name!r:.80} {got}", _ALLOWED)
+                continue
+            names.add(info.name)
+            name = PurePosixPath(info.name)
+            key, _, extension = name.name.partition(".")
+            start = str(name.with_name(key))
+            yield TarMember(start, extension.lower(), info.offset_data, info.size)
+        end = archive.offset
+    # tarfile takes a damaged header after the first, and the end of the file, for the archive's.
+    file.seek(end)
+    if file.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+        place.report(f"cut short or damaged at byte {end}", _ALLOWED)
+
+
+def _is_passed_over(info: tarfile.TarInfo) -> bool:
+    name = PurePosixPath(info.name).name
+    is_meta = name.startswith("__") and name.endswith("__")
+    return (info.isdir() or is_meta) and not _leads_out(info)
+
+
+def _leads_out(info: tarfile.TarInfo) -> bool:
+    name = PurePosixPath(info.name)
+    odd = "\\" in info.name or not info.name.isprintable()
+    return name.is_absolute() or ".." in name.parts or odd
+
+
+def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
+    """Say why a member is not taken; nothing where it is."""
+    key, dot, _ = PurePosixPath(info.name).name.partition(".")
+    if _leads_out(info):
+        return "which leads out of the archive"
+    if not info.isreg() or info.issparse():
+        return "which is a link, a device or has holes"
+    if not 0 <= info.size <= MAX_MEMBER_BYTES:
+        return f"of {info.size / 1e6:,.0f} MB"
+    if info.offset_data + info.size > archive_size:
+        return "within which the archive is cut short"
+    return "" if key and dot else "which is no KEY.EXTENSION"
+
+
+def field_of(extension: str) -> str | None:
+    """Return which of :data:`FIELDS` a member's extension stands for, None for another."""
+    if _IMAGE.fullmatch(extension):
+        return "image"
+    if _DEPTH.fullmatch(extension):
+        return "depth"
+    field = extension.removesuffix(".json")
+    return field if field in FIELDS and field != extension else None

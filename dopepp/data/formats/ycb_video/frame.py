@@ -1,4 +1,4 @@
-"""YCB-Video's folder and the files of one frame: colour, label, depth and ``meta.mat``."""
+"""The files of YCB-Video: lists of classes and frames, and a frame's images and ``meta.mat``."""
 
 from __future__ import annotations
 
@@ -13,15 +13,11 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats.images import read_map, stated_shape
+from dopepp.data.formats.invariants import rotation_problem
 from dopepp.data.formats.problems import STRICT, Place, Problems
-from dopepp.data.formats.tolerances import rotation_problem
-from dopepp.drawing.pictures import read_image
-from dopepp.geometry.camera import (
-    CameraMatrix,
-    Transform,
-    camera_matrix,
-    make_transform,
-)
+from dopepp.drawing.pictures import Shape, read_image
+from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
 
 Subset = Literal["real", "synthetic"]
 FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
@@ -77,8 +73,8 @@ class FrameMeta:
 
     Attributes:
         poses: T_cam_obj of every object, by class index (from 1), metres; with NaN where damaged.
-        columns: Where each of them stands in the file's ``poses``.
-        K: Camera matrix in pixels, None where the file has none.
+        columns: Index of each object in the file's ``poses``.
+        K: Camera matrix in pixels; None where the file has none.
     """
 
     poses: Mapping[int, Transform]
@@ -90,8 +86,8 @@ class FrameMeta:
 def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
     """Read a ``meta.mat``.
 
-    A file that is missing, cut short or lacks a field, and a pose that is not finite, no rotation,
-    or behind the camera, is a problem.
+    Reported are a file that is missing, cut short or lacks a field, and a pose that is not finite,
+    no rotation, or behind the camera.
     """
     place = Place(problems, path)
     fields = _load(path, place["file"])
@@ -105,7 +101,6 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
         factor_depth = place["factor_depth"].scalar(fields["factor_depth"])
     if factor_depth <= 0:
         place["factor_depth"].report(f"{factor_depth:g}", "above 0")
-    K = fields.get("intrinsic_matrix")
     poses: dict[int, Transform] = {}
     columns: dict[int, int] = {}
     for column, (index, pose) in enumerate(_columns(place, fields)):
@@ -114,6 +109,7 @@ def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
             continue
         poses[index] = _pose(pose, place["poses"][column])
         columns[index] = column
+    K = fields.get("intrinsic_matrix")
     K = None if K is None else place["intrinsic_matrix"].numbers(K, 3, 3)
     return FrameMeta(poses, columns, K, factor_depth)
 
@@ -139,7 +135,7 @@ def _load(path: Path, place: Place) -> dict[str, NDArray[Any]] | None:
 
 
 def _is_complete(content: bytes) -> bool:
-    """Follow the MAT-5 elements (type, length, data): the last one must end where the file ends."""
+    """Tell whether the last MAT-5 element (type, length, data) ends where the file ends."""
     # SciPy reads a file that was cut off between or inside variables it is not asked for.
     start = _HEADER_BYTES
     order = "<" if content[126:128] == b"IM" else ">"
@@ -149,7 +145,7 @@ def _is_complete(content: bytes) -> bool:
 
 
 def _columns(place: Place, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
-    """Return each object's class index and 3×4 pose, none where the two fields do not match."""
+    """Return each object's class index and 3×4 pose; none where the two fields do not match."""
     if "cls_indexes" not in fields or "poses" not in fields:
         return []
     stored = np.asarray(fields["cls_indexes"])
@@ -177,16 +173,40 @@ def _pose(value: NDArray[Any], place: Place) -> Transform:
     return make_transform(pose[:, :3], pose[:, 3])
 
 
-_FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
-_CAMERAS: Final = (
-    camera_matrix(1066.778, 1067.487, 312.9869, 241.3109),
-    camera_matrix(1077.836, 1078.189, 323.7872, 279.6921),
-)
-"""The data set's two colour cameras: scenes 0000–0059 and data_syn, scenes 0060–0091."""
+@dataclass(frozen=True)
+class Frame:
+    """The files of a frame; None where one cannot be read.
+
+    Attributes:
+        image: RGB, with alpha in a synthetic frame.
+        shape: (height, width), also of a damaged image that states its size.
+        depth: Units of ``1 / factor_depth`` metres.
+        labels: Class index of every pixel, 0 elsewhere.
+    """
+
+    image: UInt8[np.ndarray, "height width channels"] | None
+    shape: Shape | None
+    meta: FrameMeta
+    depth: NDArray[Any] | None
+    labels: NDArray[Any] | None
 
 
-def read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
-    """Read a frame's picture as RGB, with alpha (a synthetic one's) or without."""
+def read_frame(
+    start: str, subset: Subset, problems: Problems = STRICT, read_depth: bool = True
+) -> Frame:
+    """Read the frame whose paths begin with ``start``, e.g. ``data/0000/000001``."""
+    colour, depth, label = (
+        Place(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
+    )
+    path = Path(colour.path)
+    image = colour["image"].attempt(lambda: _read_colour(path, alpha=subset == "synthetic"))
+    shape: Shape | None = stated_shape(path) if image is None else image.shape[:2]
+    meta = read_meta(Path(f"{start}-meta.mat"), problems)
+    units = read_map(depth, shape) if read_depth else None
+    return Frame(image, shape, meta, units, read_map(label, shape))
+
+
+def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
         raise UserError(
@@ -195,9 +215,3 @@ def read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width chan
             "copy or download the file again",
         )
     return image
-
-
-def camera_of(subset: Subset, frame: str) -> CameraMatrix:
-    """Return K of a frame whose ``meta.mat`` does not state it."""
-    scene = 0 if subset == "synthetic" else int(frame.partition("/")[0])
-    return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]

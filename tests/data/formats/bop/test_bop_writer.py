@@ -13,7 +13,7 @@ import trimesh
 from dopepp.core.errors import UserError
 from dopepp.data.formats import STAGING
 from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.source import BopSource
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.writer import BopWriter, make_labels
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
@@ -25,7 +25,7 @@ NUM_IMAGES = 4
 
 def test_round_trip(parts, samples, tmp_path, assert_read_back, write_set):
     write_set(BopWriter, tmp_path, parts, samples)
-    source = BopSource(tmp_path, bop_parts(tmp_path), "train_pbr")
+    source = BopReader(tmp_path, bop_parts(tmp_path), "train_pbr")
     assert len(source) == NUM_IMAGES
     assert sum(len(sample.instances) for sample in samples) > 2 * NUM_IMAGES
     for index, sample in enumerate(samples):

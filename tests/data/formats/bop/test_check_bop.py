@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.data.check import check_dataset
 from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.source import BopSource
-from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.bop.reader import BopReader
+from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
 
@@ -244,7 +244,7 @@ def test_every_damage_is_found_with_file_and_field(bop, name, spoilt, assert_fou
     cube = cuboid_keypoints(-SIDES / 2000, SIDES / 2000)
     parts = [Part(f"obj_{n:06d}", cube, 0.08, cube[:8]) for n in (1, 2)]
     expected = expected.replace("0.cam_K: K", "scene_camera.json: K ")
-    assert_refused(lambda: BopSource(bop, parts, "train_pbr"), f"{expected}: ")
+    assert_refused(lambda: BopReader(bop, parts, "train_pbr"), f"{expected}: ")
 
 
 INDEPENDENT = [
@@ -311,7 +311,7 @@ def test_what_is_rounded_is_taken_by_check_and_reader(bop, damage, spoilt):
     spoil(bop, spoilt, *damage)
     assert check_dataset(bop).lines()[:-1] == []
     parts = bop_parts(bop)
-    source = BopSource(bop, parts, "train_pbr")
+    source = BopReader(bop, parts, "train_pbr")
     fractions = [one.visible_fraction for one in source.sample(0).instances]
     assert all(0 < fraction <= 1 for fraction in fractions)
     turn = parts[0].symmetries_discrete[0, :3, :3]
@@ -321,14 +321,14 @@ def test_what_is_rounded_is_taken_by_check_and_reader(bop, damage, spoilt):
 def test_pictures_and_depth_are_one_image_by_their_number(bop):
     (bop / SCENE / "rgb" / "000001.png").rename(bop / SCENE / "rgb" / "1.png")
     assert check_dataset(bop).ok
-    np.testing.assert_allclose(BopSource(bop, bop_parts(bop), "train_pbr").sample(1).depth, 0.4)
+    np.testing.assert_allclose(BopReader(bop, bop_parts(bop), "train_pbr").sample(1).depth, 0.4)
 
 
 def test_an_empty_folder_of_depth_is_none(bop):
     for path in (bop / SCENE / "depth").iterdir():
         path.unlink()
     assert check_dataset(bop).ok
-    assert BopSource(bop, bop_parts(bop), "train_pbr").sample(0).depth is None
+    assert BopReader(bop, bop_parts(bop), "train_pbr").sample(0).depth is None
 
 
 def test_a_scene_that_no_reader_finds_is_a_defect(bop, assert_found):
@@ -407,7 +407,7 @@ def test_shards_may_state_no_visible_fraction(shards, stated, spoilt, write_shar
     report = check_dataset(shards)
     assert report.ok, report.lines()
     assert any("2 objects without visib_fract" in note for note in report.notes)
-    source = WebdatasetSource(shards, bop_parts(shards), "train_pbr")
+    source = WebdatasetReader(shards, bop_parts(shards), "train_pbr")
     assert all(0 < one.visible_fraction <= 1 for one in source.sample(0).instances)
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.data.check import check_dataset
-from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
@@ -204,7 +204,7 @@ def test_every_damage_is_found_with_file_and_field(
     spoil(ndds, spoilt, *damage)
     assert_found(ndds, expected)
     if name in REFUSED:
-        assert_refused(lambda: NddsSource(ndds, PARTS), expected)
+        assert_refused(lambda: NddsReader(ndds, PARTS), expected)
 
 
 def test_one_defect_hides_no_other(ndds, spoilt, assert_found):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ndds.source import NddsSource
+from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
@@ -70,13 +70,13 @@ def written(tmp_path, write_set):
 
 def test_round_trip(written, assert_read_back):
     root, samples = written
-    source = NddsSource(root, [BOX, CUBE])
+    source = NddsReader(root, [BOX, CUBE])
     assert len(source) == 4
     for index, sample in enumerate(samples):
         back = source.sample(index, epoch=7)
         assert_read_back(back, sample)
         assert (back.key, back.source) == (f"{index:06d}", "ndds/set")
-    parts = [NddsSource(root, [BOX, CUBE], part_of=part) for part in ((0, 0.75), (0.75, 1))]
+    parts = [NddsReader(root, [BOX, CUBE], part_of=part) for part in ((0, 0.75), (0.75, 1))]
     assert parts[0].items + parts[1].items == source.items
     assert parts[0].describe()[0].identity["items"] != parts[1].describe()[0].identity["items"]
 
@@ -154,7 +154,7 @@ def test_samples_without_masks_depth_or_instances(tmp_path, write_set):
     bare, empty = make_sample(0, (BOX,)), make_sample(1, ())
     bare.depth, bare.instances[0].mask = None, None
     write_set(NddsWriter, tmp_path, [BOX], [bare, empty])
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     assert source.sample(0).depth is None
     assert source.sample(0).instances[0].mask is None
     assert source.sample(1).instances == []
@@ -168,7 +168,7 @@ def test_corner_behind_the_camera_survives(tmp_path, write_set):
     assert np.isnan(sample.instances[0].keypoints).any()
     others = [make_sample(index, (BOX,)) for index in (1, 2)]
     write_set(NddsWriter, tmp_path, [BOX], [sample, *others])
-    back = NddsSource(tmp_path, [BOX]).sample(0).instances[0]
+    back = NddsReader(tmp_path, [BOX]).sample(0).instances[0]
     np.testing.assert_allclose(back.T_cam_obj, T, atol=1e-12)
     np.testing.assert_allclose(back.keypoints, sample.instances[0].keypoints, atol=1e-6)
 
@@ -265,7 +265,7 @@ class Wild:
         (self.root / "_camera_settings.json").write_text(json.dumps({"camera_settings": cameras}))
 
 
-def assert_read(wild: Wild, source: NddsSource, atol: float = 1e-6) -> None:
+def assert_read(wild: Wild, source: NddsReader, atol: float = 1e-6) -> None:
     for index in range(len(source)):
         sample = source.sample(index)
         for instance, T in zip(sample.instances, wild.poses[sample.key], strict=True):
@@ -301,7 +301,7 @@ def test_every_habit_is_found(tmp_path, order, unit, habits, frame, caplog):
     if "fixed" in habits:
         wild.settings("box", "cube")
     with caplog.at_level(logging.INFO):
-        source = NddsSource(tmp_path, [BOX, CUBE])
+        source = NddsReader(tmp_path, [BOX, CUBE])
     assert_read(wild, source)
     found = source.finding.convention
     expected = (order, unit, "opengl" if habits.get("opengl") else "opencv", frame)
@@ -317,7 +317,7 @@ def test_a_single_instance_is_enough(tmp_path_factory, seed, order):
     wild = Wild(tmp_path_factory.mktemp("one"), order=order)
     wild.rng = np.random.default_rng(seed)
     wild.item(0, CUBE)
-    assert_read(wild, NddsSource(wild.root, [CUBE]))
+    assert_read(wild, NddsReader(wild.root, [CUBE]))
 
 
 def test_falling_things(tmp_path):
@@ -335,7 +335,7 @@ def test_falling_things(tmp_path):
         cv2.imwrite(str(wild.root / f"{stem}.depth.png"), np.full_like(seg, 5000, np.uint16))
     wild.settings("box_16k")
     wild.cameras("left", "right")
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     sample = source.sample(1)
     (instance,) = sample.instances
     assert (sample.key, instance.label) == ("mixed/kitchen_0/000001.left", "box")
@@ -343,7 +343,7 @@ def test_falling_things(tmp_path):
     assert instance.mask.sum() == 40 * 60
     assert instance.visible_fraction == pytest.approx(0.75)
     np.testing.assert_allclose(sample.depth, 0.5)
-    assert NddsSource(tmp_path, [BOX], read_depth=False).sample(0).depth is None
+    assert NddsReader(tmp_path, [BOX], read_depth=False).sample(0).depth is None
 
 
 def test_models_moved_to_their_centre(tmp_path):
@@ -352,7 +352,7 @@ def test_models_moved_to_their_centre(tmp_path):
     centre[:3, 3] = -BOX.cuboid[8]
     wild = Wild(tmp_path, fixed=centre, unit="m")
     wild.items(4, BOX)
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     assert source.finding.convention.frame == "centred"
     assert_read(wild, source)
 
@@ -360,7 +360,7 @@ def test_models_moved_to_their_centre(tmp_path):
 def test_noise_in_the_projections(tmp_path):
     wild = Wild(tmp_path, order="wxyz", noise=1.5)
     wild.items(20, BOX, CUBE)
-    source = NddsSource(tmp_path, [BOX, CUBE])
+    source = NddsReader(tmp_path, [BOX, CUBE])
     assert source.finding.convention.quaternion == "wxyz"
     assert 0.5 < source.finding.error_px < 3
     assert_read(wild, source)
@@ -371,7 +371,7 @@ def test_orders_that_cannot_be_told_apart_are_said(tmp_path):
     T[:3, :3] = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
     T[:3, 3] = [0.01, 0.0, 0.4]
     wild.item(0, BOX, pose=T)
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     assert_read(wild, source)
     assert "the same poses so far with: quaternion w,x,y,z" in str(source.finding)
 
@@ -385,7 +385,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
 def test_an_item_that_contradicts_the_others(tmp_path):
     paths = Wild(tmp_path).items(12, BOX)
     edit(paths[7], lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     source.sample(6)
     with pytest.raises(UserError, match=r"000007\.json: objects\[0\]\.projected_cuboid: .* px"):
         source.sample(7)
@@ -395,14 +395,14 @@ def test_no_convention_fits(tmp_path):
     Wild(tmp_path).items(4, BOX)
     inch = make_box("box", (0.2, 0.127, 0.076), (0.025, -0.05, 0.0127))
     with pytest.raises(UserError, match=r"no known convention fits.* px: quaternion .*, lengths"):
-        NddsSource(tmp_path, [inch])
+        NddsReader(tmp_path, [inch])
 
 
 def test_half_the_files_in_each_order(tmp_path):
     for path in Wild(tmp_path).items(8, BOX)[:4]:
         edit(path, lambda item: item["quaternion_xyzw"].insert(0, item["quaternion_xyzw"].pop()))
     with pytest.raises(UserError, match="convention"):
-        NddsSource(tmp_path, [BOX])
+        NddsReader(tmp_path, [BOX])
 
 
 def test_visible_fraction_of_a_truncated_object(tmp_path):
@@ -411,7 +411,7 @@ def test_visible_fraction_of_a_truncated_object(tmp_path):
         # The centre of the face towards the camera is on the left border.
         T[:3, 3] = [(-0.5 - 79.0) / 180 * 0.4 - BOX.cuboid[8, 0], 0, 0.4]
         wild.item(0, BOX, pose=T)
-        (instance,) = NddsSource(wild.root, [BOX]).sample(0).instances
+        (instance,) = NddsReader(wild.root, [BOX]).sample(0).instances
         expected = 0.5 * (0.5 if visibility == 0.5 else 1)
         assert instance.visible_fraction == pytest.approx(expected, abs=0.05)
 
@@ -424,7 +424,7 @@ def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path):
         item["visibility"] = 0
 
     edit(tmp_path / "000002.json", behind)
-    source = NddsSource(tmp_path, [BOX])
+    source = NddsReader(tmp_path, [BOX])
     (info,) = source.describe()
     assert info.num_instances == {"box": 2}
     assert info.identity["left out"] == {"box, behind the camera": 1, "cube": 3}
@@ -433,40 +433,40 @@ def test_other_classes_and_hidden_objects_are_left_out_and_counted(tmp_path):
     assert source.contains("box")
     assert not source.contains("cube")
     dice = make_box("dice", (0.06,) * 3, (0.0,) * 3)
-    renamed = NddsSource(tmp_path, [dice], classes={"cube": "dice"})
+    renamed = NddsReader(tmp_path, [dice], classes={"cube": "dice"})
     assert [i.label for i in renamed.sample(0).instances] == ["dice"]
     with pytest.raises(UserError, match=r"classes of the parts \['dice'\]"):
-        NddsSource(tmp_path, [BOX], classes={"cube": "dice"})
+        NddsReader(tmp_path, [BOX], classes={"cube": "dice"})
     with pytest.raises(UserError, match=r"of the parts dice.*other classes: .*box \(3\)"):
-        NddsSource(tmp_path, [dice])
+        NddsReader(tmp_path, [dice])
 
 
 def test_missing_camera_images_and_folders(tmp_path, caplog):
     wild = Wild(tmp_path / "set", own_camera=False)
     wild.item(0, BOX)
     with pytest.raises(UserError, match=r"camera_data\.intrinsics: 0 cameras.*_camera_settings"):
-        NddsSource(wild.root, [BOX])
+        NddsReader(wild.root, [BOX])
     wild.cameras("one", "two")
     with pytest.raises(UserError, match=r"camera_data\.intrinsics: 2 cameras"):
-        NddsSource(wild.root, [BOX])
+        NddsReader(wild.root, [BOX])
     wild.cameras("one")
     wild.item(1, BOX)
     (wild.root / "000001.png").unlink()
     with caplog.at_level(logging.WARNING):
-        assert len(NddsSource(wild.root, [BOX])) == 1
+        assert len(NddsReader(wild.root, [BOX])) == 1
     assert "1 annotations have no image" in caplog.text
     for folder in (tmp_path / "nowhere", tmp_path):
         if folder == tmp_path:
             (wild.root / "000000.png").unlink()
         with pytest.raises(UserError, match="without one annotated image"):
-            NddsSource(folder, [BOX])
+            NddsReader(folder, [BOX])
 
 
 def test_image_of_another_size_than_its_camera(tmp_path):
     Wild(tmp_path).item(0, BOX)
     cv2.imwrite(str(tmp_path / "000000.png"), np.zeros((40, 50, 3), np.uint8))
     with pytest.raises(UserError, match=r"for the 50×40 image of .*000000\.json"):
-        NddsSource(tmp_path, [BOX]).sample(0)
+        NddsReader(tmp_path, [BOX]).sample(0)
 
 
 def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path):
@@ -474,4 +474,4 @@ def test_segmentation_of_two_of_a_class_is_no_mask(tmp_path):
     wild.item(0, BOX, BOX)
     wild.settings("box")
     cv2.imwrite(str(tmp_path / "000000.seg.png"), np.full((HEIGHT, WIDTH), 12, np.uint8))
-    assert all(i.mask is None for i in NddsSource(tmp_path, [BOX]).sample(0).instances)
+    assert all(i.mask is None for i in NddsReader(tmp_path, [BOX]).sample(0).instances)

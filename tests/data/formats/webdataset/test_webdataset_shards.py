@@ -14,11 +14,11 @@ from hypothesis.extra import numpy as hnp
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.images import decode_runs, encode_runs
 from dopepp.data.formats.bop.models import bop_parts
+from dopepp.data.formats.images import decode_runs, encode_runs
 from dopepp.data.formats.problems import STRICT, Place
-from dopepp.data.formats.webdataset.shards import FIELDS, index_shard, members
-from dopepp.data.formats.webdataset.source import WebdatasetSource
+from dopepp.data.formats.webdataset import FIELDS, index_shard, members
+from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
 
 NUM_IMAGES = 4
@@ -33,7 +33,7 @@ def written(parts, samples, tmp_path, write_set):
 
 
 def test_round_trip(written, samples, assert_read_back):
-    source = WebdatasetSource(written, bop_parts(written), "train_pbr")
+    source = WebdatasetReader(written, bop_parts(written), "train_pbr")
     assert len(source) == NUM_IMAGES
     source = pickle.loads(pickle.dumps(source))
     for index in (2, 0, 3, 1):  # at random
@@ -45,7 +45,7 @@ def test_round_trip(written, samples, assert_read_back):
     (info,) = source.describe()
     assert info.identity["visible_fractions"] == "gt_info.json"
     parts = bop_parts(written, ["pivconnector"])
-    last = WebdatasetSource(written, parts, "train_pbr", part_of=(0.75, 1), read_depth=False)
+    last = WebdatasetReader(written, parts, "train_pbr", part_of=(0.75, 1), read_depth=False)
     sample = last.sample(0)
     assert (len(last), sample.key, sample.depth) == (1, keys[3], None)
     assert {instance.label for instance in sample.instances} <= {"pivconnector"}
@@ -156,7 +156,7 @@ def test_a_shard_of_another_writer(tmp_path, block, write_shard):
     files = [(folder, b""), *files, ("__meta__", b"x"), *long]
     for kind in (tarfile.PAX_FORMAT, tarfile.GNU_FORMAT):
         write_shard(tmp_path / "shard-000000.tar", files, format=kind)
-        source = WebdatasetSource(tmp_path, [block(2)])
+        source = WebdatasetReader(tmp_path, [block(2)])
         samples = [source.sample(index) for index in range(len(source))]
         keys = [sample.key[:20] for sample in samples]
         assert keys == ["000001_000005", "000000_000007", "some/" + "x" * 15]
@@ -239,7 +239,7 @@ def test_truncated_damaged_and_oversized_archives_are_refused(tmp_path, write_sh
 )
 def test_damaged_annotation_is_named(changes, message, tmp_path, block, write_shard):
     write_shard(tmp_path / "shard-000000.tar", image_files("000003_000004", **changes))
-    source = WebdatasetSource(tmp_path, [block(2)])
+    source = WebdatasetReader(tmp_path, [block(2)])
     with pytest.raises(UserError, match=message) as caught:
         source.sample(0)
     assert "000003_000004" in str(caught.value)
@@ -249,10 +249,10 @@ def test_a_key_in_two_shards_and_wrong_paths(tmp_path, block, write_shard):
     for name in ("shard-000000.tar", "shard-000001.tar"):
         write_shard(tmp_path / "a" / name, image_files("000000_000000"))
     with pytest.raises(UserError, match=r"shard-000001\.tar with 1 keys of .*shard-000000\.tar"):
-        WebdatasetSource(tmp_path, [block(2)], "a")
-    source = WebdatasetSource(tmp_path, [block(2)], "a/shard-000001.tar")
+        WebdatasetReader(tmp_path, [block(2)], "a")
+    source = WebdatasetReader(tmp_path, [block(2)], "a/shard-000001.tar")
     assert len(source) == 1
-    braces = WebdatasetSource(tmp_path, [block(2)], "a/shard-00000{1..1}.tar")
+    braces = WebdatasetReader(tmp_path, [block(2)], "a/shard-00000{1..1}.tar")
     assert braces.describe()[0].identity == source.describe()[0].identity
     for shards, message in {
         "b": "no such file or folder",
@@ -266,12 +266,12 @@ def test_a_key_in_two_shards_and_wrong_paths(tmp_path, block, write_shard):
         "PIPE:touch hacked": "a command to run",
     }.items():
         with pytest.raises(UserError, match=message):
-            WebdatasetSource(tmp_path, [block(2)], shards)
+            WebdatasetReader(tmp_path, [block(2)], shards)
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"a folder without \*\.tar"):
-        WebdatasetSource(tmp_path, [block(2)], "empty")
+        WebdatasetReader(tmp_path, [block(2)], "empty")
     with pytest.raises(UserError, match=r"shard-000000\.tar twice"):
-        WebdatasetSource(tmp_path, [block(2)], ["a/shard-000000.tar", "a/shard-000000.tar"])
+        WebdatasetReader(tmp_path, [block(2)], ["a/shard-000000.tar", "a/shard-000000.tar"])
 
 
 @pytest.fixture
@@ -290,19 +290,19 @@ def test_shards_are_downloaded_once_and_within_bounds(
         write_shard(tmp_path / "served" / f"shard-{n:06d}.tar", image_files(f"00000{n}_000000"))
     folder = tmp_path / "downloads"
     url = address + "/shard-{000000..000001}.tar"
-    source = WebdatasetSource(tmp_path, [block(2)], url, download_dir=folder)
+    source = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
     assert contents(folder) == contents(tmp_path / "served")
-    monkeypatch.setattr("dopepp.data.formats.webdataset.shards.MAX_SHARD_BYTES", 1000)
-    again = WebdatasetSource(tmp_path, [block(2)], url, download_dir=folder)
+    monkeypatch.setattr("dopepp.data.formats.webdataset.locations.MAX_SHARD_BYTES", 1000)
+    again = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert again.describe() == [source.describe()[0]]
     with pytest.raises(UserError, match="of over 0 GB"):
-        WebdatasetSource(tmp_path, [block(2)], url, download_dir=tmp_path / "small")
+        WebdatasetReader(tmp_path, [block(2)], url, download_dir=tmp_path / "small")
     missing = address + "/shard-000009.tar"
     with pytest.raises(UserError, match="which cannot be fetched"):
-        WebdatasetSource(tmp_path, [block(2)], missing, download_dir=folder)
+        WebdatasetReader(tmp_path, [block(2)], missing, download_dir=folder)
     with pytest.raises(UserError, match=r"URLs of .*https"):
-        WebdatasetSource(tmp_path, [block(2)], "nope://x/y.tar", download_dir=folder)
+        WebdatasetReader(tmp_path, [block(2)], "nope://x/y.tar", download_dir=folder)
     assert list((tmp_path / "small").iterdir()) == []
 
 
@@ -310,9 +310,9 @@ def test_commands_run_only_when_allowed(tmp_path, block, write_shard):
     path = write_shard(tmp_path / "elsewhere" / "shard-000000.tar", image_files("000000_000000"))
     command = f"pipe:cat {path}"
     with pytest.raises(UserError, match="a command to run"):
-        WebdatasetSource(tmp_path, [block(2)], command, download_dir=tmp_path / "d")
+        WebdatasetReader(tmp_path, [block(2)], command, download_dir=tmp_path / "d")
     assert not (tmp_path / "d").exists()
-    source = WebdatasetSource(
+    source = WebdatasetReader(
         tmp_path, [block(2)], command, download_dir=tmp_path / "d", allow_commands=True
     )
     assert source.sample(0).key == "000000_000000"

@@ -13,7 +13,7 @@ import pytest
 from dopepp.core.errors import UserError
 from dopepp.data.check import check_dataset
 from dopepp.data.formats.problems import MAX_KEPT, CheckReport
-from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.geometry.camera import camera_matrix
 
 FRAME = "0000/000001"
@@ -82,7 +82,7 @@ def spoil(what: str, value: Any) -> Callable[[Any], Any]:
 
 
 DAMAGES = {
-    "colour cut": (spoil("color.png", -300), "color.png: image: unreadable"),
+    "colour cut": (spoil("color.png", -300), "color.png: image: of "),
     "colour missing": (spoil("color.png", None), "color.png: file: missing"),
     "depth missing": (spoil("depth.png", None), "depth.png: file: missing"),
     "label missing": (spoil("label.png", None), "label.png: file: missing"),
@@ -150,7 +150,7 @@ def test_every_damage_is_found_with_file_and_field(ycb, box, name, assert_found,
     assert check_dataset(ycb.root).num_images == 3
     if name in REFUSED:
         expected = expected.replace("meta.mat: intrinsic_matrix: K", "meta.mat: K")
-        assert_refused(lambda: YcbVideoSource(ycb.root, [box], "train"), expected)
+        assert_refused(lambda: YcbVideoReader(ycb.root, [box], "train"), expected)
 
 
 def test_one_defect_hides_no_other(ycb, assert_found):

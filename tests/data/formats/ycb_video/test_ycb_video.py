@@ -10,7 +10,7 @@ import scipy.io
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.ycb_video.source import YcbVideoSource
+from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.data.sample import hull_areas
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.part import Part
@@ -23,8 +23,8 @@ def ycb_part_of(root: Path, name: str) -> Part:
     return Part(name, cuboid, float(np.ptp(points, axis=0).max()), points)
 
 
-def source_of(tree: Any, box: Part, **options: Any) -> YcbVideoSource:
-    return YcbVideoSource(tree.root, [box], **({"frames": ["0000/000001"]} | options))
+def source_of(tree: Any, box: Part, **options: Any) -> YcbVideoReader:
+    return YcbVideoReader(tree.root, [box], **({"frames": ["0000/000001"]} | options))
 
 
 SYNTHETIC = {"frames": ["000000"], "subset": "synthetic", "backgrounds": ProceduralBackgrounds()}
@@ -103,8 +103,8 @@ def test_image_set_splits_into_subsets(ycb_tree, box):
     ycb_tree.write("0000/000001")
     ycb_tree.write("data_syn/000003")
     ycb_tree.write_list("train", ["0000/000001", "data_syn/000003"])
-    real = YcbVideoSource(ycb_tree.root, [box], "train")
-    synthetic = YcbVideoSource(
+    real = YcbVideoReader(ycb_tree.root, [box], "train")
+    synthetic = YcbVideoReader(
         ycb_tree.root, [box], "train", "synthetic", backgrounds=ProceduralBackgrounds()
     )
     assert (real.frames, synthetic.frames) == (["0000/000001"], ["000003"])
@@ -114,7 +114,7 @@ def test_absent_frames_are_counted_and_named_once(ycb_tree, box, caplog):
     ycb_tree.write("0000/000001")
     ycb_tree.write_list("train", ["0000/000001", "0007/000001", "0007/000002"])
     with caplog.at_level(logging.WARNING):
-        assert len(YcbVideoSource(ycb_tree.root, [box], "train")) == 1
+        assert len(YcbVideoReader(ycb_tree.root, [box], "train")) == 1
     (record,) = caplog.records
     assert "2 of 3 frames listed in train.txt are absent; first: 0007/000001" in record.message
 
@@ -124,13 +124,13 @@ def test_describe_and_contains(ycb_tree, box):
     ycb_tree.write("0000/000002", classes=(1,))
     mug = replace(box, name="004_mug")
     frames = ["0000/000002", "0000/000001"]
-    source = YcbVideoSource(ycb_tree.root, [box, mug], frames=frames)
+    source = YcbVideoReader(ycb_tree.root, [box, mug], frames=frames)
     assert source.contains("003_box")
     assert not source.contains("004_mug")
     assert not source.contains("no_such")
     (info,) = source.describe()
     assert (info.num_images, info.num_instances) == (2, {"003_box": 1, "004_mug": 0})
-    (other,) = YcbVideoSource(ycb_tree.root, [box, mug], frames=frames[1:]).describe()
+    (other,) = YcbVideoReader(ycb_tree.root, [box, mug], frames=frames[1:]).describe()
     assert info.identity != other.identity
 
 
@@ -148,13 +148,13 @@ def test_hull_areas_against_trimesh_and_shapes():
 
 def test_root_that_is_missing_or_wrong(tmp_path, ycb_tree, box):
     with pytest.raises(UserError, match=r"which is no folder.*set data\.root"):
-        YcbVideoSource(tmp_path / "nowhere", [box], "train")
+        YcbVideoReader(tmp_path / "nowhere", [box], "train")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"empty, which has no data/.*a YCB-Video folder"):
-        YcbVideoSource(tmp_path / "empty", [box], "train")
+        YcbVideoReader(tmp_path / "empty", [box], "train")
     (ycb_tree.root / "image_sets" / "classes.txt").unlink()
     with pytest.raises(UserError, match=r"no image_sets/classes\.txt"):
-        YcbVideoSource(ycb_tree.root, [box], "train")
+        YcbVideoReader(ycb_tree.root, [box], "train")
 
 
 def test_unknown_names_list_the_known_ones_and_wrong_arguments_are_refused(ycb_tree, box):
@@ -167,11 +167,11 @@ def test_unknown_names_list_the_known_ones_and_wrong_arguments_are_refused(ycb_t
         (box, "train", r"no frame of train\.txt.*2 listed.*at least one"),
     ):
         with pytest.raises(UserError, match=message):
-            YcbVideoSource(ycb_tree.root, [part], image_set)
+            YcbVideoReader(ycb_tree.root, [part], image_set)
     with pytest.raises(ValueError, match="either image_set or frames"):
-        YcbVideoSource(ycb_tree.root, [box])
+        YcbVideoReader(ycb_tree.root, [box])
     with pytest.raises(ValueError, match="give backgrounds"):
-        YcbVideoSource(ycb_tree.root, [box], "train", "synthetic")
+        YcbVideoReader(ycb_tree.root, [box], "train", "synthetic")
 
 
 @pytest.mark.parametrize("compressed", [True, False])
@@ -207,7 +207,7 @@ def test_wrong_channels(ycb_tree, box):
     ],
 )
 def test_projected_cuboid_covers_the_real_label(ycb_root, frame, name):
-    source = YcbVideoSource(ycb_root, [ycb_part_of(ycb_root, name)], frames=[frame])
+    source = YcbVideoReader(ycb_root, [ycb_part_of(ycb_root, name)], frames=[frame])
     (instance,) = source.sample(0).instances
     hull = cv2.convexHull(instance.keypoints[:8].astype(np.float32))
     rows, columns = np.nonzero(instance.mask)
@@ -221,7 +221,7 @@ def test_projected_cuboid_covers_the_real_label(ycb_root, frame, name):
 
 def test_real_depth_agrees_with_the_pose(ycb_root):
     part = ycb_part_of(ycb_root, "003_cracker_box")
-    sample = YcbVideoSource(ycb_root, [part], frames=["0050/000003"]).sample(0)
+    sample = YcbVideoReader(ycb_root, [part], frames=["0050/000003"]).sample(0)
     (instance,) = sample.instances
     seen = sample.depth[instance.mask & (sample.depth > 0)]
     assert abs(np.median(seen) - instance.T_cam_obj[2, 3]) < part.diameter / 2
@@ -229,13 +229,13 @@ def test_real_depth_agrees_with_the_pose(ycb_root):
 
 def test_real_synthetic_frame_and_lists(ycb_root, caplog):
     parts = [ycb_part_of(ycb_root, name) for name in ("003_cracker_box", "005_tomato_soup_can")]
-    train = YcbVideoSource(ycb_root, parts, "train")
+    train = YcbVideoReader(ycb_root, parts, "train")
     assert train.frames == ["0000/000001", "0050/000003"]
     with caplog.at_level(logging.WARNING):
-        test = YcbVideoSource(ycb_root, parts, "keyframe")
+        test = YcbVideoReader(ycb_root, parts, "keyframe")
     assert "2,949 frames listed in keyframe.txt are absent; first: 0048/000001" in caplog.text
     assert 1 <= len(test) <= 3
-    synthetic = YcbVideoSource(
+    synthetic = YcbVideoReader(
         ycb_root, parts, "train", "synthetic", backgrounds=ProceduralBackgrounds()
     )
     sample = synthetic.sample(0)

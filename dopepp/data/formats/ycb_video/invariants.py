@@ -1,4 +1,4 @@
-"""Check YCB-Video's own layout: frames on disk, not those that a list names and nobody unpacked.
+"""Invariants of YCB-Video: the frames on disk, not those that a list names and nobody unpacked.
 
 An object without a label pixel is no defect: some releases label only some objects.
 """
@@ -14,10 +14,16 @@ from typing import Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.problems import CheckReport, Place, check_map, picture_shape
-from dopepp.data.formats.tolerances import Box, box_problem, camera_problem, translation_problem
-from dopepp.data.formats.ycb_video import frame as files
-from dopepp.data.formats.ycb_video.frame import FOLDERS, FrameMeta
+from dopepp.data.formats.invariants import Box, box_problem, camera_problem, translation_problem
+from dopepp.data.formats.problems import CheckReport, Place
+from dopepp.data.formats.ycb_video.frame import (
+    FOLDERS,
+    FrameMeta,
+    Subset,
+    read_classes,
+    read_frame,
+    read_image_set,
+)
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.parts.mesh import Points, largest_distance
@@ -26,16 +32,20 @@ _MAX_POINTS: Final = 100_000
 
 
 def check_ycb(report: CheckReport) -> None:
-    """Check the frames of ``data/`` and ``data_syn/``; without a class list, it is a UserError."""
-    classes = files.read_classes(report.root)
+    """Check the frames of ``data/`` and ``data_syn/``.
+
+    Raises:
+        UserError: The folder has no class list.
+    """
+    classes = read_classes(report.root)
     if not classes or len(set(classes)) != len(classes):
         path = report.root / "image_sets" / "classes.txt"
         report.report(path, "names", "empty, or one name twice")
     _check_lists(report)
     check = _FrameCheck(report, classes)
-    for folder in FOLDERS.values():
+    for subset, folder in FOLDERS.items():
         for start in _frames(report.root / folder):
-            check.check(start)
+            check.check(start, subset)
             report.count_image()
 
 
@@ -46,12 +56,12 @@ def _check_lists(report: CheckReport) -> None:
         absent = 0
         for subset, folder in FOLDERS.items():
             try:
-                listed = files.read_image_set(report.root, path.stem, subset)
+                listed = read_image_set(report.root, path.stem, subset)
             except UserError as error:
                 report.take(path, "line", error)
                 break
-            places = (report.root / folder / f"{frame}-meta.mat" for frame in listed)
-            absent += sum(not place.is_file() for place in places)
+            metas = (report.root / folder / f"{frame}-meta.mat" for frame in listed)
+            absent += sum(not meta.is_file() for meta in metas)
         if absent:
             report.note(f"{path.name} lists {absent:,} frames that are not on disk")
 
@@ -65,13 +75,13 @@ def _frames(folder: Path) -> Iterator[str]:
 
 
 class _FrameCheck:
-    """Checks frames; the objects' points are read when they are first needed."""
+    """Checks frames; an object's points are read when they are first needed."""
 
     def __init__(self, report: CheckReport, classes: list[str]) -> None:
         self._report, self._classes = report, classes
-        self._shape = cache(self._read_shape)
+        self._size = cache(self._read_size)
 
-    def _read_shape(self, name: str) -> tuple[Points, float] | None:
+    def _read_size(self, name: str) -> tuple[Points, float] | None:
         """Return an object's points and diameter, metres; None where it has no points."""
         path = self._report.root / "models" / name / "points.xyz"
         if not path.is_file():
@@ -88,30 +98,26 @@ class _FrameCheck:
             return None
         return points, largest_distance(points)
 
-    def check(self, start: str) -> None:
+    def check(self, start: str, subset: Subset) -> None:
         """Check the files of the frame whose paths begin like this."""
-        colour, depth, labels, matrices = (
-            Place(self._report, Path(f"{start}-{name}"))
-            for name in ("color.png", "depth.png", "label.png", "meta.mat")
-        )
-        shape = picture_shape(colour)
-        check_map(depth, shape)
-        label = check_map(labels, shape)
-        meta = files.read_meta(Path(f"{start}-meta.mat"), self._report)
+        frame = read_frame(start, subset, self._report)
+        meta, label = frame.meta, frame.labels
+        place = Place(self._report, Path(f"{start}-meta.mat"))
         K = meta.K if meta.K is not None and np.isfinite(meta.K).all() else None
-        problem = None if K is None or shape is None else camera_problem(K, shape)
+        problem = None if K is None or frame.shape is None else camera_problem(K, frame.shape)
         if problem is not None:
-            matrices["intrinsic_matrix"].report(problem)
+            place["intrinsic_matrix"].report(problem)
             K = None
-        self._check_box_file(Path(f"{start}-box.txt"), shape)
+        self._check_box_file(Path(f"{start}-box.txt"), frame.shape)
         is_read = bool(meta.poses) or np.isfinite(meta.factor_depth)
         if label is not None and is_read:
             strangers = sorted(set(np.unique(label).tolist()) - {0, *meta.poses})
             if strangers:
-                labels["values"].report(f"classes {strangers} without a pose in meta.mat")
+                got = f"classes {strangers} without a pose in meta.mat"
+                self._report.report(Path(f"{start}-label.png"), "values", got)
         for index in meta.poses:
             seen = None if label is None else Box.of_mask(label == index)
-            self._check_pose(matrices, meta, index, K, seen)
+            self._check_pose(place, meta, index, K, seen)
 
     def _check_pose(
         self, place: Place, meta: FrameMeta, index: int, K: CameraMatrix | None, seen: Box | None
@@ -122,18 +128,18 @@ class _FrameCheck:
             place["cls_indexes"][column].report(f"unknown class {index}", allowed)
             return
         place = place["poses"][column]
-        shape = self._shape(self._classes[index - 1])
-        apart = translation_problem(T_cam_obj[:3, 3], None if shape is None else shape[1])
+        size = self._size(self._classes[index - 1])
+        apart = translation_problem(T_cam_obj[:3, 3], None if size is None else size[1])
         if apart is not None:
             place[apart[0]].report(apart[1])
-        if apart or shape is None or K is None or not np.isfinite(T_cam_obj).all():
+        if apart or size is None or K is None or not np.isfinite(T_cam_obj).all():
             return
-        problem = box_problem(transform(T_cam_obj, shape[0]), K, seen)
+        problem = box_problem(transform(T_cam_obj, size[0]), K, seen)
         if problem is not None:
             place["box"].report(problem)
 
     def _check_box_file(self, path: Path, shape: Shape | None) -> None:
-        """Check ``box.txt``, where there is one: name, left, top, right and bottom a line."""
+        """Check ``box.txt``, if present: name, left, top, right and bottom a line."""
         lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
         for number, line in enumerate(lines, 1):
             name, *values = line.split() or [""]
@@ -147,10 +153,9 @@ class _FrameCheck:
                 continue
             if name not in self._classes:
                 place.report(f"unknown object {name!r:.60}")
-            outside = shape is not None and (
-                left >= shape[1] or top >= shape[0] or right < 0 or bottom < 0
-            )
             if not (left < right and top < bottom):
                 place.report(got, "left < right and top < bottom")
-            elif outside and shape is not None:
-                place.report(f"{got} outside the {shape[1]}×{shape[0]} image")
+            elif shape is not None:
+                height, width = shape
+                if left >= width or top >= height or right < 0 or bottom < 0:
+                    place.report(f"{got} outside the {width}×{height} image")

@@ -2,7 +2,7 @@
 
 How the files write their poses is found by reprojection
 (:mod:`~dopepp.data.formats.ndds.conventions`), said in the log and in
-:meth:`NddsSource.describe`, and checked again on every instance that is read. What
+:meth:`NddsReader.describe`, and checked again on every instance that is read. What
 :class:`~dopepp.data.formats.ndds.writer.NddsWriter` writes reads back exactly.
 """
 
@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from dopepp.core.errors import UserError
+from dopepp.data.formats import ndds as files
 from dopepp.data.formats import share
-from dopepp.data.formats.ndds import conventions, files
+from dopepp.data.formats.ndds import IMAGE_SUFFIXES, conventions
 from dopepp.data.formats.ndds.conventions import Finding, Observation
-from dopepp.data.formats.problems import STRICT
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
 from dopepp.drawing.pictures import Shape, read_rgb
 from dopepp.geometry.camera import CameraMatrix, check_camera, project_keypoints
@@ -38,7 +38,7 @@ _MAX_COUNTED_ITEMS: Final = 1000
 """Reading this many annotations takes about a second."""
 
 
-class NddsSource:
+class NddsReader:
     """The items of an NDDS or FAT folder and of the folders below it.
 
     ``visibility`` in the wild is 1 or 0 (visible at all or not), or the share of the visible
@@ -131,10 +131,8 @@ class NddsSource:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an item; the epoch is ignored."""
         path = self.items[index]
-        record, image_path = files.read_record(path) or {}, files.image_of(path)
-        if image_path is None:
-            STRICT.report(path, "image", "no file", "a PNG or JPEG beside it")
-        image = read_rgb(image_path)
+        record = files.read_record(path) or {}
+        image = read_rgb(files.image_of(path) or files.companion(path, IMAGE_SUFFIXES[0]))
         shape: Shape = image.shape[:2]
         objects, own_ids = files.objects_of(record, path), files.has_own_ids(record)
         values = files.label_values(objects, own_ids, path, self._settings)

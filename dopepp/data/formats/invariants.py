@@ -1,10 +1,9 @@
-"""What a pose, a camera and a box in the image must fulfil, in any layout.
+"""Invariants of poses, cameras and boxes that hold in every layout.
 
-Tolerances: a rotation is orthogonal to 1e-3, BOP's to 1e-2; what is visible of an object lies in
-the reprojected box within 8 px (released poses of YCB-Video sit up to 6 px off) or 5 % of the box's
-longer side; an object that is fully visible covers at least a third of that box in width or in
-height; the camera is 0.1 to 300 diameters away from an object, which no mix-up of mm and m leaves
-so.
+Tolerances: a rotation is orthogonal to 1e-3, BOP's to 1e-2; the visible pixels of an object lie in
+the reprojected box within 8 px (released poses of YCB-Video are up to 6 px off) or 5 % of the box's
+longer side; a fully visible object covers at least a third of that box in width or in height; the
+camera is 0.1 to 300 diameters away from an object, which no mix-up of mm and m satisfies.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ SMALLEST_COVER: Final = 1 / 3
 FULLY_VISIBLE: Final = 0.95
 DIAMETERS_AWAY: Final = (0.1, 300.0)
 PIXEL_ASPECT: Final = (0.5, 2.0)
-DIAMETERS_MM: Final = (5.0, 5000.0)
 
 
 class Box(NamedTuple):
@@ -40,7 +38,7 @@ class Box(NamedTuple):
 
     @classmethod
     def of_points(cls, points_px: Float[np.ndarray, "points 2"]) -> Box | None:
-        """Return the box of points, None where one of them is not finite."""
+        """Return the box of points, or None where one of them is not finite."""
         if not len(points_px) or not np.isfinite(points_px).all():
             return None
         (left, top), (right, bottom) = points_px.min(axis=0), points_px.max(axis=0)
@@ -48,7 +46,7 @@ class Box(NamedTuple):
 
     @classmethod
     def of_mask(cls, mask: NDArray[Any]) -> Box | None:
-        """Return the box of a mask's pixels, None where it has none."""
+        """Return the box of a mask's pixels, or None where it has none."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         if not len(rows):
             return None
@@ -56,7 +54,7 @@ class Box(NamedTuple):
 
     @classmethod
     def of_bop(cls, box: Float[np.ndarray, "4"]) -> Box | None:
-        """Return the box of BOP's (x, y, width, height), None where there is none (−1, NaN).
+        """Return the box of BOP's (x, y, width, height), or None for −1 and NaN.
 
         Width and height are the differences of the outermost pixels' coordinates.
         """
@@ -68,12 +66,12 @@ class Box(NamedTuple):
         return max(abs(a - b) for a, b in zip(self, other, strict=True))
 
     def beyond(self, other: Box) -> float:
-        """Return how far another box reaches out of this one, pixels; below 0 inside of it."""
+        """Return how far another box reaches out of this one, pixels; negative inside of it."""
         left, top = self.left - other.left, self.top - other.top
         return max(left, top, other.right - self.right, other.bottom - self.bottom)
 
     def is_inside(self, shape: Shape) -> bool:
-        """Tell whether all of it is in an image of (height, width)."""
+        """Tell whether the whole box is in an image of (height, width)."""
         height, width = shape
         return min(self.left, self.top) >= 0 and self.right < width and self.bottom < height
 
@@ -82,19 +80,18 @@ class Box(NamedTuple):
 
 
 def rotation_problem(rotation: RotationMatrix, tolerance: float = 1e-3) -> str | None:
-    """Say why a matrix is no rotation, None where it is one or not known (NaN)."""
+    """Return why a matrix is no rotation, or None where it is one or has NaN."""
     if is_rotation(rotation, tolerance) or not np.isfinite(rotation).all():
         return None
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    determinant = np.linalg.det(rotation)
-    allowed = f"{deviation:.2g} (allowed {tolerance:.0e}), determinant {determinant:.3g}"
-    return f"no rotation: R·Rᵀ off by {allowed}"
+    allowed = f"{deviation:.2g} (allowed {tolerance:.0e})"
+    return f"no rotation: R·Rᵀ off by {allowed}, determinant {np.linalg.det(rotation):.3g}"
 
 
 def translation_problem(translation: Vector, diameter: float | None) -> tuple[str, str] | None:
-    """Say what is wrong with an object's place as (kind, message), None where nothing is.
+    """Return what is wrong with an object's position as (kind, message), or None.
 
-    ``translation`` is in the camera frame, in the unit of ``diameter``, which may not be known.
+    ``translation`` is in the camera frame, in the unit of ``diameter``, which may be unknown.
     """
     depth = float(translation[2])
     if depth <= 0:
@@ -112,7 +109,7 @@ def translation_problem(translation: Vector, diameter: float | None) -> tuple[st
 
 
 def camera_problem(K: CameraMatrix, shape: Shape) -> str | None:
-    """Say why K cannot belong to an image of (height, width), None where it can."""
+    """Return why K cannot belong to an image of (height, width), or None."""
     try:
         check_camera(K, shape[::-1], "this image")
     except UserError as error:
@@ -130,11 +127,14 @@ def box_problem(
     visible_fraction: float | None = None,
     shape: Shape | None = None,
 ) -> str | None:
-    """Hold what is seen of an object against where its pose puts it; None where they agree.
+    """Return how an object's visible pixels contradict its pose, or None.
 
-    The hull of ``points_cam``, camera frame, contains the object; ``seen`` is the box of its
-    visible pixels, None where nothing is seen. ``shape`` is the image's (height, width), where
-    ``visible_fraction`` does not count what the border cuts off.
+    Args:
+        points_cam: Points in the camera frame whose hull contains the object.
+        K: Camera matrix in pixels.
+        seen: Box of the visible pixels; None where nothing is visible.
+        visible_fraction: Visible share of the object, where it is known.
+        shape: (height, width) of the image, where ``visible_fraction`` ignores its border.
     """
     predicted = Box.of_points(project(points_cam, K))
     if predicted is None or seen is None:

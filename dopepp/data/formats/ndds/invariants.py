@@ -14,11 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from dopepp.data.formats.ndds import files
-from dopepp.data.formats.ndds.check_object import Majority, ObjectCheck
-from dopepp.data.formats.ndds.files import IMAGE_SUFFIXES, Objects, Settings
-from dopepp.data.formats.problems import CheckReport, Place, check_map, mapping, picture_shape
-from dopepp.data.formats.tolerances import camera_problem
+from dopepp.data.formats import ndds as files
+from dopepp.data.formats.images import picture_shape, read_map
+from dopepp.data.formats.invariants import camera_problem
+from dopepp.data.formats.ndds import IMAGE_SUFFIXES, Objects, Settings
+from dopepp.data.formats.ndds.object_invariants import Majority, ObjectCheck
+from dopepp.data.formats.problems import CheckReport, Place, mapping
 from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix
 
@@ -96,7 +97,7 @@ def _check_item(
     image = files.image_of(path)
     shape = None if image is None else picture_shape(Place(report, image))
     images = {
-        suffix: check_map(Place(report, files.companion(path, suffix)), shape, colour=True)
+        suffix: read_map(Place(report, files.companion(path, suffix)), shape, colour=True)
         for suffix in maps
     }
     labels = images.get(".seg.png")

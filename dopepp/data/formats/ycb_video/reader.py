@@ -1,6 +1,6 @@
 """YCB-Video in its own layout: ``data/SSSS/NNNNNN-*`` (real) and ``data_syn/NNNNNN-*`` (synthetic).
 
-One source reads one of the two subsets; :mod:`dopepp.data.sources.hybrid` mixes them.
+One reader reads one of the two subsets; :mod:`dopepp.data.sources.hybrid` mixes them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats.bop.records import make_instance
-from dopepp.data.formats.problems import read_map
-from dopepp.data.formats.ycb_video import frame as files
-from dopepp.data.formats.ycb_video.frame import FOLDERS, Subset, read_meta
+from dopepp.data.formats.bop import make_instance
+from dopepp.data.formats.ycb_video.frame import (
+    FOLDERS,
+    FrameMeta,
+    Subset,
+    read_classes,
+    read_frame,
+    read_image_set,
+    read_meta,
+)
 from dopepp.data.sample import Purpose, Sample, SourceInfo, item_rng
-from dopepp.drawing.pictures import Picture, Shape
-from dopepp.geometry.camera import check_camera
+from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -30,8 +36,15 @@ _log = logging.getLogger(__name__)
 _MAX_COUNTED_FRAMES: Final = 1000
 """Reading this many meta.mat files takes about a second."""
 
+_FIRST_SCENE_OF_SECOND_CAMERA: Final = 60
+_CAMERAS: Final = (
+    camera_matrix(1066.778, 1067.487, 312.9869, 241.3109),
+    camera_matrix(1077.836, 1078.189, 323.7872, 279.6921),
+)
+"""The data set's two colour cameras: scenes 0000–0059 and data_syn, scenes 0060–0091."""
 
-class YcbVideoSource:
+
+class YcbVideoReader:
     """Real or synthetic frames of a YCB-Video folder.
 
     Visible fractions: label pixels over the area of the convex hull of the projected ADD points,
@@ -66,7 +79,7 @@ class YcbVideoSource:
             raise ValueError("synthetic frames are transparent: give backgrounds")
         self.root, self.subset = Path(root), subset
         self.name = f"ycb_video/{FOLDERS[subset]}"
-        classes = files.read_classes(self.root)
+        classes = read_classes(self.root)
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
             raise UserError(
@@ -74,7 +87,7 @@ class YcbVideoSource:
             )
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
-            frames = files.read_image_set(self.root, image_set, subset)
+            frames = read_image_set(self.root, image_set, subset)
         self.frames = self._present(
             list(frames or ()), f"{image_set}.txt" if image_set else "frames"
         )
@@ -82,7 +95,7 @@ class YcbVideoSource:
 
     def _present(self, listed: list[str], where: str) -> list[str]:
         folder = self.root / FOLDERS[self.subset]
-        is_there = {frame: self._path(frame, "color.png").is_file() for frame in listed}
+        is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
             raise UserError(
@@ -101,27 +114,33 @@ class YcbVideoSource:
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read a frame; only the background of a synthetic one depends on the epoch."""
-        frame, is_real = self.frames[index], self.subset == "real"
-        image = files.read_colour(self._path(frame, "color.png"), alpha=not is_real)
-        shape: Shape = image.shape[:2]
-        path = self._path(frame, "meta.mat")
-        meta, depth = read_meta(path), None
-        if self._read_depth:
-            depth = read_map(self._path(frame, "depth.png"), shape) / np.float32(meta.factor_depth)
-        labels = read_map(self._path(frame, "label.png"), shape)
-        stated = files.camera_of(self.subset, frame) if meta.K is None else meta.K
-        K = check_camera(stated, (shape[1], shape[0]), str(path))
+        name, is_real = self.frames[index], self.subset == "real"
+        frame = read_frame(self._start(name), self.subset, read_depth=self._read_depth)
+        assert frame.image is not None
+        shape, meta, depth = frame.image.shape[:2], frame.meta, frame.depth
+        if depth is not None:
+            depth = depth / np.float32(meta.factor_depth)
+        K = self._camera(name) if meta.K is None else meta.K
+        K = check_camera(K, (shape[1], shape[0]), f"{self._start(name)}-meta.mat")
         instances = []
         for class_index, part in self._parts.items():
             if class_index in meta.poses:
-                seen = labels == class_index
+                seen = np.asarray(frame.labels == class_index)
                 mask = None if is_real and not seen.any() else seen
                 pose = meta.poses[class_index]
                 instances.append(make_instance(part, pose, K, np.nan, mask, shape))
-        return Sample(self._rgb(image, frame, epoch), K, instances, depth, self.name, frame)
+        return Sample(self._rgb(frame.image, name, epoch), K, instances, depth, self.name, name)
 
-    def _path(self, frame: str, what: str) -> Path:
-        return self.root / FOLDERS[self.subset] / f"{frame}-{what}"
+    def _start(self, frame: str) -> str:
+        return str(self.root / FOLDERS[self.subset] / frame)
+
+    def _camera(self, frame: str) -> CameraMatrix:
+        """Return K of a frame whose ``meta.mat`` does not state it."""
+        scene = 0 if self.subset == "synthetic" else int(frame.partition("/")[0])
+        return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]
+
+    def _meta(self, frame: str) -> FrameMeta:
+        return read_meta(Path(f"{self._start(frame)}-meta.mat"))
 
     def _rgb(self, image: NDArray[Any], frame: str, epoch: int) -> Picture:
         """Composite a synthetic frame on a background drawn for (seed, epoch, frame)."""
@@ -137,8 +156,7 @@ class YcbVideoSource:
         """Tell whether a frame holds this object, reading frames until one does."""
         wanted = {index for index, part in self._parts.items() if part.name == label}
         return bool(wanted) and any(
-            not wanted.isdisjoint(read_meta(self._path(frame, "meta.mat")).poses)
-            for frame in self.frames
+            not wanted.isdisjoint(self._meta(frame).poses) for frame in self.frames
         )
 
     def describe(self) -> list[SourceInfo]:
@@ -156,7 +174,7 @@ class YcbVideoSource:
     def _count_instances(self) -> dict[str, int]:
         if len(self.frames) > _MAX_COUNTED_FRAMES:
             return {}
-        metas = [read_meta(self._path(frame, "meta.mat")) for frame in self.frames]
+        metas = [self._meta(frame) for frame in self.frames]
         return {
             part.name: sum(class_index in meta.poses for meta in metas)
             for class_index, part in self._parts.items()

@@ -17,12 +17,12 @@ import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.core.json import MAX_BYTES
-from dopepp.data.formats import share
-from dopepp.data.formats.bop import records as bop
-from dopepp.data.formats.bop.images import decode_depth, decode_rgb, decode_runs
+from dopepp.data.formats import bop, share
 from dopepp.data.formats.bop.models import parts_by_id
+from dopepp.data.formats.images import decode_depth, decode_rgb, decode_runs
 from dopepp.data.formats.problems import STRICT, Place, Problems, mapping
-from dopepp.data.formats.webdataset.shards import ShardIndex, find_shards, index_shard
+from dopepp.data.formats.webdataset import ShardIndex, index_shard
+from dopepp.data.formats.webdataset.locations import find_shards
 from dopepp.data.sample import Sample, SourceInfo
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import check_camera
@@ -33,18 +33,18 @@ _log = logging.getLogger(__name__)
 _MAX_NAMED: Final = 3
 
 
-class WebdatasetSource:
+class WebdatasetReader:
     """The images of some shards, shard by shard in the shards' own order.
 
     Opening reads the archives' headers; an image's members are read and checked when it is asked
     for. An image without ``gt.json`` has no instances. Objects that are none of the parts, and
     objects behind the camera, are left out. The visible fraction is ``visib_fract`` of
-    ``gt_info.json``; without it, see :func:`~dopepp.data.formats.bop.records.make_instance`.
+    ``gt_info.json``; without it, see :func:`~dopepp.data.formats.bop.make_instance`.
 
     Args:
         parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
         shards: A folder in ``root``, a file or a URL, or several; see
-            :func:`~dopepp.data.formats.webdataset.shards.find_shards`.
+            :func:`~dopepp.data.formats.webdataset.locations.find_shards`.
         download_dir: Where shards from URLs are kept; None refuses URLs.
         allow_commands: Whether ``pipe:`` may run a command.
     """

@@ -1,6 +1,6 @@
 """Hold the fields of one NDDS object against each other and against the image.
 
-Tolerances beside those of :mod:`~dopepp.data.formats.tolerances`: a stated projection lies within
+Tolerances beside those of :mod:`~dopepp.data.formats.invariants`: a stated projection lies within
 2 px and 2 % of the cuboid's longer side of where K puts the 3-D point; edges of a cuboid are
 perpendicular and equal within 2 %, and its class's within 5 %; an orientation agrees with the
 cuboid's within 2 degrees.
@@ -15,10 +15,10 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
+from dopepp.data.formats.invariants import Box, box_problem, translation_problem
+from dopepp.data.formats.ndds import NddsObject
 from dopepp.data.formats.ndds.conventions import OPENGL
-from dopepp.data.formats.ndds.files import NddsObject
 from dopepp.data.formats.problems import CheckReport, Place, mapping
-from dopepp.data.formats.tolerances import Box, box_problem, translation_problem
 from dopepp.drawing.pictures import Mask, Shape
 from dopepp.geometry.camera import CameraMatrix, project
 from dopepp.geometry.rotation import (

@@ -1,0 +1,360 @@
+"""Invariants of BOP data: records, models, masks and images of one data set agree.
+
+The records are parsed by the reader, whose problems are defects. What is optional in BOP (depth,
+masks) must be there for every image of a scene as soon as it is there for one. Noted are a scene
+without ``scene_gt.json`` (data sets keep the ground truth of their tests private), objects without
+``visib_fract``, objects without a model and inexact rotations.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dopepp.data.formats import STAGING, bop, invariants, staged_items
+from dopepp.data.formats.bop import MM, BopPoses, Places, Record
+from dopepp.data.formats.bop.models import INFO_FILE, info_path, modelled, parse_models, part_of
+from dopepp.data.formats.bop.scene import (
+    DEPTH_SUFFIXES,
+    IMAGE_FOLDERS,
+    IMAGE_SUFFIXES,
+    image_files,
+    read_records,
+)
+from dopepp.data.formats.images import COLOUR_MODES, DEPTH_MODES, one_channel_of, picture_shape
+from dopepp.data.formats.invariants import Box
+from dopepp.data.formats.problems import CheckReport, Place, mapping
+from dopepp.drawing.pictures import Mask, Shape
+from dopepp.geometry.camera import CameraMatrix, transform
+from dopepp.geometry.cuboid import cuboid_keypoints
+
+DIAMETERS_MM: Final = (5.0, 5000.0)
+
+FRACTION_TOLERANCE: Final = 0.05
+"""Between ``visib_fract`` and the quotient of the pixel counts, which renderers round apart."""
+
+PIXEL_TOLERANCE: Final = 0.01
+"""Share of a mask's pixels by which a stated count may differ (plus one row, of a border)."""
+
+BOX_EDGE_PX: Final = 2.0
+"""Between ``bbox_visib`` and the box of ``mask_visib``: tools differ on whether ends count."""
+
+_ROUNDING: Final = 1.001
+"""Diameters and boxes are rounded to a few digits."""
+
+_CAMERA, _TRUTH, _INFO = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
+_MASKS: Final = ("mask", "mask_visib")
+
+ReadMask = Callable[[str, int], Mask | None]
+"""Reads ``mask`` or ``mask_visib`` of an object by its number; None where there is none."""
+
+
+def scene_folders(root: Path) -> Iterator[Path]:
+    """Yield the scenes of a data set, a split, or the scene that ``root`` is, in order."""
+    if _is_scene(root):
+        yield root
+        return
+    for folder in sorted(path for path in root.glob("*") if path.is_dir()):
+        if _is_scene(folder):
+            yield folder
+        elif not folder.name.startswith("."):
+            yield from sorted(path for path in folder.glob("*") if _is_scene(path))
+
+
+def _is_scene(folder: Path) -> bool:
+    named = folder.name.isdecimal() and (folder / "rgb").is_dir()
+    return named or any((folder / name).is_file() for name in (_CAMERA, _TRUTH, _INFO))
+
+
+def check_bop(report: CheckReport) -> None:
+    """Check the models and every scene of a data set, a split, or a single scene."""
+    # The models lie beside the splits: in this folder, or above the split or scene that it is.
+    models = load_models(report, (report.root, *report.root.resolve().parents[:2]))
+    for folder in scene_folders(report.root):
+        if folder != report.root and not bop.is_number(folder.name):
+            report.report(folder, "name", "no scene's number", "000000, 000001, …")
+        _SceneCheck(report, folder, models).check()
+
+
+class _SceneCheck:
+    """One scene: its JSON files and the files in its folders."""
+
+    def __init__(self, report: CheckReport, folder: Path, models: Models | None) -> None:
+        self._report, self._folder, self._models = report, folder, models
+        self._pictures = _image_files(report, folder, IMAGE_FOLDERS, IMAGE_SUFFIXES)
+        self._depths = _image_files(report, folder, ("depth",), DEPTH_SUFFIXES)
+        self._masks = {name: _mask_files(folder / name) for name in _MASKS}
+        self._records = read_records(folder, report)
+        self._has_truth = (folder / _TRUTH).is_file()
+
+    def check(self) -> None:
+        report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
+        if not self._has_truth:
+            if (folder / _INFO).is_file() or any(self._masks.values()):
+                report.report(folder / _TRUTH, "file", "missing")
+            else:
+                report.note(f"{folder} has no {_TRUTH}: its poses are not published")
+        oddities = Oddities()
+        images = sorted(cameras.keys() | self._pictures.keys() | truths.keys())
+        for image in images:
+            # A file that cannot be read is one defect, not one for every image.
+            for by_image, name in ((cameras, _CAMERA), (truths, _TRUTH)):
+                if by_image and image not in by_image:
+                    report.report(folder / name, str(image), "missing")
+            oddities.count(self._check_image(image), self._models)
+            report.count_image()
+        oddities.note(report, folder)
+        for name, by_number in (("depth", self._depths), (_INFO, infos)):
+            for image in sorted(by_number.keys() - set(images)):
+                report.report(folder / name, str(image), "no such image in the scene")
+        if staged := len(staged_items(folder / STAGING, ".json")):
+            report.note(f"{folder}: {staged} images written and not yet finalized")
+
+    def _check_image(self, image: int) -> BopPoses:
+        report, folder, (cameras, truths, infos) = self._report, self._folder, self._records
+        path = self._pictures.get(image, folder / "rgb" / f"{image:06d}.png")
+        shape = picture_shape(Place(report, path), modes=COLOUR_MODES)
+        if self._depths:
+            path = self._depths.get(image, folder / "depth" / f"{image:06d}.png")
+            one_channel_of(Place(report, path), shape, modes=DEPTH_MODES)
+        objects = truths.get(image, [])
+        masks = {name: by_image.get(image, {}) for name, by_image in self._masks.items()}
+        for by_number in masks.values() if self._has_truth else ():
+            for number in sorted(by_number.keys() - set(range(len(objects)))):
+                report.report(by_number[number], "file", f"no object {number} on the image")
+
+        def places(what: str, number: int) -> Place:
+            place = Place(report, folder / f"scene_{what}.json")[f"{image}"]
+            return place if what == "camera" else place[number]
+
+        def read_mask(name: str, number: int) -> Mask | None:
+            if not self._masks[name]:
+                return None
+            path = masks[name].get(number, folder / name / f"{image:06d}_{number:06d}.png")
+            mask = one_channel_of(Place(report, path), shape)
+            return None if mask is None else mask != 0
+
+        objects_infos = infos.get(image, [None] * len(objects))
+        camera, has_depth = cameras.get(image), bool(self._depths)
+        return check_image(
+            places, camera, objects, objects_infos, shape, has_depth, self._models, read_mask
+        )
+
+
+def _image_files(
+    report: CheckReport, scene: Path, folders: tuple[str, ...], suffixes: tuple[str, ...]
+) -> dict[int, Path]:
+    """Return numbered images; report images of another name beside them."""
+    files = image_files(scene, folders, suffixes, report)
+    for folder in {path.parent for path in files.values()}:
+        for path in sorted(folder.iterdir()):
+            hidden = path.name.startswith(".")
+            if path.suffix.lower() in suffixes and not hidden and not bop.is_number(path.stem):
+                report.report(path, "file", "no image's number")
+    return files
+
+
+def _mask_files(folder: Path) -> dict[int, dict[int, Path]]:
+    """Return the masks in a folder by image and object."""
+    files: dict[int, dict[int, Path]] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        image, _, number = path.stem.partition("_")
+        if image.isdecimal() and number.isdecimal():
+            files.setdefault(int(image), {})[int(number)] = path
+    return files
+
+
+@dataclass
+class Oddities:
+    """Counts of what every reader copes with: notes, not defects."""
+
+    inexact: int = 0
+    without_fraction: int = 0
+    without_model: Counter[int] = field(default_factory=Counter)
+
+    def count(self, poses: BopPoses, models: Models | None) -> None:
+        """Count the oddities of an image's annotation."""
+        self.inexact += int(poses.inexact.sum())
+        self.without_fraction += int(np.isnan(poses.visible_fractions).sum())
+        self.without_model += poses.without_model(models or ())
+
+    def note(self, report: CheckReport, where: Path | str) -> None:
+        """Note the oddities and how a reader handles them."""
+        if self.inexact:
+            report.note(
+                f"{where}: {self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only; the "
+                "nearest rotation is taken"
+            )
+        if self.without_fraction:
+            report.note(
+                f"{where}: {self.without_fraction:,} objects without visib_fract; how much of them "
+                "is visible is estimated"
+            )
+        for number, count in sorted(self.without_model.items()):
+            report.note(
+                f"{where}: object {number} is annotated {count:,} times and has no model; it is "
+                "left out"
+            )
+
+
+@dataclass(frozen=True)
+class Model:
+    """An object's size, metres; None where it is not stated or damaged."""
+
+    diameter: float | None = None
+    corners: Float[np.ndarray, "8 3"] | None = None
+
+
+Models = dict[int, Model]
+
+
+def load_models(report: CheckReport, roots: Sequence[Path]) -> Models | None:
+    """Check the first ``models*/models_info.json`` below one of the folders, and its meshes.
+
+    Returns:
+        The sizes of the objects with a mesh, of all objects where there is no mesh; None without
+        such a file.
+    """
+    path = next(filter(None, map(info_path, roots)), None)
+    if path is None:
+        report.note(f"no {INFO_FILE}: objects' numbers, sizes and boxes are not checked")
+        return None
+    place = Place(report, path)
+    records = place.load()
+    if records is None:
+        return None
+    infos = parse_models(path, records, report)
+    present = modelled(infos)
+    if absent := infos.keys() - present:
+        numbers = ", ".join(map(str, sorted(absent)))
+        report.note(f"{path.parent}: no file of object {numbers}, left out where it is annotated")
+    for number in sorted(present):
+        Place(report, infos[number].path)["mesh"].attempt(partial(part_of, infos[number]))
+    sizes = {
+        int(key): _model(place[key], record, infos[int(key)].diameter)
+        for key, record in records.items()
+        if bop.is_number(key)
+    }
+    return {number: size for number, size in sizes.items() if number in present}
+
+
+def _model(place: Place, record: object, stated: float) -> Model:
+    fields, diameter = mapping(record), None if np.isnan(stated) else stated
+    if fields and "diameter" not in fields:
+        place["diameter"].report("missing")
+    if diameter is not None and not DIAMETERS_MM[0] <= diameter * MM <= DIAMETERS_MM[1]:
+        least, most = DIAMETERS_MM
+        allowed = f"{least:g} … {most:g} mm: is it in another unit?"
+        place["unit"].report(f"{diameter * MM:.4g} mm", allowed)
+        diameter = None
+    bounds = [fields.get(f"{what}_{axis}") for what in ("min", "size") for axis in "xyz"]
+    if all(value is None for value in bounds):
+        return Model(diameter)
+    low, size = place["min_x … size_z"].numbers(bounds, 2, 3) / MM
+    if (size < 0).any():
+        place["size_x … size_z"].report(f"{(size * MM).tolist()}", "0 and above")
+    if not (size >= 0).all():
+        return Model(diameter)
+    length = float(np.linalg.norm(size))
+    if diameter is not None and not size.max() / _ROUNDING <= diameter <= length * _ROUNDING:
+        got = f"{diameter * MM:.5g} mm for a box of {np.round(size * MM, 3).tolist()} mm"
+        place["diameter"].report(got)
+    return Model(diameter, cuboid_keypoints(low, low + size)[:8])
+
+
+def check_image(
+    places: Places,
+    camera: object,
+    truths: Sequence[Record],
+    infos: Sequence[Record | None],
+    shape: Shape | None,
+    has_depth: bool,
+    models: Models | None,
+    read_mask: ReadMask,
+) -> BopPoses:
+    """Check camera, poses, boxes, counts and masks of one image; return the poses.
+
+    ``shape`` is the image's (height, width), None where it cannot be read; ``has_depth`` tells
+    whether the camera must state the scale of a depth image.
+    """
+    K = None if camera is None else _check_camera(places, camera, shape, has_depth)
+    poses = bop.read_poses(truths, infos, places)
+    for n, info in enumerate(infos):
+        place, T_cam_obj, stated = places("gt", n), poses.T_cam_obj[n], poses.visible_fractions[n]
+        fraction = None if np.isnan(stated) else float(stated)
+        model = (models or {}).get(int(poses.obj_ids[n]), Model())
+        problem = invariants.translation_problem(T_cam_obj[:3, 3], model.diameter)
+        if problem is not None:
+            place["cam_t_m2c"][problem[0]].report(problem[1])
+        whole, visible = read_mask("mask", n), read_mask("mask_visib", n)
+        if whole is not None and visible is not None and whole.shape == visible.shape:
+            outside = int(np.count_nonzero(visible & ~whole))
+            if outside > PIXEL_TOLERANCE * visible.sum():
+                place["mask_visib"].report(f"{outside} visible pixels outside the whole mask")
+        seen = None if visible is None else Box.of_mask(visible)
+        if info is not None:
+            _check_counts(places("gt_info", n), info, visible, fraction)
+            seen = _check_boxes(places("gt_info", n), info, seen)
+        is_posed = problem is None and bool(np.isfinite(T_cam_obj).all())
+        if is_posed and K is not None and model.corners is not None:
+            apart = invariants.box_problem(transform(T_cam_obj, model.corners), K, seen, fraction)
+            if apart is not None:
+                place["box"].report(apart)
+    return poses
+
+
+def _check_camera(
+    places: Places, camera: object, shape: Shape | None, has_depth: bool
+) -> CameraMatrix | None:
+    place = places("camera", 0)
+    K: CameraMatrix = bop.read_cameras([camera], places)[0][0]
+    if has_depth and "depth_scale" not in mapping(camera):
+        place["depth_scale"].report("missing", "millimetres a unit of the depth")
+    if not np.isfinite(K).all():
+        return None
+    problem = None if shape is None else invariants.camera_problem(K, shape)
+    if problem is None:
+        return K
+    place["cam_K"].report(problem)
+    return None
+
+
+def _check_counts(
+    place: Place, info: Mapping[str, Any], visible: Mask | None, fraction: float | None
+) -> None:
+    """Compare pixel counts with each other, the visible fraction and the mask."""
+    total, count = (
+        place[field].scalar(info[field]) if field in info else np.nan
+        for field in ("px_count_all", "px_count_visib")
+    )
+    if count < 0 or count > total:
+        place["px_count_visib"].report(f"{count:g} of {total:g} pixels")
+    elif fraction is not None and total > 0:
+        slack = FRACTION_TOLERANCE + 1 / np.sqrt(total)
+        if abs(count / total - fraction) > slack:
+            got = f"{fraction:.3g}, the pixel counts say {count / total:.3g}"
+            place["visib_fract"].report(got)
+    if visible is not None:
+        pixels = int(np.count_nonzero(visible))
+        if abs(pixels - count) > PIXEL_TOLERANCE * max(pixels, count) + np.sqrt(pixels):
+            place["px_count_visib"].report(f"{count:g}, mask_visib has {pixels} pixels")
+
+
+def _check_boxes(place: Place, info: Mapping[str, Any], seen: Box | None) -> Box | None:
+    """Compare ``bbox_visib`` with the mask's box; return the latter, or else the former."""
+    stated = {
+        field: Box.of_bop(place[field].numbers(info[field], 4))
+        for field in ("bbox_visib", "bbox_obj")
+        if field in info
+    }
+    box = stated.get("bbox_visib")
+    if seen is not None and box is not None and seen.distance(box) > BOX_EDGE_PX:
+        place["bbox_visib"].report(f"{box}, mask_visib has {seen}")
+    return seen or box

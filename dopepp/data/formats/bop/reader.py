@@ -1,0 +1,282 @@
+"""BOP data sets in their scenewise layout: LM-O, T-LESS, YCB-V, ITODD, or a rendered one.
+
+``SPLIT/NNNNNN/`` are scenes, see :mod:`~dopepp.data.formats.bop.scene`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from math import ceil, floor
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+from jaxtyping import Int
+
+from dopepp.core.errors import UserError
+from dopepp.core.json import read_json
+from dopepp.core.validation import Range, parse
+from dopepp.data.formats import bop, share
+from dopepp.data.formats.bop.models import modelled, parts_by_id, read_models
+from dopepp.data.formats.bop.scene import Scene, read_scene
+from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
+from dopepp.data.sample import Instance, Sample, SourceInfo
+from dopepp.drawing.pictures import DepthMap, Shape, Size, read_content
+from dopepp.geometry.camera import CameraMatrix, check_camera, transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.parts.part import Part
+
+_log = logging.getLogger(__name__)
+
+TARGETS_FILE: Final = "test_targets_bop19.json"
+"""BOP's own list of targets."""
+
+AUTO: Final = "auto"
+"""Value of ``targets``: :data:`TARGETS_FILE` for a split like ``test_primesense``, if present."""
+
+Count = Annotated[int, Range(0, 10**9 - 1)]
+
+
+@dataclass(frozen=True)
+class _Target:
+    scene_id: Count
+    im_id: Count
+    obj_id: Count | None = None
+    inst_count: Count = 1
+
+
+Targets = dict[tuple[int, int], Counter[int] | None]
+"""Number of instances of each object to find, by scene and image; None for all objects."""
+
+
+def read_targets(path: Path) -> Targets:
+    """Return the targets of a file like ``test_targets_bop19.json``.
+
+    Raises:
+        UserError: The file holds no list of targets with ``scene_id`` and ``im_id``.
+    """
+    records = parse(list[_Target], read_json(path), f"{path}", "download the file again")
+    if not records:
+        raise UserError(f"{path}", "a list of targets", "download the file again")
+    targets: Targets = {}
+    for target in records:
+        key = target.scene_id, target.im_id
+        if target.obj_id is None:
+            targets[key] = None
+        elif (counts := targets.setdefault(key, Counter())) is not None:
+            counts[target.obj_id] += target.inst_count
+    return targets
+
+
+class BopReader:
+    """The images of a split, by scene and number.
+
+    Opening reads the scenes' JSON files and checks every record; images are read one by one. An
+    image without ground truth has no instances. Objects that are none of the parts, and objects
+    behind the camera (rendered sets pose them too), are left out and counted. The visible fraction
+    is ``visib_fract`` of ``scene_gt_info.json``; without it, see
+    :func:`~dopepp.data.formats.bop.make_instance`.
+
+    Args:
+        parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
+        split: Folder of the scenes, e.g. ``test``, ``train_pbr``, ``train_real``.
+        targets: File in ``root`` that selects images and, in them, so many instances of an object,
+            the most visible ones, e.g. ``test_targets_bop19.json``; ``auto`` uses that file where
+            it exists.
+        part_of: Consecutive share of the images, as (first, last) fractions: disjoint shares of
+            one folder serve training, validation and test.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        parts: Sequence[Part],
+        split: str,
+        targets: str | None = None,
+        part_of: tuple[float, float] = (0.0, 1.0),
+        read_depth: bool = True,
+    ) -> None:
+        self.root, self.split, self.name = Path(root), split, f"bop/{split}"
+        self._parts = parts_by_id(self.root, parts)
+        self._read_depth = read_depth
+        with_model = modelled(read_models(self.root))
+        folders = _scene_folders(self.root, split)
+        self._scenes = [read_scene(folder, self._parts, with_model) for folder in folders]
+        if targets == AUTO:
+            is_there = split.startswith("test") and (self.root / TARGETS_FILE).is_file()
+            targets = TARGETS_FILE if is_there else None
+        self._targets = None if targets is None else read_targets(self.root / targets)
+        items = self._present()
+        self._items = items[share(len(items), part_of, self.name)]
+        self._log_oddities(with_model)
+
+    def _present(self) -> Int[np.ndarray, "items 2"]:
+        """Return (scene, row) of the images that are selected and on disk, in order."""
+        listed = [
+            (number, row)
+            for number, scene in enumerate(self._scenes)
+            for row, image in enumerate(scene.image_ids.tolist())
+            if self._targets is None or (int(scene.folder.name), image) in self._targets
+        ]
+        present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
+        num_wanted = len(listed) if self._targets is None else len(self._targets)
+        if not present:
+            raise UserError(
+                f"no image under {self.root / self.split} ({num_wanted:,} listed)",
+                "at least one listed image in rgb/ or gray/", "unpack the data set fully",
+            )  # fmt: skip
+        if len(present) < num_wanted:
+            absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
+            _log.warning("%s: %s listed images are absent", self.name, absent)
+        return np.array(present, np.int64)
+
+    def _log_oddities(self, with_model: Collection[int]) -> None:
+        """Log what is left out, estimated or replaced."""
+        other = sum(scene.num_other for scene in self._scenes)
+        behind = sum(scene.num_behind for scene in self._scenes)
+        without: Counter[int] = sum((scene.without_model for scene in self._scenes), Counter())
+        left_out = other + without.total()
+        self._left_out = {"other_objects": left_out, "behind_the_camera": behind}
+        if other or behind:
+            got = f"{other:,} objects that are none of the parts and {behind:,} behind the camera"
+            _log.info("%s: left out %s", self.name, got)
+        if inexact := sum(int(scene.poses.inexact.sum()) for scene in self._scenes):
+            got = f"{inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
+            _log.warning("%s: %s; the nearest are taken", self.name, got)
+        if without:
+            listed = ", ".join(f"{number} ({count:,})" for number, count in sorted(without.items()))
+            _log.warning("%s: left out objects without a model: %s", self.name, listed)
+        fractions = np.concatenate([scene.poses.visible_fractions for scene in self._scenes])
+        if unknown := int(np.isnan(fractions).sum()):
+            _log.info("%s: %s objects' visible fractions are estimated", self.name, f"{unknown:,}")
+        lacking = 0
+        for number, row in self._items.tolist() if self._targets is not None else ():
+            scene = self._scenes[number]
+            present = Counter(scene.poses.obj_ids[scene.objects(row)].tolist())
+            counts = self._target_counts(scene, row) or Counter()
+            counted = self._parts.keys() | (counts.keys() - with_model if with_model else set())
+            lacking += sum(max(0, counts[obj_id] - present[obj_id]) for obj_id in counted)
+        if lacking:
+            got = "listed instances have no annotation or no model and are not counted"
+            _log.warning("%s: %s %s", self.name, f"{lacking:,}", got)
+
+    def _target_counts(self, scene: Scene, row: int) -> Counter[int] | None:
+        """Return how many instances of each object the list has on an image; None for all."""
+        assert self._targets is not None
+        return self._targets[int(scene.folder.name), int(scene.image_ids[row])]
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def sample(self, index: int, epoch: int = 0) -> Sample:
+        """Read an image; the epoch does not matter."""
+        number, row = self._items[index].tolist()
+        scene = self._scenes[number]
+        path = scene.folder / scene.files[row]
+        image = decode_rgb(read_content(path), str(path))
+        shape: Shape = image.shape[:2]
+        where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
+        K = check_camera(scene.K[row], (shape[1], shape[0]), where)
+        objects = scene.objects(row)
+        instances = [
+            self._instance(scene, k, path.stem, K, shape)
+            for k in range(objects.start, objects.stop)
+        ]
+        if self._targets is not None:
+            self._mark_wanted(instances, self._target_counts(scene, row))
+        depth = self._depth(scene, row, shape) if self._read_depth else None
+        key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
+        return Sample(image, K, instances, depth, self.name, key)
+
+    def _mark_wanted(self, instances: list[Instance], counts: Counter[int] | None) -> None:
+        """Mark the targets among an image's instances: of each object the most visible ones."""
+        if counts is None:
+            return
+        numbers = {part.name: number for number, part in self._parts.items()}
+        left = Counter(counts)
+        for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
+            instance.wanted = left[numbers[instance.label]] > 0
+            left[numbers[instance.label]] -= 1
+
+    def _instance(self, scene: Scene, k: int, stem: str, K: CameraMatrix, shape: Shape) -> Instance:
+        path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
+        mask = decode_mask(read_content(path), str(path), shape) if path.exists() else None
+        poses, part = scene.poses, self._parts[int(scene.poses.obj_ids[k])]
+        fraction = float(poses.visible_fractions[k])
+        return bop.make_instance(part, poses.T_cam_obj[k].copy(), K, fraction, mask, shape)
+
+    def _depth(self, scene: Scene, row: int, shape: Shape) -> DepthMap | None:
+        """Read the depth image; None in a scene without any."""
+        if not any(scene.depth_files):
+            return None
+        missing = f"depth/{scene.image_ids[row]:06d}.png"
+        path = scene.folder / (scene.depth_files[row] or missing)
+        return decode_depth(read_content(path), str(path), float(scene.depth_scales[row]), shape)
+
+    def view(self) -> tuple[Size, CameraMatrix, tuple[float, float] | None]:
+        """Return the first image's (width, height), its K, and the range of the objects' depths.
+
+        The range is the nearest and the farthest depth of a cuboid's centre over all images,
+        metres, rounded outwards to centimetres; None where no object is annotated.
+        """
+        depths = [
+            float(transform(T_cam_obj, self._parts[int(number)].cuboid[[CENTROID]])[0, 2])
+            for scene in self._scenes
+            for number, T_cam_obj in zip(scene.poses.obj_ids, scene.poses.T_cam_obj, strict=True)
+        ]
+        first = self.sample(0)
+        if not depths:
+            return first.size, first.K, None
+        return first.size, first.K, (floor(100 * min(depths)) / 100, ceil(100 * max(depths)) / 100)
+
+    def contains(self, label: str) -> bool:
+        """Tell whether an image holds this object."""
+        return bool(self._count_instances().get(label))
+
+    def describe(self) -> list[SourceInfo]:
+        """Return the hash of the annotation, the objects and the origin of visible fractions."""
+        digest = hashlib.sha256()
+        unknown = 0
+        for number, row in self._items.tolist():
+            scene, chosen = self._scenes[number], self._scenes[number].objects(row)
+            digest.update(f"{scene.folder.name}/{scene.image_ids[row]}".encode())
+            for array in (scene.K[row], scene.poses.T_cam_obj[chosen], scene.poses.obj_ids[chosen]):
+                digest.update(np.ascontiguousarray(array).tobytes())
+            unknown += int(np.isnan(scene.poses.visible_fractions[chosen]).sum())
+        identity: dict[str, object] = {
+            "annotation": digest.hexdigest(),
+            "objects": {part.name: part.mesh_hash for part in self._parts.values()},
+            "left_out": self._left_out,
+            "visible_fractions": "scene_gt_info.json" if not unknown else bop.ESTIMATED,
+        }
+        return [SourceInfo(self.name, len(self), identity, self._count_instances())]
+
+    def _count_instances(self) -> dict[str, int]:
+        counts: Counter[int] = Counter()
+        for number, row in self._items.tolist():
+            scene = self._scenes[number]
+            counts.update(scene.poses.obj_ids[scene.objects(row)].tolist())
+        return {part.name: counts[object_id] for object_id, part in self._parts.items()}
+
+
+def _scene_folders(root: Path, split: str) -> list[Path]:
+    """Return a split's scenes by number: the folders whose names are numbers."""
+    if not (root / split).is_dir():
+        splits = sorted({path.parent.parent.name for path in root.glob("*/*/scene_camera.json")})
+        raise UserError(
+            f"{root / split}, which is no folder",
+            f"one of {splits}" if splits else "a BOP data set's folder with its splits",
+            "correct data.root or data.image_sets; without labelled images to learn from, "
+            "data=bop_renders learns renders of the models",
+        )
+    folders = [p for p in (root / split).iterdir() if bop.is_number(p.name) and p.is_dir()]
+    if not folders:
+        raise UserError(
+            f"{root / split}, which has no scene", "folders 000000, 000001, …",
+            "unpack the data set's images into it",
+        )  # fmt: skip
+    return sorted(folders, key=lambda path: (int(path.name), path.name))

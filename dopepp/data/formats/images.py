@@ -1,0 +1,228 @@
+"""Images of all layouts: decoded whole or reported, and encoded.
+
+BOP's images are PNG, JPEG or TIFF, in a file or in a member of a tar file; the frames and maps of
+YCB-Video, NDDS and FAT are PNG or JPEG files. Masks in BOP-WebDataset are run lengths down the
+columns, as COCO's uncompressed RLE: ``{"size": [height, width], "counts": [zeros, ones, …]}``.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dopepp.data.formats.problems import STRICT, Place, mapping
+from dopepp.drawing.pictures import (
+    MAX_PIXELS,
+    DepthMap,
+    Mask,
+    Picture,
+    Shape,
+    read_content,
+    read_image,
+    whole_picture,
+)
+
+FORMATS: Final = ("PNG", "JPEG", "TIFF")
+"""Formats of BOP's images."""
+
+COLOUR_MODES: Final = ("RGB", "RGBA", "L", "LA", "P", "CMYK", "YCbCr")
+"""Pillow's pixel types of BOP's colour and grey images."""
+
+DEPTH_MODES: Final = ("I;16", "I;16B", "I", "L")
+"""Pillow's pixel types of BOP's depth images: whole numbers."""
+
+DEPTH_SCALES_MM: Final = (0.1, 1.0)
+"""Millimetres a unit of the depth images that are written: up to 6.5 m, and up to 65 m."""
+
+_MAX_UNITS: Final = 65_535
+
+
+def picture(
+    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+) -> Image.Image | None:
+    """Decode a BOP image; return None where it is missing, damaged, too large or of another kind.
+
+    Args:
+        place: The image's file, or its name where ``content`` is given.
+        content: Bytes of an image that is no file of its own.
+        modes: Allowed pixel types, by Pillow's names; none allows any.
+    """
+    if content is None:
+        content = place["image"].attempt(lambda: read_content(Path(place.path)))
+    if content is None:
+        return None
+    try:
+        image = whole_picture(content, FORMATS)
+    except ValueError as error:
+        got = f"unreadable or truncated, {len(content):,} bytes ({error})"
+        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_PIXELS / 1e6:.0f} megapixels"
+        place["image"].report(got, allowed)
+        return None
+    if modes and image.mode not in modes:
+        place["image"].report(f"pixels of type {image.mode}", "colour or grey of 8 bits")
+        return None
+    return image
+
+
+def picture_shape(
+    place: Place, content: bytes | None = None, modes: Sequence[str] = ()
+) -> Shape | None:
+    """Return the (height, width) of an image after decoding it like :func:`picture`."""
+    image = picture(place, content, modes)
+    if image is not None:
+        return image.height, image.width
+    return stated_shape(Path(place.path) if content is None else io.BytesIO(content))
+
+
+def stated_shape(file: Path | io.BytesIO) -> Shape | None:
+    """Return the (height, width) that a damaged image states, or None.
+
+    So other images can be compared with a truncated one.
+    """
+    try:
+        with Image.open(file, formats=FORMATS) as image:
+            width, height = image.size
+    except Exception:  # Pillow raises another type for every way to be damaged
+        return None
+    return (height, width) if 0 < width * height <= MAX_PIXELS else None
+
+
+def decode_rgb(content: bytes, where: str) -> Picture:
+    """Decode a colour or grey image as RGB, without an alpha channel.
+
+    Raises:
+        UserError: The image is no PNG, JPEG or TIFF, damaged, too large, or not of 8 bits.
+    """
+    image = picture(Place(STRICT, where), content, COLOUR_MODES)
+    assert image is not None
+    return np.array(image.convert("RGB"))
+
+
+def decode_depth(content: bytes, where: str, depth_scale: float, shape: Shape) -> DepthMap:
+    """Decode a depth image as metres, float32, 0 where unknown.
+
+    ``depth_scale`` is in millimetres a unit, NaN where it is not stated; ``shape`` is the colour
+    image's (height, width).
+
+    Raises:
+        UserError: As for :func:`decode_rgb`, or another size, no whole numbers, or no scale.
+    """
+    place = Place(STRICT, where)
+    units = one_channel_of(place, shape, content, DEPTH_MODES)
+    assert units is not None
+    if np.isnan(depth_scale):
+        place["image"].report("no depth_scale", "depth_scale (mm a unit) beside the image's cam_K")
+    return (units.astype(np.float64) * (depth_scale / 1000)).astype(np.float32)
+
+
+def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
+    """Decode a mask of an image of ``shape`` (height, width); the object's pixels are not 0.
+
+    Raises:
+        UserError: As for :func:`decode_rgb`, or another size, or several channels.
+    """
+    mask = one_channel_of(Place(STRICT, where), shape, content)
+    assert mask is not None
+    return np.asarray(mask != 0)
+
+
+def one_channel_of(
+    place: Place, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
+) -> NDArray[Any] | None:
+    """Decode a BOP depth image or mask like :func:`picture`; return None where it is reported.
+
+    ``modes`` are allowed pixel types; none allows any with one channel.
+    """
+    image = picture(place, content)
+    if image is None:
+        return None
+    if len(image.getbands()) > 1 or (modes and image.mode not in modes):
+        allowed = "one channel of 16-bit whole numbers" if modes else "one channel"
+        place["channels"].report(f"pixels of type {image.mode}", allowed)
+        return None
+    return one_channel(place, np.asarray(image), shape)
+
+
+def read_map(place: Place, shape: Shape | None, colour: bool = False) -> NDArray[Any] | None:
+    """Read a map (depth, labels) of YCB-Video, NDDS or FAT; return None where it is reported.
+
+    ``shape`` is the colour image's (height, width), None for any. Where ``colour`` is allowed, a
+    map of several channels, whose meaning no file states, returns None without a report.
+    """
+    image = place["image"].attempt(lambda: read_image(Path(place.path)))
+    if image is not None and image.ndim > 2 and colour:
+        one_channel(place, image[..., 0], shape)
+        return None
+    return one_channel(place, image, shape)
+
+
+def one_channel(
+    place: Place, image: NDArray[Any] | None, shape: tuple[int, ...] | None
+) -> NDArray[Any] | None:
+    """Return a map, or None where it has several channels or another size than the image."""
+    if image is None:
+        return None
+    if image.ndim != 2:
+        place["channels"].report(f"an image of {image.shape[2]}", "one channel")
+        return None
+    if shape is not None and image.shape != tuple(shape[:2]):
+        got = f"{image.shape[1]}×{image.shape[0]} pixels"
+        place["size"].report(got, f"{shape[1]}×{shape[0]}, the colour image's size")
+        return None
+    return image
+
+
+def encode_png(pixels: NDArray[Any]) -> bytes:
+    """Return an RGB (uint8) or one-channel (uint8, uint16) image as PNG."""
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".png", pixels)[1])
+
+
+def depth_units(depth: DepthMap, covered: Mask) -> tuple[NDArray[np.uint16], float]:
+    """Convert metres into units of a 16-bit image; return the units and BOP's ``depth_scale``.
+
+    The scale is the finest one that reaches the farthest object: 0.1 mm within 6.5 m. Background
+    beyond the scale's range becomes 0, unknown. ``covered`` are the pixels of the objects.
+    """
+    farthest = 1000 * float(depth[covered].max(initial=0.0))
+    fine, coarse = DEPTH_SCALES_MM
+    scale = fine if farthest <= _MAX_UNITS * fine else coarse
+    units = np.rint(np.asarray(depth, np.float64) * (1000 / scale))
+    return np.where(units <= _MAX_UNITS, units, 0).astype(np.uint16), scale
+
+
+def encode_runs(mask: Mask) -> dict[str, list[int]]:
+    """Return a mask as run lengths, the first of which counts zeros."""
+    pixels = mask.ravel(order="F")
+    borders = np.flatnonzero(np.diff(pixels)) + 1
+    runs = np.diff(np.concatenate([[0], borders, [pixels.size]])).tolist()
+    return {"counts": [0, *runs] if pixels.size and pixels[0] else runs, "size": list(mask.shape)}
+
+
+def decode_runs(record: object, shape: Shape, place: Place) -> Mask | None:
+    """Decode the run lengths of a mask; return None where they are reported.
+
+    ``record`` must have the image's ``shape`` (height, width) as its size, so a file cannot ask for
+    more memory, and its runs must fill it.
+    """
+    fields = mapping(record)
+    counts, size = fields.get("counts"), fields.get("size")
+    whole = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
+    if size != list(shape):
+        got = "missing" if record is None else f"size {size!r:.40}"
+        place.report(got, f"runs of size [{shape[0]}, {shape[1]}], the image's")
+    elif not whole or counts is None or sum(counts) != shape[0] * shape[1]:
+        allowed = f"a list of run lengths that add up to {shape[0] * shape[1]} pixels"
+        place.report(f"counts {counts!r:.40}", allowed)
+    else:
+        pixels = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+        return np.asarray(pixels.reshape(shape, order="F"))
+    return None

@@ -1,0 +1,160 @@
+"""Where shards are: from a folder, file or URL that a user writes to local files."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path, PurePosixPath
+from typing import Final
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import partial_path
+
+_log = logging.getLogger(__name__)
+
+MAX_SHARDS: Final = 100_000
+MAX_SHARD_BYTES: Final = 20_000_000_000
+"""Largest shard to download; BOP's have about 1 GB."""
+
+_MAX_TEXT: Final = 4000
+"""Characters of a path; Python reads no number with more digits."""
+
+_MAX_BRACES: Final = 10
+_PIECE_BYTES: Final = 1 << 20
+
+_RANGE: Final = re.compile(r"\{(-?\d+)\.\.(-?\d+)(?:\.\.-?\d+)?\}")
+_SCHEME: Final = re.compile(r"([a-z][a-z0-9+.-]+):", re.IGNORECASE)
+
+
+def find_shards(
+    root: Path,
+    shards: str | Sequence[str],
+    download_dir: Path | None = None,
+    allow_commands: bool = False,
+) -> list[Path]:
+    """Return the shards as local files, in the order in which they are named.
+
+    Args:
+        root: Folder that relative paths start from.
+        shards: A folder (its ``*.tar`` by name), a file, a URL, or several of them; braces as in
+            ``shard-{000000..000009}.tar`` are expanded.
+        download_dir: Where shards from URLs are kept; one that is there is not fetched again.
+        allow_commands: Whether ``pipe:COMMAND`` may be run: a path that somebody else wrote into a
+            config would run it with the user's rights.
+    """
+    paths = []
+    for text in _expanded([shards] if isinstance(shards, str) else shards):
+        scheme = _SCHEME.match(text)
+        if scheme is None:
+            paths += _local(root / text)
+        elif scheme[1].lower() == "file":
+            paths += _local(Path(url2pathname(urlsplit(text).path)))
+        else:
+            paths.append(_fetched(text, scheme[1].lower(), download_dir, allow_commands))
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise UserError(f"shard {twice} twice", "each shard once", "correct data.image_sets")
+    return paths
+
+
+def _expanded(texts: Sequence[str]) -> list[str]:
+    from braceexpand import braceexpand  # comes with the webdataset library
+
+    expanded: list[str] = []
+    for text in texts:
+        if _longest_range(text) >= MAX_SHARDS:
+            raise _too_many(text)
+        try:
+            # Of a command, braces belong to the command.
+            lazily = [text] if text.startswith("pipe:") else braceexpand(text)
+            expanded += islice(lazily, MAX_SHARDS + 1)
+        except ValueError as error:
+            raise UserError(
+                f"shards {text!r:.100}: {error}", "braces as in shard-{000000..000009}.tar",
+                "close the brace",
+            ) from error  # fmt: skip
+        if len(expanded) > MAX_SHARDS:
+            raise _too_many(text)
+    return expanded
+
+
+def _longest_range(text: str) -> int:
+    """Return the length of the longest ``{1..9}``, all of which the library lists at once."""
+    # Texts too long, or with more braces than a path needs, count as too long a range.
+    if len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES:
+        return MAX_SHARDS
+    return max((abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text)), default=0)
+
+
+def _too_many(text: str) -> UserError:
+    return UserError(f"shards {text!r:.100}", f"at most {MAX_SHARDS:,} shards", "correct the range")
+
+
+def _local(path: Path) -> list[Path]:
+    if path.is_dir():
+        shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))
+        if shards:
+            return shards
+    elif path.is_file():
+        return [path]
+    raise UserError(
+        f"shards {path}, {'a folder without *.tar' if path.is_dir() else 'no such file or folder'}",
+        "a folder of shard-000000.tar, …, a shard, or a URL", "correct data.root or image_sets",
+    )  # fmt: skip
+
+
+def _fetched(url: str, scheme: str, folder: Path | None, allow_commands: bool) -> Path:
+    if scheme == "pipe" and not allow_commands:
+        raise UserError(
+            f"shards {url!r:.100}, a command to run", "files, folders and URLs of shards",
+            "download the shards, or allow commands in so many words (allow_commands=True)",
+        )  # fmt: skip
+    if folder is None:
+        raise UserError(
+            f"shards {url!r:.100}, which are not on this machine",
+            "local shards, or a folder to download them into",
+            "set data.download_dir",
+        )
+    name = PurePosixPath(urlsplit(url).path).name
+    if scheme == "pipe" or not name.endswith(".tar"):
+        name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
+    path = folder / name
+    if not path.exists():
+        _log.info("downloading %s to %s", url, path)
+        _download(url, scheme, path)
+    return path
+
+
+def _download(url: str, scheme: str, path: Path) -> None:
+    """Copy a shard through the library's own opener, within bounds; all of it or nothing."""
+    # Imports torch where it is installed, so only those who download pay for it.
+    from webdataset.gopen import gopen, gopen_schemes
+
+    if scheme not in gopen_schemes:
+        known = sorted(gopen_schemes.keys() - {"__default__", "pipe"})
+        raise UserError(f"shards {url!r:.100}", f"URLs of {', '.join(known)}", "correct the URL")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial, size = partial_path(path), 0
+    try:
+        with gopen(url) as stream, partial.open("wb") as file:
+            while piece := stream.read(_PIECE_BYTES):
+                size += len(piece)
+                if size > MAX_SHARD_BYTES:
+                    raise UserError(
+                        f"{url} of over {size / 1e9:.0f} GB",
+                        f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB", "download it by hand",
+                    )  # fmt: skip
+                file.write(piece)
+        partial.replace(path)
+    except OSError as error:  # the library's for a command that failed, and a full disk
+        raise UserError(
+            f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}",
+            "a URL that can be read and enough space", "check the URL and the connection",
+        ) from error  # fmt: skip
+    finally:
+        partial.unlink(missing_ok=True)
