@@ -7,7 +7,7 @@ line in ``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/call
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from dopepp.core.errors import RunError
 from dopepp.data.batch import Batch
 from dopepp.maps.encode import Beliefs, Fields, MapGeometry
 from dopepp.models.heads import Stage
@@ -29,11 +30,15 @@ from dopepp.parts.part import Part
 from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
 from dopepp.recovery.recover import recover_batch
-from dopepp.training.callbacks.averaging import go_on_with_trained
-from dopepp.training.callbacks.finite import check_state
 from dopepp.training.loggers import MetricsTable
-from dopepp.training.symmetry import SymmetryHandling, SymmetryOptions
-from dopepp.training.targets import Targets, choose_keypoints, draw_maps
+from dopepp.training.optimizers import go_on_with_trained
+from dopepp.training.targets import (
+    SymmetryHandling,
+    SymmetryOptions,
+    Targets,
+    choose_keypoints,
+    draw_maps,
+)
 
 OptimizerFactory = Callable[[Iterable[nn.Parameter]], Optimizer]
 SchedulerFactory = Callable[[Optimizer, int], LRScheduler]
@@ -107,7 +112,7 @@ class PoseSystem(LightningModule):
 
         An instance that is too little visible for a metric to count is left out. A symmetric part
         looks the same in several poses: the maps are of the one nearest a reference orientation
-        (:mod:`~dopepp.training.symmetry`), or, where two are as good, of the one that the network
+        (:mod:`~dopepp.training.targets`), or, where two are as good, of the one that the network
         itself tends to, as its answer to the images shows (``stages``; without it, the first).
         """
         keypoints = batch.keypoints
@@ -199,7 +204,8 @@ class PoseSystem(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Make the file self-describing: anybody can load it without this module or a config.
 
-        If the weights are not finite, no file gets them: a ``RunError``.
+        Raises:
+            RunError: Weights or optimiser state are not finite.
         """
         check_state(checkpoint)
         checkpoint["dopepp"] = self.payload
@@ -208,3 +214,25 @@ class PoseSystem(LightningModule):
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
     """Return what describes a schedule itself, of its state."""
     return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}
+
+
+def all_finite(tensors: Iterable[Tensor]) -> bool:
+    """Return whether every number is finite; waits for the device once."""
+    flags = [tensor.isfinite().all() for tensor in tensors if tensor.is_floating_point()]
+    return not flags or bool(torch.stack(flags).all())
+
+
+def check_state(checkpoint: Mapping[str, Any]) -> None:
+    """Refuse, with a :class:`RunError`, to save weights or optimiser states that are not finite."""
+    for name, text in (("state_dict", "weights"), ("optimizer_states", "optimiser's state")):
+        if not all_finite(_tensors(checkpoint.get(name))):
+            when = f"after step {checkpoint.get('global_step')}"
+            raise RunError(f"the {text} not finite {when}: nothing was saved, the run ends")
+
+
+def _tensors(value: object) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, (Mapping, list, tuple)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _tensors(item)

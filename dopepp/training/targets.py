@@ -1,23 +1,65 @@
-"""Target maps: what the network is asked to give for a batch."""
+"""Target maps: what the network is asked to give for a batch, also for symmetric parts.
+
+A pose T and T·S look the same when S maps the part onto itself, so a network that is asked for both
+learns their mean, which is neither. Of all T·S it is asked for one: the nearest to a reference
+orientation, as seen along the line of sight. Where another is nearly as near, at a sector's border,
+it may give either. The poses that metrics compare with are left as they are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check_fields
 from dopepp.data.batch import PADDING, Batch
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.maps.encode import Beliefs, Fields, MapGeometry, encode
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
-from dopepp.training.symmetry import SymmetryHandling
+from dopepp.parts.part import Part
 
 Keypoints = Float[Tensor, "batch instances 9 2"]
 Targets = tuple[Beliefs, Fields]
 """Belief maps and vector fields as the network should give them."""
+
+FACING: Final = np.diag([1.0, -1.0, -1.0])
+"""The reference orientation: the part's +z at the camera, its +y up in the image."""
+
+UP: Final = np.array([0.0, -1.0, 0.0])
+"""Where the axis of a round part points in its reference orientation: up in the image."""
+
+
+@dataclass(frozen=True)
+class SymmetryOptions:
+    """How symmetric parts are learnt.
+
+    Attributes:
+        canonical: Whether keypoints are those of the equivalent pose nearest the reference.
+        border_deg: Equivalent poses whose angle to the reference exceeds the nearest's by less than
+            this, degrees, are as good: the one with the least loss is learnt. 0: never.
+    """
+
+    canonical: bool = True
+    border_deg: Annotated[float, Range(0, 360, "degrees")] = 30.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.border_deg > 0 and not self.canonical:
+            raise UserError(
+                f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false",
+                "0 where there are no sectors and so no borders",
+                "set symmetry=none, or symmetry.canonical=true",
+            )
 
 
 def draw_maps(
@@ -41,23 +83,23 @@ def choose_keypoints(
     loss: MapLoss,
     geometry: MapGeometry,
 ) -> Keypoints:
-    """Return each instance's keypoints in the one of its look-alike poses that is to be learnt.
+    """Return each instance's keypoints in the pose, of those that look alike, to be learnt.
 
-    That is the pose nearest the reference orientation. Where another one is as good, it is the one
-    whose maps the network's answer (``stages``) has the lower loss to; one instance is decided
-    after the other. Without an answer it is always the nearest.
+    This is the pose nearest the reference orientation. Where another pose is as good, the one is
+    taken whose maps have the lower loss to the network's answer (``stages``); instances are decided
+    one after the other. Without an answer it is always the nearest pose.
     """
-    found = symmetry.equivalents(batch)
-    keypoints = found.keypoints[:, :, 0].clone()
+    choices, allowed = symmetry.equivalents(batch)
+    keypoints = choices[:, :, 0].clone()
     if stages is None:
         return keypoints
-    for slot, choice in found.allowed[:, :, 1:].any(dim=0).nonzero().tolist():
+    for slot, choice in allowed[:, :, 1:].any(dim=0).nonzero().tolist():
         # Only the images on which this instance may take this choice are drawn, twice.
-        rows = found.allowed[:, slot, 1 + choice].nonzero()[:, 0]
+        rows = allowed[:, slot, 1 + choice].nonzero()[:, 0]
         some = batch.rows(rows)
         answer = [(logits[rows].detach(), field[rows].detach()) for logits, field in stages]
         other = keypoints[rows]
-        other[:, slot] = found.keypoints[rows, slot, 1 + choice]
+        other[:, slot] = choices[rows, slot, 1 + choice]
         present_loss, other_loss = (
             loss.per_image(answer, *draw_maps(some, points, symmetry.num_objects, geometry))
             for points in (keypoints[rows], other)
@@ -65,3 +107,159 @@ def choose_keypoints(
         better = other_loss < present_loss
         keypoints[rows] = torch.where(better[:, None, None, None], other, keypoints[rows])
     return keypoints
+
+
+class Equivalents(NamedTuple):
+    """Poses that look alike, the one to learn first: projected cuboids of each, input pixels.
+
+    ``allowed`` marks those that may be learnt; the first always may.
+    """
+
+    keypoints: Float[Tensor, "batch instances choices 9 2"]
+    allowed: Bool[Tensor, "batch instances choices"]
+
+
+class SymmetryHandling:
+    """Finds the poses that look like a labelled one; parts are in the order of the channels."""
+
+    def __init__(self, parts: Sequence[Part], options: SymmetryOptions) -> None:
+        self.options, self.num_objects = options, len(parts)
+        rows = [_row(part) for part in parts]
+        longest = max(len(row["transforms"]) for row in rows)
+        for row in rows:
+            count = len(row["transforms"])
+            padding = [np.eye(4)[None]] * (longest - count)
+            row["there"] = np.arange(longest) < count
+            row["transforms"] = np.concatenate([row["transforms"], *padding])
+        self.active = options.canonical and any(row["symmetric"] for row in rows)
+        self._tables = {
+            name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]
+        }
+
+    def equivalents(self, batch: Batch) -> Equivalents:
+        """Return the poses of a batch's instances that look alike.
+
+        Instances of parts without symmetries have their own keypoints alone, bit by bit.
+        """
+        poses, excess = self._poses(batch)
+        order = excess.argsort(dim=-1, stable=True)
+        nearest = excess.gather(-1, order)
+        poses = poses.gather(2, order[..., None, None].expand_as(poses))
+        index = batch.object_index.clamp(min=0)
+        tables = self._on(batch.T_cam_obj.device)
+        symmetric = tables["symmetric"][index] & (batch.object_index != PADDING)
+        keypoints = _project(poses, tables["cuboids"][index], batch.K).to(batch.keypoints.dtype)
+        own = batch.keypoints[:, :, None].expand_as(keypoints)
+        border = np.radians(self.options.border_deg)
+        allowed = symmetric[..., None] & (nearest - nearest[..., :1] < border)
+        allowed[..., 0] = True
+        return Equivalents(torch.where(symmetric[..., None, None, None], keypoints, own), allowed)
+
+    def _poses(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Return T·S·C of every discrete S, and the angle of each to the reference.
+
+        C is the best turn about a round part's axis. Poses are (batch, instances, choices, 4, 4),
+        angles (batch, instances, choices), radians, infinite for what pads the table.
+        """
+        tables = self._on(batch.T_cam_obj.device)
+        index = batch.object_index.clamp(min=0)
+        poses = batch.T_cam_obj.double()[:, :, None] @ tables["transforms"][index]
+        sight = _line_of_sight(batch.T_cam_obj.double(), tables["fixed"][index])
+        towards = (sight @ tables["references"][index]).mT[:, :, None]
+        axes = tables["axes"][index][:, :, None]
+        turns = _best_turn(towards @ poses[..., :3, :3], axes)
+        offset = tables["offsets"][index][:, :, None]
+        shifts = offset - (turns @ offset[..., None])[..., 0]
+        moved = poses[..., :3, 3] + (poses[..., :3, :3] @ shifts[..., None])[..., 0]
+        rotations = poses[..., :3, :3] @ turns
+        poses = poses.clone()
+        poses[..., :3, :3], poses[..., :3, 3] = rotations, moved
+        trace = (towards @ rotations).diagonal(dim1=-2, dim2=-1).sum(-1)
+        angle = ((trace - 1) / 2).clamp(-1, 1).arccos()
+        return poses, torch.where(tables["there"][index], angle, torch.inf)
+
+    def _on(self, device: torch.device) -> dict[str, Tensor]:
+        if self._tables["axes"].device != device:
+            self._tables = {name: table.to(device) for name, table in self._tables.items()}
+        return self._tables
+
+
+def _row(part: Part) -> dict[str, np.ndarray]:
+    """Return a part's symmetries with the reference that its poses are compared with."""
+    discrete = part.symmetries_discrete
+    transforms = np.eye(4)[None]
+    if discrete is not None and len(discrete):
+        transforms = np.concatenate([transforms, discrete])
+    axis, offset, reference = np.zeros(3), np.zeros(3), FACING
+    orbit = transforms[:, :3, :3] @ part.cuboid[CENTROID] + transforms[:, :3, 3]
+    fixed = orbit.mean(axis=0)  # every symmetry only reorders the orbit
+    if part.symmetries_continuous:
+        # A ball has more axes than this one; its maps are round whatever is chosen.
+        axis, offset = map(np.array, part.symmetries_continuous[0])
+        axis = axis / np.linalg.norm(axis)
+        reference = _between(FACING @ axis, UP) @ FACING
+        fixed = offset + axis * (axis @ (fixed - offset))
+    return {
+        "transforms": transforms,
+        "axes": axis,
+        "offsets": offset,
+        "references": reference,
+        "fixed": fixed,
+        "cuboids": part.cuboid,
+        "symmetric": np.array(bool(part.symmetries_continuous) or len(transforms) > 1),
+    }
+
+
+def _between(start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest rotation of one unit vector to another."""
+    across = np.cross(start, end)
+    sine, cosine = np.linalg.norm(across), start @ end
+    if sine < 1e-9:  # the same, or opposite: then half a turn in the image plane
+        return np.eye(3) if cosine > 0 else np.diag([-1.0, -1.0, 1.0])
+    return rotation_vector_to_matrix(across / sine * np.arctan2(sine, cosine))
+
+
+def _line_of_sight(
+    T_cam_obj: Float[Tensor, "batch instances 4 4"], fixed: Float[Tensor, "batch instances 3"]
+) -> Float[Tensor, "batch instances 3 3"]:
+    """Return the smallest rotation of the optical axis to the direction of a part's centre.
+
+    A part that moves across the image keeps its look when it turns with this.
+    """
+    centre = (T_cam_obj[..., :3, :3] @ fixed[..., None])[..., 0] + T_cam_obj[..., :3, 3]
+    x, y, z = torch.nn.functional.normalize(centre, dim=-1).unbind(-1)
+    # Rodrigues' formula for the axis (−y, x, 0); at z = −1, behind the camera, nothing is drawn.
+    c = 1 / (1 + z).clamp(min=1e-6)
+    rows = [1 - c * x * x, -c * x * y, x, -c * x * y, 1 - c * y * y, y, -x, -y, z]
+    return torch.stack(rows, -1).reshape(*x.shape, 3, 3)
+
+
+def _best_turn(
+    offset: Float[Tensor, "*batch 3 3"], axes: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return the turn C about an axis that brings offset·C nearest to the identity.
+
+    tr(A·C(θ)) = aᵀAa + cos θ·(tr A − aᵀAa) + sin θ·tr(A·[a]×) is largest at the angle of the two
+    factors. An axis of zeros stands for no continuous symmetry: then C is the identity.
+    """
+    x, y, z = axes.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
+    along = (axes[..., None, :] @ offset @ axes[..., None])[..., 0, 0]
+    cosine = offset.diagonal(dim1=-2, dim2=-1).sum(-1) - along
+    sine = (offset @ skew).diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = torch.atan2(sine, cosine)[..., None, None]
+    turns: Tensor = torch.eye(3, dtype=offset.dtype, device=offset.device)
+    return turns + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
+
+
+def _project(
+    poses: Float[Tensor, "batch instances choices 4 4"],
+    cuboids: Float[Tensor, "batch instances 9 3"],
+    K: Float[Tensor, "batch 3 3"],
+) -> Float[Tensor, "batch instances choices 9 2"]:
+    """Project the cuboids' points; NaN at or behind the camera."""
+    points = cuboids[:, :, None] @ poses[..., :3, :3].mT + poses[..., None, :3, 3]
+    depth = points[..., 2:]
+    rays = torch.where(depth > 0, points / depth, torch.nan)
+    return (rays @ K.double()[:, None, None].mT)[..., :2]

@@ -14,8 +14,7 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoi
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.part import Part
-from dopepp.training.symmetry import FACING, SymmetryHandling, SymmetryOptions
-from dopepp.training.targets import draw_maps
+from dopepp.training.targets import FACING, SymmetryHandling, SymmetryOptions, draw_maps
 
 K = camera_matrix(110.0, 110.0, 63.5, 63.5)
 HALF_TURNS = np.stack(
@@ -184,7 +183,7 @@ def test_instances_on_one_image_choose_each_for_itself(plate_system):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"border_deg": -1.0}, "symmetry.border_deg"),
+        ({"border_deg": -1.0}, "border_deg"),
         ({"canonical": False}, "border_deg=30.0 with symmetry.canonical=false"),
     ],
 )

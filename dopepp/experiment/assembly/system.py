@@ -28,10 +28,10 @@ from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen
 from dopepp.recovery.calibration import RecoveryOptions
-from dopepp.training.callbacks.averaging import AveragedWeights
 from dopepp.training.callbacks.throughput import RunProgress, make_profiler
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
+from dopepp.training.optimizers import AveragedWeights
 from dopepp.training.processes import WatchedDDP
 from dopepp.training.system import PoseSystem
 

@@ -15,7 +15,7 @@ from dopepp.experiment.config.parse import Node, Range, Seed, parse
 from dopepp.experiment.config.protocols import Protocols
 from dopepp.experiment.run.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
-from dopepp.training.symmetry import SymmetryOptions
+from dopepp.training.targets import SymmetryOptions
 
 T = TypeVar("T")
 

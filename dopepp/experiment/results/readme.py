@@ -22,7 +22,7 @@ from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, rea
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.results.tables import markdown_text
 from dopepp.metrics.row import shown_columns
-from dopepp.training.callbacks.pictures import best_effort
+from dopepp.training.callbacks.validation import best_effort
 
 README_FILE: Final = "README.md"
 

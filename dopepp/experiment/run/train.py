@@ -53,10 +53,10 @@ from dopepp.experiment.run.resume import ConfigDifference, check_resume, remembe
 from dopepp.experiment.run.tracking import log_report, tracked
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.parts.part import Parts
-from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import FOLDER as PROFILE
 from dopepp.training.callbacks.throughput import profile_rows
 from dopepp.training.callbacks.trial import PrunedError, raise_if_pruned
+from dopepp.training.callbacks.validation import EarlyStop
 from dopepp.training.checkpointing.files import FOLDER, check_room, newest_checkpoint, saved_step
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.processes import ProcessDiedError

@@ -1,14 +1,14 @@
-"""The checkpoint a run goes on from: saved by the clock, at moments that leave no trace.
+"""The checkpoint that a run is resumed from: saved by the clock, at moments that leave no trace.
 
 A run that was cut off anywhere and resumed ends with the weights, the best checkpoint and the
 metrics of one that was not, as far as its arithmetic repeats (on CPUs it does). See
 ``docs/reliability.md``. Ctrl-C and SIGTERM are remembered and answered between two steps.
 
-Lightning counts a batch as begun when it hands it out, an epoch as open until its metrics are
-logged, and derives from such differences at which hook a checkpoint was taken. Taken inside a
-batch or a validation, and at the end of an epoch, those counters lead to replayed or skipped
-batches. So the counters of a checkpoint are set to a moment between two batches, at the beginning
-of a validation or between two epochs; only these are resumed from.
+Lightning's ``ModelCheckpoint`` keeps the best checkpoint, and cannot keep this one. It saves inside
+a batch or a validation, or at the end of an epoch, where Lightning's counters (a batch counts as
+begun when it is handed out, an epoch as open until its metrics are logged) lead to replayed or
+skipped batches. The counters of every checkpoint are therefore set to a moment between two batches,
+at the beginning of a validation or between two epochs, and only these are resumed from.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from dopepp.core.interrupts import Interruption
+from dopepp.core.validation import Range, check
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseLoader
 from dopepp.training.checkpointing import files
@@ -55,11 +56,8 @@ class LastCheckpoint(Checkpoint):
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
-        if every_s < 0:
-            raise ValueError(f"every_s={every_s}, must be at least 0")
-        if not 0 < max_share <= 1:
-            raise ValueError(f"max_share={max_share}, must be in (0, 1]")
-        self.every_s, self.max_share = every_s, max_share
+        self.every_s = check("every_s", every_s, float, Range(0, 1e9, "seconds"))
+        self.max_share = check("max_share", max_share, float, Range(1e-9, 1))
         self._stop = StopRequest()
         self._cut: Cut | None = None
         self._random: dict[str, Any] | None = None
@@ -93,7 +91,11 @@ class LastCheckpoint(Checkpoint):
         _find_place(trainer)
         if trainer.is_global_zero:
             files.sweep(Path(trainer.default_root_dir))
-            _set_aside_damaged(trainer)
+            # A damaged file must not take the place of the whole one that is resumed from.
+            last = Path(trainer.default_root_dir) / files.FOLDER / files.LAST
+            resumed = trainer.ckpt_path
+            if resumed is not None and Path(resumed).name != files.LAST and last.exists():
+                last.replace(last.with_name(f"{files.LAST}.damaged"))
         _forget_later_best(trainer)
         self._saved, self._saved_at = _state(trainer), time.monotonic()
         self._stop = StopRequest()
@@ -114,7 +116,7 @@ class LastCheckpoint(Checkpoint):
     def on_validation_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
-        """Save if it is time; the validation is repeated as a whole."""
+        """Save if it is time; a resumed run repeats the validation as a whole."""
         self._save_if_due(trainer, before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -168,12 +170,12 @@ class LastCheckpoint(Checkpoint):
 
 
 class StopRequest:
-    """Takes the signals that ask a run to stop, so that it can save before it does.
+    """Catches the signals that ask a run to stop, so that it can save before it does.
 
     The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
-    that is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
+    it is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
     the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
-    ``number`` is the signal that asked, SIGTERM for SIGUSR1; None as long as nobody has.
+    ``number`` is the signal that was caught, SIGTERM for SIGUSR1, or None.
     """
 
     def __init__(self) -> None:
@@ -207,19 +209,8 @@ class StopRequest:
             os.write(2, _ANSWERS[self.number])
 
 
-def _set_aside_damaged(trainer: Trainer) -> None:
-    """Keep a damaged file from taking the place of the whole one that is resumed from."""
-    last = Path(trainer.default_root_dir) / files.FOLDER / files.LAST
-    if (
-        trainer.ckpt_path is not None
-        and Path(trainer.ckpt_path).name != files.LAST
-        and last.exists()
-    ):
-        last.replace(last.with_name(f"{files.LAST}.damaged"))
-
-
 def _find_place(trainer: Trainer) -> None:
-    """Go to the place of the epoch that the loop's counters tell."""
+    """Set loop and loader to the batch of the epoch at which the loop's counters stand."""
     epoch_loop, epochs = trainer.fit_loop.epoch_loop, trainer.fit_loop.epoch_progress.total
     batches = epoch_loop.batch_progress
     num_done = 0 if batches.is_last_batch else batches.current.ready
@@ -233,15 +224,17 @@ def _find_place(trainer: Trainer) -> None:
 
 
 def _state(trainer: Trainer) -> tuple[int, float | None]:
-    """Return the step and the best score: what a checkpoint that is worth saving differs in."""
+    """Return the step and the best score: a checkpoint that differs in neither is not saved."""
     score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
 
 
 def _best(trainer: Trainer) -> ModelCheckpoint | None:
     """Return the callback that keeps the best checkpoint."""
-    kept = (one for one in trainer.checkpoint_callbacks if isinstance(one, ModelCheckpoint))
-    return next((one for one in kept if one.monitor is not None), None)
+    for callback in trainer.checkpoint_callbacks:
+        if isinstance(callback, ModelCheckpoint) and callback.monitor is not None:
+            return callback
+    return None
 
 
 def _forget_later_best(trainer: Trainer) -> None:

@@ -19,9 +19,14 @@ from dopepp.experiment.results.tables import read_csv
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
 from dopepp.training.callbacks import throughput
-from dopepp.training.callbacks.pictures import AUCCurves, Overlays
-from dopepp.training.callbacks.pose_metrics import LOGGED, PoseMetricsCallback, batch_instances
 from dopepp.training.callbacks.throughput import Operators, Throughput, make_profiler, profile_rows
+from dopepp.training.callbacks.validation import (
+    LOGGED,
+    AUCCurves,
+    Overlays,
+    PoseMetricsCallback,
+    batch_instances,
+)
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 

@@ -11,7 +11,7 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
-from dopepp.training.callbacks.empty_maps import EmptyMaps
+from dopepp.training.callbacks.guards import EmptyMaps
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 CAUSES = ("too little training", "a learning rate", "labels or units")
@@ -61,7 +61,7 @@ def first_cause(caplog: pytest.LogCaptureFixture) -> str:
 
 @pytest.fixture(autouse=True)
 def warnings(caplog):
-    caplog.set_level(logging.WARNING, "dopepp.training.callbacks.empty_maps")
+    caplog.set_level(logging.WARNING, "dopepp.training.callbacks.guards")
 
 
 def test_a_falling_loss_needs_more_steps(validations, caplog):

@@ -20,9 +20,9 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
 from dopepp.experiment.results.tables import read_csv
-from dopepp.training.callbacks.finite import FOLDER, FiniteSteps, check_state
+from dopepp.training.callbacks.guards import FOLDER, FiniteSteps
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
-from dopepp.training.system import PoseSystem
+from dopepp.training.system import PoseSystem, check_state
 
 NUM_BATCHES = 4
 
@@ -240,7 +240,7 @@ from pathlib import Path
 import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch.utils.data import DataLoader, TensorDataset
-from dopepp.training.callbacks.finite import FiniteSteps
+from dopepp.training.callbacks.guards import FiniteSteps
 from dopepp.training.processes import WatchedDDP
 
 class Line(LightningModule):

@@ -16,11 +16,11 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
 from dopepp.experiment.results.tables import read_csv
-from dopepp.training.callbacks.averaging import TRAINED, AveragedWeights
-from dopepp.training.callbacks.pose_metrics import EarlyStop
 from dopepp.training.callbacks.throughput import Throughput
+from dopepp.training.callbacks.validation import EarlyStop
 from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.checkpointing.last import LastCheckpoint
+from dopepp.training.optimizers import TRAINED, AveragedWeights
 from dopepp.training.system import PoseSystem
 
 TIMES = ("throughput/images_per_s", "throughput/loader_wait")
@@ -249,5 +249,5 @@ def test_a_decay_out_of_its_range(decay):
 
 @pytest.mark.parametrize("options", [{"every_s": -1.0}, {"max_share": 0.0}, {"max_share": 1.5}])
 def test_arguments_out_of_range(options):
-    with pytest.raises(ValueError, match=f"{next(iter(options))}="):
+    with pytest.raises(UserError, match=f"{next(iter(options))}="):
         LastCheckpoint(**options)

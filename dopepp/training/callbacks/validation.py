@@ -1,35 +1,134 @@
-"""Pictures of every validation, as files in the run folder and in the loggers that take pictures.
+"""Validation in poses: metrics, early stopping, and pictures in the run folder and the loggers.
 
-To draw another sheet of the first validation images, a subclass of :class:`ValidationSheet` with a
-``name`` and :meth:`~ValidationSheet.tiles`, a line in
-``dopepp/experiment/assembly/registries.py`` and
-an entry in ``conf/callbacks``.
+Poses are recovered from the maps and go into the accumulator that every evaluation uses. To log
+another metric, add a field of :class:`~dopepp.metrics.row.PoseRow` and its name in :data:`LOGGED`.
+To draw another sheet of the first validation images, add a subclass of :class:`ValidationSheet`
+with a ``name`` and :meth:`~ValidationSheet.tiles`, a line in
+``dopepp/experiment/assembly/registries.py`` and an entry in ``conf/callbacks``.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import EarlyStopping
 
 from dopepp.core.files import write_png
 from dopepp.data.batch import Batch
+from dopepp.data.sample import Instance
 from dopepp.drawing.curves import figure_image, save_accuracy_curves
 from dopepp.drawing.overlay import GREEN, YELLOW, Wireframe, overlay
 from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, belief_tiles, contact_sheet
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
-from dopepp.training.callbacks.pose_metrics import PoseMetricsCallback
+from dopepp.metrics.pose import MEAN, PoseMetrics
+from dopepp.metrics.row import PoseRow
+from dopepp.parts.part import Part
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.system import PoseSystem, ValidationOutput
 
 _log = logging.getLogger(__name__)
+
+LOGGED: Final = (
+    "add_01d", "add_s_01d", "pass_5cm", "pass_10cm", "auc_10cm", "auc_s_10cm", "ar_mssd",
+    "ar_mspd", "median_rotation_deg", "median_rotation_s_deg", "miss_rate",
+)  # fmt: skip
+_OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")
+"""These do not exist where nothing was found."""
+
+
+class PoseMetricsCallback(Callback):
+    """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
+
+    ``val/selection`` is what the best checkpoint is chosen by: the mean over objects of the exact
+    AUC up to 0.1 m, of ADD, or of ADD-S for an object with symmetries ("ADD(-S)").
+
+    The metrics stay readable on :attr:`metrics` for callbacks further down the list.
+    """
+
+    metrics: PoseMetrics
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Prepare an accumulator for the system's parts."""
+        assert isinstance(pl_module, PoseSystem)
+        self.metrics = PoseMetrics(pl_module.parts)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start counting anew, on the device that gathers across processes."""
+        self.metrics.to(pl_module.device).reset()
+
+    def on_validation_batch_end(  # type: ignore[override]
+        self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
+    ) -> None:
+        """Recover the batch's poses and compare them with its instances."""
+        detections = system.recover(outputs, batch)
+        truths = batch_instances(batch, system.parts)
+        width = batch.images.shape[-1]
+        cameras = batch.K.double().cpu().numpy()
+        for found, instances, K in zip(detections, truths, cameras, strict=True):
+            self.metrics.update(found, instances, K, width)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the mean over objects; what does not exist (nothing matched) is left out."""
+        rows = self.metrics.compute()
+        values = {name: getattr(rows[MEAN], name) for name in LOGGED}
+        values["selection"] = _selection([row for name, row in rows.items() if name != MEAN])
+        for name, value in values.items():
+            # A selection needs a number even where no object was in the validation images.
+            if value is None and name not in _OF_MATCHES:
+                value = math.nan
+            if value is not None:
+                on_bar = name == "add_01d"
+                pl_module.log(f"val/{name}", float(value), prog_bar=on_bar, rank_zero_only=False)
+
+
+def _selection(rows: Sequence[PoseRow]) -> float | None:
+    areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in rows]
+    known = [area for area in areas if area is not None]
+    return sum(known) / len(known) if known else None
+
+
+def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
+    """Yield each image's ground truth in the form that samples have."""
+    index = batch.object_index.cpu().numpy()
+    poses, keypoints = batch.T_cam_obj.double().cpu().numpy(), batch.keypoints.cpu().numpy()
+    visible = batch.visible_fraction.cpu().numpy()
+    for row in range(len(batch)):
+        yield [
+            Instance(parts[c].name, poses[row, n], keypoints[row, n], float(visible[row, n]))
+            for n, c in enumerate(index[row])
+            if c >= 0
+        ]
+
+
+class EarlyStop(EarlyStopping):
+    """Lightning's callback, for runs that are resumed.
+
+    The patience is that of the present config, not the saved one; and a run that has stopped does
+    not train further, unless it now has more patience.
+    """
+
+    @property
+    def impatient(self) -> bool:
+        """Whether there were as many validations without an improvement as there may be."""
+        return bool(self.wait_count >= self.patience)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on counting."""
+        super().load_state_dict({**state_dict, "patience": self.patience})
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """End at once what has ended before."""
+        if self.impatient:
+            trainer.should_stop = True
 
 
 class AUCCurves(Callback):
@@ -49,7 +148,7 @@ class AUCCurves(Callback):
         folder = Path(trainer.default_root_dir)
         with best_effort(f"{folder}/val_auc"):
             figure = save_accuracy_curves(folder / "val_auc", curves, title=title)
-            log_picture(trainer, "val/auc", figure_image(figure))
+            _log_picture(trainer, "val/auc", figure_image(figure))
 
 
 class ValidationSheet(Callback):
@@ -89,7 +188,7 @@ class ValidationSheet(Callback):
         path = Path(trainer.default_root_dir) / f"val_{self.name}.png"
         with best_effort(str(path)):
             write_png(path, sheet)
-        log_picture(trainer, f"val/{self.name}", sheet)
+        _log_picture(trainer, f"val/{self.name}", sheet)
 
 
 class Overlays(ValidationSheet):
@@ -132,8 +231,7 @@ class BeliefMaps(ValidationSheet):
         return tiles
 
 
-def log_picture(trainer: Trainer, name: str, image: Picture) -> None:
-    """Hand an RGB picture to TensorBoard and Weights & Biases where they are on."""
+def _log_picture(trainer: Trainer, name: str, image: Picture) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, GuardedLogger):
             logger.log_picture(name, image, trainer.global_step)
@@ -141,7 +239,7 @@ def log_picture(trainer: Trainer, name: str, image: Picture) -> None:
 
 @contextmanager
 def best_effort(what: str) -> Iterator[None]:
-    """Report it in a line where a file cannot be written, and go on."""
+    """Report a file that cannot be written in one line, and go on."""
     try:
         yield
     except OSError as error:

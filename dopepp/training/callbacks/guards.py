@@ -1,0 +1,325 @@
+"""Guards of a training: steps that are not finite, and belief maps that stay empty.
+
+Whether a step is taken must be known before it is taken, so :class:`FiniteSteps` waits for the
+device once per optimiser step: three numbers, as often as torch's own gradient scaler does.
+A network whose maps are empty gives no pose, and every pose metric is zero whatever the reason;
+:class:`EmptyMaps` names the likely reasons. To add a reason, write a method like
+:meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._causes`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+from torch.optim import Optimizer
+
+from dopepp.core.errors import RunError
+from dopepp.core.files import write_png
+from dopepp.core.validation import Range, check
+from dopepp.data.batch import PADDING, Batch
+from dopepp.drawing.overlay import GREEN, Wireframe, overlay
+from dopepp.drawing.sheet import Tile, contact_sheet
+from dopepp.geometry.cuboid import CENTROID, NUM_KEYPOINTS
+from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
+from dopepp.models.losses import MapMSE
+from dopepp.models.storage import write_atomic
+from dopepp.training.system import PoseSystem, ValidationOutput, all_finite
+
+_log = logging.getLogger(__name__)
+
+FOLDER: Final = "nonfinite"
+"""Folder of the run that keeps the batch that ended it."""
+
+_COUNTS: Final = Range(1, 10**6)
+_MAX_TILES: Final = 64
+_CHECKED: Final = ("loss", "gradient", "batch norm's statistics")
+"""What is looked at after every backward pass, in this order."""
+
+_MIN_INSIDE: Final = 0.5
+"""With fewer keypoints than this inside the images, poses or camera are probably wrong."""
+_MIN_CELLS: Final = 3.0
+"""Objects narrower than this on the maps have their nine keypoints in one place."""
+_FALL: Final = 0.95
+"""A validation loss above this share of its first value has not fallen."""
+
+
+@dataclass
+class _Pass:
+    """One forward and backward pass; ``bad`` marks what of it is not finite (as ``_CHECKED``)."""
+
+    batch: Batch
+    loss: Tensor
+    bad: Bool[Tensor, "checked"]
+
+
+class FiniteSteps(Callback):
+    """Leaves out every optimiser step whose loss or gradient is not finite on any process.
+
+    Weights, the optimiser's state and batch norm's statistics then stay as they were; the step
+    counts as one, so the schedule goes on as planned. With accumulation the whole step is left out.
+    Gradients that only overflow because mixed precision scales them are its scaler's own business:
+    they are neither counted nor reported. ``train/skipped_steps`` counts over the whole run. After
+    ``max_in_a_row`` such steps one after the other the run ends, and leaves the last of their
+    batches in the run folder's ``nonfinite/``.
+    """
+
+    def __init__(self, max_in_a_row: int = 10) -> None:
+        self.max_in_a_row = check("max_in_a_row", max_in_a_row, int, _COUNTS)
+        self.skipped = self.in_a_row = 0
+        self._passes: list[_Pass] = []
+        self._buffers: list[Tensor] = []
+        self._kept: list[Tensor] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the count of the whole run."""
+        return {"skipped": self.skipped}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on counting."""
+        self.skipped = int(state_dict["skipped"])
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Find what a forward pass changes: batch norm's statistics."""
+        self._passes = []
+        self._buffers = list(pl_module.buffers())
+        self._kept = [buffer.clone() for buffer in self._buffers]
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
+    ) -> None:
+        """Keep the statistics as they are before a step's first pass."""
+        self._batch = batch
+        if not self._passes and self._buffers:
+            torch._foreach_copy_(self._kept, self._buffers)
+
+    def on_before_backward(
+        self, trainer: Trainer, pl_module: LightningModule, loss: Tensor
+    ) -> None:
+        """Remember the loss, which is multiplied by the scaler's factor where there is one."""
+        self._loss = loss.detach()
+
+    def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Check the pass without waiting for the device."""
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        statistics = [buffer for buffer in self._buffers if buffer.is_floating_point()]
+        norms = [
+            torch.nn.utils.get_total_norm(tensors).to(self._loss)
+            for tensors in (gradients, statistics)
+        ]
+        bad = ~torch.stack([self._loss, *norms]).isfinite()
+        self._passes.append(_Pass(self._batch, self._loss, bad))
+
+    def on_before_optimizer_step(
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
+    ) -> None:
+        """Leave the step out if any process had a pass that was not finite.
+
+        Raises:
+            RunError: It is one too many, or the weights are not finite.
+        """
+        passes, self._passes = self._passes, []
+        bad = torch.stack([one_pass.bad for one_pass in passes]).sum(dim=0)
+        if trainer.world_size > 1:
+            torch.distributed.all_reduce(bad)
+        names = [name for name, count in zip(_CHECKED, bad.tolist(), strict=True) if count > 0]
+        if not names:
+            self.in_a_row = 0
+            return
+        scaler = getattr(trainer.precision_plugin, "scaler", None)
+        if scaler is not None and names == ["gradient"] and scaler.get_scale() >= 1:
+            return
+        if self._buffers:
+            torch._foreach_copy_(self._buffers, self._kept)
+        # A scaler has already seen what is wrong with the gradient, and leaves the step out itself.
+        if scaler is None or "gradient" not in names:
+            optimizer.zero_grad(set_to_none=True)
+        self.skipped += 1
+        self.in_a_row += 1
+        message = f"{' and '.join(names)} not finite in step {trainer.global_step}"
+        broken = not all_finite(pl_module.parameters())
+        if self.in_a_row >= self.max_in_a_row or broken:
+            folder = self._dump(trainer, passes, names)
+            reason = "the weights are not finite" if broken else f"{self.in_a_row} steps in a row"
+            raise RunError(f"{message} ({reason}): the run ends; its batch is in {folder}")
+        if trainer.is_global_zero:
+            counts = f"{self.in_a_row} in a row; at {self.max_in_a_row} the run ends"
+            _log.warning("%s: the step is left out (%s)", message, counts)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Log the count."""
+        pl_module.log("train/skipped_steps", float(self.skipped), rank_zero_only=False)
+
+    def _dump(self, trainer: Trainer, passes: list[_Pass], names: list[str]) -> Path:
+        """Write the first pass that was not finite, on every process that had one.
+
+        Gradients are summed over the processes, so where they alone are wrong, all have one.
+        """
+        folder = Path(trainer.default_root_dir) / FOLDER
+        bad = [
+            one_pass
+            for one_pass in passes
+            if (one_pass.bad[0] if "loss" in names else one_pass.bad.any())
+        ]
+        if bad:
+            facts: dict[str, Any] = {"step": trainer.global_step, "epoch": trainer.current_epoch}
+            facts |= {"not_finite": names, "loss": float(bad[0].loss)}
+            name = f"step_{trainer.global_step}_rank_{trainer.global_rank}"
+            _dump_batch(folder / name, bad[0].batch, facts)
+        return folder
+
+
+def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
+    """Write ``path.pt`` and ``path.png``; a disk that takes neither is reported, not raised.
+
+    The file is a mapping of the facts, plain values, and of the batch's fields, and loads under
+    ``weights_only=True``.
+    """
+    shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
+    images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
+    tiles = [
+        Tile(overlay(image, [Wireframe(points, GREEN, "true") for points in keypoints]), key)
+        for image, keypoints, key in zip(images, truths, shown.keys, strict=True)
+    ]
+    try:
+        write_atomic({**facts, **vars(batch.to("cpu"))}, path.with_name(f"{path.name}.pt"))
+        write_png(path.with_name(f"{path.name}.png"), contact_sheet(tiles))
+    except OSError as error:
+        _log.warning("the batch could not be written to %s: %s", path.parent, error)
+
+
+class EmptyMaps(Callback):
+    """Warns once, with the likely reasons, when no belief is high enough for any detection.
+
+    Maps are empty if no centroid's, or no corner's, belief reaches the threshold of the recovery
+    on any validation image. After ``patience`` such validations in a row (a network of few steps is
+    rightly silent), or at the end of a shorter training, one warning names the three usual causes,
+    the likely ones first, each with what the run shows of it and what to try.
+    """
+
+    def __init__(self, patience: int = 3) -> None:
+        self.patience = check("patience", patience, int, _COUNTS)
+        self._num_empty, self._warned = 0, False
+        self._first_loss = self._loss = math.nan
+        self._highest = torch.zeros(2)
+        self._inside: list[Tensor] = []
+        self._sizes: list[Tensor] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what has been seen, for a run that goes on."""
+        return {"empty": self._num_empty, "told": self._warned, "first_loss": self._first_loss}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on counting."""
+        self._num_empty, self._warned = int(state_dict["empty"]), bool(state_dict["told"])
+        self._first_loss = float(state_dict["first_loss"])
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forget the validation before."""
+        self._highest = torch.zeros(2, device=pl_module.device)
+        self._inside, self._sizes = [], []
+
+    def on_validation_batch_end(  # type: ignore[override]
+        self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
+    ) -> None:
+        """Keep the highest beliefs, and where the labels are."""
+        belief = outputs.belief.reshape(len(batch), -1, NUM_KEYPOINTS, *outputs.belief.shape[-2:])
+        highest = torch.stack([belief[:, :, :CENTROID].max(), belief[:, :, CENTROID].max()])
+        self._highest = torch.fmax(self._highest, highest)
+        height, width = batch.images.shape[-2:]
+        visible = batch.visible_fraction >= MIN_VISIBLE_FRACTION
+        keypoints = batch.keypoints[visible & (batch.object_index != PADDING)]
+        limit = keypoints.new_tensor([width, height])
+        self._inside.append(((keypoints >= 0) & (keypoints < limit)).all(dim=-1).float().flatten())
+        extent = keypoints.amax(dim=1) - keypoints.amin(dim=1)
+        self._sizes.append(extent.amax(dim=-1) / system.geometry.stride)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Count, and warn when there have been enough."""
+        assert isinstance(pl_module, PoseSystem)
+        if trainer.world_size > 1:
+            torch.distributed.all_reduce(self._highest, torch.distributed.ReduceOp.MAX)
+        self._loss = float(trainer.callback_metrics.get("val/loss", math.nan))
+        if math.isnan(self._first_loss):
+            self._first_loss = self._loss
+        corners, centroid = self._highest.tolist()
+        options = pl_module.recovery
+        enough = corners >= options.peak_threshold and centroid >= options.centroid_threshold
+        self._num_empty = 0 if enough else self._num_empty + 1
+        if self._num_empty >= self.patience:
+            self._warn(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Warn of a training with fewer validations."""
+        assert isinstance(pl_module, PoseSystem)
+        if self._num_empty:
+            self._warn(trainer, pl_module)
+
+    def _warn(self, trainer: Trainer, system: PoseSystem) -> None:
+        if self._warned or not trainer.is_global_zero:
+            return
+        self._warned = True
+        corners, centroid = self._highest.tolist()
+        options = system.recovery
+        lines = [
+            f"all belief maps are empty, no pose can be found (validations so far: "
+            f"{self._num_empty}): the highest belief of a corner is {corners:.2g} "
+            f"(recovery.peak_threshold={options.peak_threshold:g}), of a centroid {centroid:.2g} "
+            f"(recovery.centroid_threshold={options.centroid_threshold:g}). The usual causes:"
+        ]
+        causes = sorted(self._causes(trainer, system), key=lambda cause: not cause[0])
+        for number, (likely, name, text) in enumerate(causes, start=1):
+            lines.append(f"  {number}. {name}{' (likely here)' if likely else ''}: {text}")
+        _log.warning("\n".join(lines))
+
+    def _causes(self, trainer: Trainer, system: PoseSystem) -> list[tuple[bool, str, str]]:
+        """Return of each cause whether it is likely, its name, and what to look at and try."""
+        rate, labels = self._rate(trainer), self._labels()
+        early = (
+            f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
+            "train longer (trainer.max_epochs)"
+        )
+        if isinstance(system.loss, MapMSE):
+            early += (
+                "; to the squared error of model/loss=mse, whose peaks are a few cells of a map, "
+                "empty maps are a good answer for long: model/loss=spatial_ce learns from the "
+                "first step on"
+            )
+        return [
+            (not rate[0] and not labels[0], "too little training so far", early),
+            (rate[0], "a learning rate that is too high or too low", rate[1]),
+            (labels[0], "labels or units that do not fit the images", labels[1]),
+        ]
+
+    def _rate(self, trainer: Trainer) -> tuple[bool, str]:
+        """Judge the learning rate by the validation loss."""
+        first, last = self._first_loss, self._loss
+        flat = self._num_empty > 1 and not last < _FALL * first
+        rates = [group["lr"] for one in trainer.optimizers for group in one.param_groups]
+        present = f"{max(rates):.2g}" if rates else "unknown"
+        return flat, (
+            f"the validation loss went from {first:.4g} to {last:.4g}, the rate is {present} now; "
+            "job=lr_finder looks for one, optimizer.lr=… sets it"
+        )
+
+    def _labels(self) -> tuple[bool, str]:
+        """Judge the labels by where they are in the images."""
+        inside, sizes = torch.cat(self._inside), torch.cat(self._sizes)
+        look = "look at val_overlay.png, whose truth is green, and run dopepp check on the data"
+        if not len(inside):
+            return True, f"no object in the validation images is visible enough to count; {look}"
+        share, cells = float(inside.mean()), float(sizes.nanmedian())
+        wrong = share < _MIN_INSIDE or not cells >= _MIN_CELLS
+        return wrong, (
+            f"{100 * share:.0f} % of the keypoints are inside the images and an object is "
+            f"{cells:.1f} cells of the maps wide; {look}; a part's unit is data.unit; small "
+            "objects need a larger data.input_size, narrow peaks a larger maps.sigma"
+        )
