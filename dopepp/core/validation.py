@@ -153,8 +153,13 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
     try:
         typed: T = _validated(kind, value, name)
     except ValidationError as error:
-        cause = _cause(error.errors()[0])  # of a __post_init__
-        raise cause or _user_error(next(_mistakes(kind, value, error)), name, fix) from None
+        if cause := _cause(error.errors()[0]):  # of a __post_init__
+            raise cause from None
+        first, *others = _mistakes(kind, value, error)
+        deeper = (one for one in others if one.location[: len(first.location)] == first.location)
+        # Of a union's alternatives, the one that fails deepest inside is the one that was meant.
+        mistake = max((first, *deeper), key=lambda one: len(one.location))
+        raise _user_error(mistake, name, fix) from None
     return typed
 
 
@@ -271,7 +276,7 @@ def _user_error(mistake: Mistake, root: str, fix: str) -> UserError:
 
 def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[Mistake]:
     """Translate pydantic's errors; those of a union's alternatives become one mistake."""
-    located = [(_location(value, detail["loc"]), detail) for detail in error.errors()]
+    located = [(_location(value, detail), detail) for detail in error.errors()]
     for location, group in groupby(located, key=lambda pair: pair[0]):
         details = [detail for _, detail in group]
         first = details[0]
@@ -285,12 +290,12 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
             yield Mistake(location, shown(first["input"]), allowed)
 
 
-def _location(value: object, steps: Sequence[str | int]) -> tuple[str | int, ...]:
+def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:
     """Return the steps that lead into the value; pydantic adds the names of union members."""
     location: list[str | int] = []
-    for number, step in enumerate(steps):
-        is_last = number == len(steps) - 1
-        if isinstance(value, Mapping) and (step in value or is_last):
+    for number, step in enumerate(detail["loc"]):
+        is_missing = detail["type"].startswith("missing") and number == len(detail["loc"]) - 1
+        if isinstance(value, Mapping) and (step in value or is_missing):
             location.append(step)
             value = value.get(step)
         elif isinstance(value, (list, tuple)) and isinstance(step, int):

@@ -11,13 +11,18 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from dopepp.core.errors import UserError
+from dopepp.core.validation import STRICT, Range, parse, shown
 from dopepp.data.sources.rendered import MAX_ITEMS, Split
-from dopepp.experiment.config.parse import Node, Range, Seed, Share, parse
 from dopepp.geometry.camera import camera_matrix
 from dopepp.virtual.presets.view import View, read_lens
 
+Node = Mapping[str, Any]
+"""``{"_target_": …, argument: …}`` for a registry; without a target there is no such thing."""
 Cache = Literal["none", "memory", "disk"]
 Count = Annotated[int, Range(1, MAX_ITEMS)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+Share = Annotated[float, Range(0, 1)]
+Side = Annotated[int, Range(8, 16384)]
 
 MAX_WORKERS: Final = 1024
 """More loader processes than any machine here has cores: a slip of the keyboard."""
@@ -29,13 +34,11 @@ _CLOSED: Final = ("data.jitter", "data.masking", "data.augment", "data.image_set
 """Nodes of an evaluation's data in which every option that can be changed is there already."""
 
 
-Side = Annotated[int, Range(8, 16384)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class LensConfig:
     """A camera's picture size and camera matrix, pixels, as its file states them."""
 
+    __pydantic_config__ = STRICT
     width: Side
     height: Side
     fx: float
@@ -62,6 +65,7 @@ class VirtualConfig:
         camera_scale: By how much the network sees its pictures scaled; None chooses.
     """
 
+    __pydantic_config__ = STRICT
     preset: str | None = None
     scene: Mapping[str, Any] | None = None
     backgrounds: str | None = None
@@ -70,6 +74,11 @@ class VirtualConfig:
     camera: LensConfig | None = None
     working_distance: tuple[float, ...] | None = None
     camera_scale: Annotated[float, Range(0.01, 1.0)] | None = None
+
+    @classmethod
+    def of(cls, node: object) -> VirtualConfig:
+        """Read the node; an option of it may be a :class:`UserError`."""
+        return parse(cls, with_lens(node or {}), "virtual")
 
     @property
     def view(self) -> View | None:
@@ -98,6 +107,7 @@ class TestConfig:
         cache: Where renders are kept; ``disk`` keeps them for the next evaluation.
     """
 
+    __pydantic_config__ = STRICT
     renderer: str | None = None
     cache: Cache = "none"
 
@@ -144,6 +154,7 @@ class DataConfig:
         num_workers: Processes that load; None takes one a core.
     """
 
+    __pydantic_config__ = STRICT
     name: str
     format: str
     root: Path | None
@@ -158,9 +169,9 @@ class DataConfig:
     targets: str | None = None
     classes: Mapping[str, str] | None = None
     download_dir: str | None = None
-    jitter: Mapping[str, Any] = field(default_factory=dict)
-    masking: Mapping[str, Any] = field(default_factory=dict)
-    augment: Mapping[str, Any] = field(default_factory=dict)
+    jitter: Node = field(default_factory=dict)
+    masking: Node = field(default_factory=dict)
+    augment: Node = field(default_factory=dict)
     virtual: VirtualConfig = VirtualConfig()
     test: TestConfig = TestConfig()
     cache: Cache = "none"
@@ -179,10 +190,18 @@ class DataConfig:
 
         A :class:`UserError`: an option is unknown, missing, of a wrong type or out of range.
         """
-        if isinstance(data, Mapping):
-            _check_size(data.get("input_size"))
-        how = parse(VirtualConfig, with_lens(virtual or {}), "virtual")
-        return parse(cls, data, "data", virtual=how)
+        if isinstance(data, Mapping) and "virtual" in data:
+            got = f"data.virtual={shown(data['virtual'])}"
+            raise UserError(got, "virtual.… alone", "set virtual.…")
+        return replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
+
+    def __post_init__(self) -> None:
+        if any(side < 1 or side % _MULTIPLE for side in self.input_size or ()):
+            raise UserError(
+                f"data.input_size={list(self.input_size or ())}",
+                f"[width, height], each a multiple of {_MULTIPLE}",
+                "round up; images are letterboxed into it",
+            )
 
     @property
     def network_input(self) -> tuple[int, int]:
@@ -257,18 +276,6 @@ def with_lens(virtual: object) -> object:
     return {**virtual, "camera": lens}
 
 
-def _check_size(size: object) -> None:
-    if size is None:
-        return
-    sides = size if isinstance(size, list) and len(size) == 2 else [0]
-    if not all(type(side) is int and side > 0 and side % _MULTIPLE == 0 for side in sides):
-        raise UserError(
-            f"data.input_size={size}",
-            f"[width, height], each a multiple of {_MULTIPLE}",
-            "round up; images are letterboxed into it",
-        )
-
-
 def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> VirtualConfig:
     """Return how to render: a whole node as given, or the stored one with options changed."""
     if not {"renderer", "preset"} <= set(given):  # else a file of conf/virtual
@@ -277,7 +284,7 @@ def _chosen_virtual(given: Mapping[str, Any], stored: object, source: str) -> Vi
                 f"{source}, which does not say how to render", "virtual=default", "add it"
             )
         given = _changed(stored, given, "virtual")
-    return parse(VirtualConfig, with_lens(given), "virtual")
+    return VirtualConfig.of(given)
 
 
 def _changed(base: object, changes: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 import torch
 
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.data import DataConfig, with_lens
-from dopepp.experiment.config.parse import Node, Range, Seed, parse
+from dopepp.core.validation import STRICT, Range, parse, shown
+from dopepp.experiment.config.data import Count, DataConfig, Node, Seed, Share, with_lens
 from dopepp.experiment.config.protocols import Protocols
-from dopepp.experiment.run.tuning import FalsePositiveTarget
 from dopepp.models.layers import MAX_WIDTH, MIN_WIDTH
 from dopepp.training.targets import SymmetryOptions
 
-T = TypeVar("T")
+C = TypeVar("C", bound="MeasurementConfig")
 
 _MOST: Final = 10**6
 _MAX_EPOCHS: Final = 10**9
@@ -28,7 +27,6 @@ _MAX_THRESHOLD: Final = 1000
 """Above any map size in cells, angle in degrees and number of peaks that means something."""
 
 Cells = Annotated[float, Range(_MIN_CELLS, _MAX_THRESHOLD)]
-Threshold = Annotated[float, Range(0, _MAX_THRESHOLD)]
 Rate = Annotated[float, Range(1e-12, 1e3)]
 
 
@@ -45,6 +43,7 @@ class ModelConfig:
         loss: Node of :data:`~dopepp.models.network.LOSSES`.
     """
 
+    __pydantic_config__ = STRICT
     name: str
     width: Annotated[float, Range(MIN_WIDTH, MAX_WIDTH)]
     backbone: Node
@@ -57,6 +56,7 @@ class ModelConfig:
 class MapsConfig:
     """The target maps: a belief peak's standard deviation and the field's discs' radius, cells."""
 
+    __pydantic_config__ = STRICT
     sigma: Cells
     field_radius: Cells
 
@@ -78,6 +78,7 @@ class TrainerConfig:
         lightning: Further arguments of Lightning's Trainer, which refuses what it does not know.
     """
 
+    __pydantic_config__ = STRICT
     accelerator: str = "auto"
     devices: Any = 1
     num_nodes: Annotated[int, Range(1, _MOST)] = 1
@@ -90,15 +91,11 @@ class TrainerConfig:
     lightning: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, node: Mapping[str, Any]) -> TrainerConfig:
-        """Read the node; a :class:`UserError` tells what is wrong with an option of ours."""
-        ours = {one.name for one in fields(cls)} - {"lightning"}
-        return parse(
-            cls,
-            {key: value for key, value in node.items() if key in ours},
-            "trainer",
-            lightning={key: value for key, value in node.items() if key not in ours},
-        )
+    def node(cls, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the options with those that are Lightning's under ``lightning``."""
+        ours = {field.name for field in fields(cls)} - {"lightning"}
+        lightning = {key: value for key, value in options.items() if key not in ours}
+        return {**{key: options[key] for key in options if key in ours}, "lightning": lightning}
 
     @property
     def num_processes(self) -> int:
@@ -129,6 +126,7 @@ class TrainerConfig:
 class CostConfig:
     """``job=cost``: frames timed one by one, from picture to poses, and the network's batch."""
 
+    __pydantic_config__ = STRICT
     num_frames: Annotated[int, Range(1, _MOST)]
     batch_size: Annotated[int, Range(1, _MOST)]
 
@@ -140,6 +138,7 @@ class LearningRateConfig:
     Training ends earlier where the loss diverges.
     """
 
+    __pydantic_config__ = STRICT
     min_lr: Rate
     max_lr: Rate
     num_steps: Annotated[int, Range(10, _MOST)]
@@ -150,27 +149,51 @@ class LearningRateConfig:
             raise UserError(f"lr_finder.max_lr={self.max_lr:g}", allowed, "widen the range")
 
 
+@dataclass(frozen=True)
+class FalsePositiveTarget:
+    """How silent a network must be where its objects are not.
+
+    Attributes:
+        num_empty: Images without objects, for choosing the threshold and again for checking it.
+        false_positive_rate: Share of them on which the threshold may let a detection pass; 1 sets
+            no threshold.
+    """
+
+    num_empty: Count = 500
+    false_positive_rate: Share = 0.005
+
+
 @dataclass(frozen=True, kw_only=True)
-class MeasurementConfig:
+class MeasurementConfig(FalsePositiveTarget):
     """What a training and an evaluation have in common: how a network is measured.
 
     Attributes:
         plain: The whole config in plain values, as it is shown and written down.
-        protocols: What is measured beside the test set as it is: ``shading``, ``scale_factors``,
-            ``by`` and ``num_bins``.
+        shading, scale_factors, by, num_bins: What is measured beside the test set as it is, see
+            :class:`~dopepp.experiment.config.protocols.Protocols`.
         tune: Whether to learn a factor on distances, a score and its threshold first.
-        false_positives: What tuning demands: ``num_empty`` and ``false_positive_rate``.
         refine: ``region`` measures, and tunes, with poses refined on the picture as well, ``depth``
             where the images have depth, a list of the two by both.
         output_dir: Folder of run folders.
     """
 
-    plain: Mapping[str, Any]
-    protocols: Protocols
+    __pydantic_config__ = STRICT
+    plain: Mapping[str, Any] = field(default_factory=dict)
+    shading: Any = None
+    scale_factors: Any = None
+    by: Any = None
+    num_bins: Any = 5
     tune: bool
-    false_positives: FalsePositiveTarget
     refine: str | tuple[str, ...] | None
     output_dir: Any
+
+    def __post_init__(self) -> None:
+        _ = self.protocols  # refuses a wrong option
+
+    @property
+    def protocols(self) -> Protocols:
+        """Shading, scale and rates per bin."""
+        return Protocols.of(vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,7 +243,7 @@ class RunConfig(MeasurementConfig):
     init_from: str | None
     model: ModelConfig
     maps: MapsConfig
-    recovery: Mapping[str, Threshold]
+    recovery: Mapping[str, int | float]
     symmetry: SymmetryOptions
     data: DataConfig
     optimizer: Node
@@ -233,11 +256,10 @@ class RunConfig(MeasurementConfig):
     def of(cls, config: Mapping[str, Any]) -> RunConfig:
         """Read a composed and resolved config; a :class:`UserError` tells what is wrong."""
         plain = {**config, "virtual": with_lens(config.get("virtual"))}
-        nodes = {
-            "data": DataConfig.of(plain.get("data"), plain.get("virtual")),
-            "trainer": TrainerConfig.of(plain.get("trainer") or {}),
-        }
-        return _parsed(cls, plain, ("virtual", *nodes), **nodes)
+        data = DataConfig.of(plain.get("data"), plain["virtual"])
+        options = {key: value for key, value in plain.items() if key != "virtual"}
+        options["trainer"] = TrainerConfig.node(options.get("trainer") or {})
+        return replace(_parsed(cls, options), plain=plain, data=data)
 
     def stored_data(self) -> dict[str, Any]:
         """Return what a checkpoint says of its data: the node ``data`` with ``virtual`` in it."""
@@ -279,16 +301,24 @@ class EvaluationConfig(MeasurementConfig):
         return _parsed(cls, config)
 
 
-def _parsed(kind: type[T], plain: Mapping[str, Any], read: Sequence[str] = (), **known: Any) -> T:
-    """Parse a config, of which some nodes have been read, with what a measurement asks for."""
-    names = [one.name for one in fields(FalsePositiveTarget)]
-    silent = {name: plain[name] for name in names if name in plain}
-    done = {*read, *silent, "shading", "scale_factors", "by", "num_bins"}
-    return parse(
-        kind,
-        {key: value for key, value in plain.items() if key not in done},
-        plain=plain,
-        protocols=Protocols.of(plain),
-        false_positives=parse(FalsePositiveTarget, silent),
-        **known,
-    )
+def _parsed(kind: type[C], options: Mapping[str, Any]) -> C:
+    """Parse a whole config."""
+    if "plain" in options:
+        raise UserError(
+            f"plain={shown(options['plain'])}", "the options of `--cfg job`", "remove it"
+        )
+    return replace(parse(kind, options), plain=options)
+
+
+def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the leaves of nested mappings by their dotted names; lists are leaves."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from flat(item, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, value
+
+
+def below(key: str, nodes: Sequence[str]) -> bool:
+    """Tell whether an option is one of some nodes or stands below one."""
+    return any(key == node or key.startswith(f"{node}.") for node in nodes)

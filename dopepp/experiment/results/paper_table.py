@@ -20,9 +20,9 @@ from scipy.stats import t
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_csv, write_png, write_whole
+from dopepp.core.validation import STRICT, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
-from dopepp.experiment.config.parse import parse
 from dopepp.experiment.results import display, tables
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import (
@@ -47,7 +47,7 @@ from dopepp.metrics.row import COLUMNS
 TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
 
-Printed = Mapping[str, Mapping[str, Mapping[str, float]]]
+Printed = Mapping[str, Mapping[str, Mapping[str, int | float]]]
 """Figures by label, object and measure."""
 
 _LABELS: Final = ("method", "object", "measure")
@@ -80,6 +80,7 @@ class PaperTable:
         notes: What must be said below the table.
     """
 
+    __pydantic_config__ = STRICT
     title: str
     kind: str = "poses"
     threshold: float = 0.05

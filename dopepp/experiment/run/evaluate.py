@@ -14,14 +14,14 @@ from dopepp.core.errors import UserError
 from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import share_in_words
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
-from dopepp.experiment.config.run import EvaluationConfig
+from dopepp.experiment.config.run import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
 from dopepp.experiment.results.measurement import measure_and_record, of_networks, refining
 from dopepp.experiment.results.readme import write_job_readme
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.images import warn_of_other_images
-from dopepp.experiment.run.tuning import FalsePositiveTarget, Tuning, tune, write_tuned
+from dopepp.experiment.run.tuning import Tuning, tune, write_tuned
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.runtimes import is_export
 from dopepp.models.network import PoseNetwork
@@ -151,7 +151,7 @@ def _tune_only(
         fix = "tune the checkpoint, then export the tuned one"
         raise UserError(f"tune=true of {asked.ckpt_path}, which is an export", "a checkpoint", fix)
     estimator = refining(loaded[0], asked.refine, parts)
-    tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked.false_positives)
+    tune_and_record(estimator, Path(asked.ckpt_path), parts, data, run_dir, asked)
     display.show_files(run_dir)
 
 

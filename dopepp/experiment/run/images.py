@@ -18,7 +18,7 @@ from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import DataConfig, trained_on
-from dopepp.experiment.config.parse import flat
+from dopepp.experiment.config.run import flat
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Parts

@@ -21,8 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
 from dopepp.core.yaml import read_yaml
-from dopepp.experiment.config.parse import below, flat
-from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.config.run import RunConfig, below, flat
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
     CONFIG_FILE,

@@ -266,10 +266,9 @@ def _measure_run(config: RunConfig, parts: Parts, run_dir: Path, trainer: Traine
     device = trainer.strategy.root_device
     estimator = PoseEstimator.load(path, device)
     if config.tune:
-        target = config.false_positives
         try:
             tuned = refining(estimator, config.refine, parts)
-            path = tune_and_record(tuned, path, parts, config.data, run_dir, target)
+            path = tune_and_record(tuned, path, parts, config.data, run_dir, config)
         except UserError as error:  # a network that learned little is measured as it is
             display.console.print(f"not tuned: {error}")
         else:

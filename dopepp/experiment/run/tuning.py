@@ -22,8 +22,8 @@ from dopepp.data.sample import Instance, Sample, Source
 from dopepp.data.transforms.shading import shade
 from dopepp.experiment.assembly.renders import empty_renders
 from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import Count, DataConfig
-from dopepp.experiment.config.parse import Share
+from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.run import FalsePositiveTarget
 from dopepp.experiment.run.memory import Memory
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.inference.estimator import PoseEstimator
@@ -41,20 +41,6 @@ HIDDEN: Final = 0.4
 """Share of each object that is hidden on the validation images that refined poses' scores learn
 from a second time: a network names a part that is hidden with little belief, and the picture may
 agree all the same."""
-
-
-@dataclass(frozen=True)
-class FalsePositiveTarget:
-    """How silent a network must be where its objects are not.
-
-    Attributes:
-        num_empty: Images without objects, for choosing the threshold and again for checking it.
-        false_positive_rate: Share of them on which the threshold may let a detection pass; 1 sets
-            no threshold.
-    """
-
-    num_empty: Count = 500
-    false_positive_rate: Share = 0.005
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
-from dopepp.experiment.config.parse import below, flat
+from dopepp.experiment.config.run import below, flat
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import (
     FAILURE_FILE,

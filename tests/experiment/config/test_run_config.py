@@ -14,7 +14,7 @@ from dopepp.experiment.config.run import EvaluationConfig, RunConfig
         *((option, option.lstrip("+")) for option in (
             "+speed=1", "seed=-1", "seed=1.5", "compile=1", "ema=nan", "num_empty=0",
             "num_empty=2.5", "false_positive_rate=1.5", "maps.sigma=0", "data.eval_seed=-1",
-            "data.parts=pivconnector", "data.batch_size=0", "data.num_val=0",
+            "data.batch_size=0", "data.num_val=0",
             "data.num_workers=-1", "data.real_fraction=1.5", "data.input_size=64", "data.root=1",
             "lr_finder.num_steps=9", "trainer.max_epochs=0", "+trainer.num_nodes=0",
             "trainer.ddp_timeout_s=0",
@@ -24,6 +24,7 @@ from dopepp.experiment.config.run import EvaluationConfig, RunConfig
         ("++data.virtual.preset=table", "data.virtual={'preset': 'table'}"),
         ("~data.batch_size", "no data.batch_size"),
         ("~trainer", "no trainer.max_epochs"),
+        ("data.parts=pivconnector", "data.parts='pivconnector'"),
         ("job=mow", "job='mow'"),
         ("seed=true", "seed=True"),
         ("tune=maybe", "tune='maybe'"),
@@ -81,6 +82,6 @@ def test_values_are_typed_and_the_plain_config_stays(composed):
     assert config.trainer.lightning["limit_val_batches"] == 2
     assert config.protocols.shading == (0.4,)
     assert type(config.recovery["max_peaks"]) is int
-    assert config.false_positives.num_empty == 500
+    assert config.num_empty == 500
     assert config.stored_data()["virtual"] == plain["virtual"]
     assert (config.ema, config.logger, config.search) == (0.5, None, None)

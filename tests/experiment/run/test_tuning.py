@@ -10,9 +10,9 @@ import torch
 
 from dopepp.core.errors import UserError
 from dopepp.data.sample import Instance, Sample
+from dopepp.experiment.config.run import FalsePositiveTarget
 from dopepp.experiment.run.tuning import (
     HIDDEN,
-    FalsePositiveTarget,
     Hidden,
     Scored,
     choose,
