@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -31,7 +30,6 @@ def node(
         typer.Argument(help="of --json and --udp: as `dopepp predict` takes it"),
     ] = None,
     ros2: Annotated[bool, typer.Option("--ros2", help="a node of ROS 2 (extra ros2)")] = False,
-    ros1: Annotated[bool, typer.Option("--ros1", help="a node of ROS 1 (rospy)")] = False,
     bag: Annotated[
         Path | None, typer.Option(help="answer a recording: .bag, .mcap, a folder; with --out")
     ] = None,
@@ -75,7 +73,7 @@ def node(
     """
     words = list(source or ())
     with resumable("the node has ended"):
-        ways = {"--ros2": ros2, "--ros1": ros1, "--bag": bag, "--json": json_lines, "--udp": udp}
+        ways = {"--ros2": ros2, "--bag": bag, "--json": json_lines, "--udp": udp}
         way = _way([one for one, given in ways.items() if given], words, out, params)
         if refine not in (None, "region"):
             raise UserError(f"--refine {refine}", "region, or none", "leave it out")
@@ -101,28 +99,23 @@ def node(
             say_lines(worker, zip(sources, cameras, strict=True), udp)
         elif bag is not None and out is not None:
             _answer(worker, bag, out, topic, name)
-        elif ros2:
+        else:
             from dopepp.robot.nodes.ros2 import run
 
             run(worker, topic or TOPIC, name, params)
-        else:
-            from dopepp.robot.nodes.ros1 import run as run_ros1
-
-            run_ros1(worker, topic or TOPIC, name, words)
 
 
 def _way(given: Sequence[str], words: Sequence[str], out: Path | None, params: Path | None) -> str:
     """Return which way was asked for; a UserError where options do not go together."""
     if len(given) != 1:
         got = " and ".join(given) or "no way in and out"
-        allowed = "one of --ros2, --ros1, --bag FILE --out FILE, --json, --udp HOST:PORT"
+        allowed = "one of --ros2, --bag FILE --out FILE, --json, --udp HOST:PORT"
         raise UserError(got, allowed, "say how pictures come in and poses go out")
     way = given[0]
-    strange = [one for one in words if way != "--ros1" or ":=" not in one]
     for wrong, got, allowed, fix in (
         (way in LINES and not words, f"{way} without a source", "a camera, a video, pictures, …",
          "name it behind the model"),
-        (way not in LINES and strange, f"{way} with {strange[:1]}", "no source: pictures come "
+        (way not in LINES and words, f"{way} with {words[:1]}", "no source: pictures come "
          "from --topic, or from the recording", "leave it out"),
         ((way == "--bag") != (out is not None), "--bag without --out, or --out without --bag",
          "both", "add --out poses.mcap"),
@@ -131,11 +124,6 @@ def _way(given: Sequence[str], words: Sequence[str], out: Path | None, params: P
     ):  # fmt: skip
         if wrong:
             raise UserError(got, allowed, fix)
-    if way == "--ros1" and find_spec("rospy") is None:
-        raise UserError(
-            "--ros1 without rospy", "a Python that imports ROS 1's rospy", "install it (Debian: "
-            "python3-rospy) and name its folder in a .pth of this environment: docs/robot.md",
-        )  # fmt: skip
     if way in PACKAGES:
         require(PACKAGES[way][0], way, PACKAGES[way][1])
     return way

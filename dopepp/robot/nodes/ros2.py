@@ -1,25 +1,40 @@
 """A node of ROS 2: the wheels of the extra ``ros2``, or the rclpy of an installed ROS.
 
 Pictures are taken RELIABLE, unless the camera offers less: best effort loses large messages. The
-queue is short and emptied at once; what waits for the network is one picture (:mod:`.pump`).
+queue is short and emptied at once. A camera does not wait and a network takes its time, so one
+picture waits in a :class:`Slot` while the last one is processed, and a newer one replaces it.
 What has no messages installed (``vision_msgs``, ``tf2_msgs``) is left out, which is said.
 """
 
 from __future__ import annotations
 
+import array
 import logging
-from collections.abc import Iterator
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
+
+import numpy as np
 
 from dopepp.core.errors import UserError
 from dopepp.inference.sources.message import info_topic
-from dopepp.robot.nodes.messages import DIAGNOSTICS, Message
-from dopepp.robot.nodes.native import native, type_of
-from dopepp.robot.nodes.pump import Pump
-from dopepp.robot.nodes.worker import Worker
+from dopepp.robot.nodes.messages import (
+    DIAGNOSTICS,
+    OVERLAY,
+    Fields,
+    Message,
+    Speaker,
+    Triangles,
+    diagnosis,
+)
+from dopepp.robot.nodes.worker import Stamp, Worker
 
 QUEUE_IN: Final = 5
 """With queues of one at both ends, a process that a busy machine lets wait for 33 ms loses pictures
@@ -30,7 +45,12 @@ QUEUE_OUT: Final = 10
 WAIT_S: Final = 0.2
 """Seconds between two looks at whether the node is to end."""
 
+RECENT: Final = 100
+"""Pictures over which rates and latencies are told."""
+
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item")
 
 
 def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> None:
@@ -58,12 +78,12 @@ def run(worker: Worker, topic: str, name: str, params: Path | None = None) -> No
             executor.spin_once(timeout_sec=WAIT_S)
     finally:
         if node is not None:
-            node.stop()
+            node.slot.stop()
         rclpy.try_shutdown()
 
 
 class _Node:
-    """What subscribes and publishes."""
+    """Subscribes to pictures and publishes the worker's answers."""
 
     def __init__(self, worker: Worker, topic: str, name: str) -> None:
         import rclpy
@@ -73,76 +93,87 @@ class _Node:
             self._topic = self.handle.resolve_topic_name(topic)
         self._worker, self._name = worker, name
         self._declare_parameters()
-        clock = self.handle.get_clock()
+        self._clock = self.handle.get_clock()
+        self._speaker, self._pace = Speaker(worker.parts), Pace()
         self._publishers: dict[str, Any] = {}
-        self._pump = Pump(
-            worker, self._topic, self._publish, self._is_heard,
-            lambda: clock.now().nanoseconds / 1e9,
-        )  # fmt: skip
-        for one, kind in (*self._pump.speaker.topics(), DIAGNOSTICS):
-            self._advertise(one, kind)
+        for published, kind in (*self._speaker.topics(), DIAGNOSTICS):
+            self._advertise(published, kind)
+        self.slot: Slot[tuple[Any, Any | None]] = Slot(self._answer)
+        self._info: Any | None = None
         self._is_reliable = True
-        self._picture: Any = None
+        self._subscriptions: list[Any] = []
         self._subscribe()
         self._silent_s = 0
         self.handle.create_timer(1.0, self._tick)
 
-    def stop(self) -> None:
-        """Let the picture that is looked at be the last."""
-        self._pump.slot.stop()
-
     def _declare_parameters(self) -> None:
         """Declare the worker's settings; a file's values take the place of the command's."""
-        for name, value in asdict(self._worker.settings).items():
+        settings = asdict(self._worker.settings)
+        for name, value in settings.items():
             with _told(f"parameter {name}"):
                 self.handle.declare_parameter(name, value)
-        values = {name: self.handle.get_parameter(name).value
-                  for name in asdict(self._worker.settings)}  # fmt: skip
+        values = {name: self.handle.get_parameter(name).value for name in settings}
         self._worker.set(replace(self._worker.settings, **values))
-        self.handle.add_on_set_parameters_callback(self._changed)
+        self.handle.add_on_set_parameters_callback(self._change)
 
-    def _changed(self, parameters: Any) -> Any:
+    def _change(self, parameters: Any) -> Any:
         """Take over changed parameters, all or none."""
         from rcl_interfaces.msg import SetParametersResult
 
-        own = asdict(self._worker.settings)
-        changes = {one.name: one.value for one in parameters if one.name in own}
+        settings = self._worker.settings
+        names = asdict(settings)
+        changes = {entry.name: entry.value for entry in parameters if entry.name in names}
         try:
-            self._worker.set(replace(self._worker.settings, **changes))
+            self._worker.set(replace(settings, **changes))
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _advertise(self, topic: str, kind: str) -> None:
+        full = topic if topic.startswith("/") else f"~/{topic}"
         try:
             message = type_of(kind)
         except ImportError:
             package = kind.partition("/")[0]
-            logger.warning("without %s: %s is not published", package, self._own(topic))
+            logger.warning("without %s: %s is not published", package, full)
             return
-        self._publishers[topic] = self.handle.create_publisher(message, self._own(topic), QUEUE_OUT)
+        self._publishers[topic] = self.handle.create_publisher(message, full, QUEUE_OUT)
 
     def _subscribe(self) -> None:
-        """Subscribe to the pictures and what is beside them."""
+        """Subscribe to the pictures and the ``camera_info`` beside them."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         policy = ReliabilityPolicy.RELIABLE if self._is_reliable else ReliabilityPolicy.BEST_EFFORT
         compressed = self._topic.endswith("/compressed")
-        kind = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
-        info, beside = type_of("sensor_msgs/CameraInfo"), info_topic(self._topic)
+        image = type_of(f"sensor_msgs/{'CompressedImage' if compressed else 'Image'}")
+        info = type_of("sensor_msgs/CameraInfo")
         qos = QoSProfile(depth=QUEUE_IN, reliability=policy)
-        for old in self._picture or ():
-            self.handle.destroy_subscription(old)
+        for subscription in self._subscriptions:
+            self.handle.destroy_subscription(subscription)
         # In this order a picture finds the camera_info that came with it.
-        self._picture = [
-            self.handle.create_subscription(info, beside, self._pump.take_info, qos),
-            self.handle.create_subscription(kind, self._topic, self._pump.take_picture, qos),
+        self._subscriptions = [
+            self.handle.create_subscription(info, info_topic(self._topic), self._take_info, qos),
+            self.handle.create_subscription(image, self._topic, self._take_picture, qos),
         ]
+
+    def _take_info(self, message: Any) -> None:
+        self._info = message  # which holds until the next
+
+    def _take_picture(self, message: Any) -> None:
+        self.slot.put((message, self._info))
+
+    def _answer(self, item: tuple[Any, Any | None]) -> None:
+        answer = self._worker.take(*item, self._topic)
+        if answer is None:
+            return
+        for message in self._speaker.messages(answer, self._is_wanted):
+            self._publish(message)
+        self._pace.count(self._now() - answer.stamp.seconds)
 
     def _tick(self) -> None:
         """Say once a second how the node does, and what keeps pictures from coming."""
-        self._publish(self._pump.diagnosis(self._name))
-        if self._pump.slot.received:
+        self._publish(self._diagnosis())
+        if self.slot.received:
             return
         self._silent_s += 1
         if self._is_reliable and self._offers_less():
@@ -150,29 +181,41 @@ class _Node:
             logger.warning("%s is published best effort: pictures may be lost", self._topic)
             self._subscribe()
         elif self._silent_s == 5:
-            kind = "sensor_msgs/msg/Image"
-            named = [one for one, kinds in self.handle.get_topic_names_and_types() if kind in kinds]
-            there = ", ".join(one for one in named if one != self._own("rgb_points")) or "none"
+            own, kind = f"/{self._name}/{OVERLAY}", "sensor_msgs/msg/Image"
+            topics = self.handle.get_topic_names_and_types()
+            others = [name for name, kinds in topics if kind in kinds and name != own]
             logger.warning("no picture on %s for 5 s; topics with pictures: %s (--topic)",
-                           self._topic, there)  # fmt: skip
+                           self._topic, ", ".join(others) or "none")  # fmt: skip
+
+    def _diagnosis(self) -> Message:
+        self.slot.check()
+        counts = {"received": self.slot.received, "replaced by newer": self.slot.replaced}
+        values = {key: str(value) for key, value in counts.items()} | self._pace.values()
+        now = self._now()
+        stamp = Stamp(int(now), int(1e9 * (now % 1)))
+        trouble = self._worker.trouble or f"no picture on {self._topic}" * (not self.slot.received)
+        return diagnosis(stamp, self._name, trouble, values)
 
     def _offers_less(self) -> bool:
         from rclpy.qos import ReliabilityPolicy
 
         offers = self.handle.get_publishers_info_by_topic(self._topic)
         lesser = ReliabilityPolicy.BEST_EFFORT
-        return any(one.qos_profile.reliability == lesser for one in offers)
+        return any(offer.qos_profile.reliability == lesser for offer in offers)
 
     def _publish(self, message: Message) -> None:
         if message.topic in self._publishers:
             self._publishers[message.topic].publish(native(message.kind, message.fields))
 
-    def _is_heard(self, topic: str) -> bool:
+    def _is_wanted(self, topic: str) -> bool:
+        if topic == OVERLAY and not self._worker.settings.overlay:
+            return False
         publisher = self._publishers.get(topic)
         return publisher is not None and publisher.get_subscription_count() > 0
 
-    def _own(self, topic: str) -> str:
-        return topic if topic.startswith("/") else f"~/{topic}"
+    def _now(self) -> float:
+        """Return seconds since 1970, by the clock of the stamps."""
+        return float(self._clock.now().nanoseconds / 1e9)
 
 
 @contextmanager
@@ -183,3 +226,121 @@ def _told(what: str) -> Iterator[None]:
     except Exception as error:  # rclpy's are of many kinds
         allowed = "names and values that ROS 2 takes"
         raise UserError(f"{what}: {error!s:.300}", allowed, "correct it") from error
+
+
+class Slot(Generic[Item]):
+    """Hands each picture to a thread of its own; one that comes while it works replaces the last.
+
+    Args:
+        handle: What the thread does with it. What it raises ends the thread, and is raised again
+            by :meth:`put` and :meth:`check`.
+    """
+
+    def __init__(self, handle: Callable[[Item], None]) -> None:
+        self._handle = handle
+        self._item: Item | None = None
+        self._fresh, self._stopped = threading.Condition(), False
+        self._error: Exception | None = None
+        self.received = self.replaced = 0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Leave a picture, whatever was there."""
+        self.check()
+        with self._fresh:
+            self.received += 1
+            self.replaced += self._item is not None
+            self._item = item
+            self._fresh.notify()
+
+    def check(self) -> None:
+        """Raise what has ended the thread, if anything has."""
+        if self._error is not None:
+            raise self._error
+
+    def stop(self, wait_s: float = 5.0) -> None:
+        """Let the picture that is processed be the last."""
+        with self._fresh:
+            self._stopped = True
+            self._fresh.notify()
+        self._thread.join(wait_s)
+
+    def _run(self) -> None:
+        try:
+            while True:
+                with self._fresh:
+                    self._fresh.wait_for(lambda: self._item is not None or self._stopped)
+                    item, self._item = self._item, None
+                    if item is None or self._stopped:
+                        return
+                self._handle(item)
+        except Exception as error:
+            self._error = error
+
+
+class Pace:
+    """How often a node answers, and how old a picture is by then."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._times: deque[float] = deque(maxlen=RECENT)
+        self._latencies: deque[float] = deque(maxlen=RECENT)
+        self._answered = 0
+
+    def count(self, latency_s: float) -> None:
+        """Count an answer, and how long ago its picture was taken."""
+        self._times.append(self._clock())
+        self._latencies.append(1000 * latency_s)
+        self._answered += 1
+
+    def values(self) -> dict[str, str]:
+        """Return what a diagnosis tells; nothing of what is not known yet."""
+        values = {"answered": str(self._answered)}
+        if len(self._times) > 1:
+            span = self._times[-1] - self._times[0]
+            values["rate (1/s)"] = f"{(len(self._times) - 1) / max(span, 1e-9):.1f}"
+        if self._latencies:
+            values["latency, median (ms)"] = f"{np.median(self._latencies):.1f}"
+            values["latency, 95 % (ms)"] = f"{np.percentile(self._latencies, 95):.1f}"
+        return values
+
+
+def native(kind: str, fields: Fields) -> Any:
+    """Return ROS 2's message of plain values; what they leave out is 0 or empty."""
+    return _fill(type_of(kind)(), fields)
+
+
+@cache
+def type_of(kind: str) -> Any:
+    """Return the class of a message, by its package and name; an ImportError without it."""
+    package, _, name = kind.partition("/")
+    return getattr(import_module(f"{package}.msg"), name)
+
+
+def _fill(message: Any, fields: Fields) -> Any:
+    kinds = message.get_fields_and_field_types()
+    for name, value in fields.items():
+        setattr(message, name, _value(getattr(message, name), kinds[name], value))
+    return message
+
+
+def _value(default: Any, kind: str, value: Any) -> Any:
+    """Return a field's value; ``kind`` is how ROS writes its type."""
+    if isinstance(value, dict):
+        return _fill(default, value)
+    if isinstance(value, Triangles):
+        return _points(value)
+    if isinstance(value, bytes) and isinstance(default, array.array):
+        return array.array("B", value)  # anything else is checked byte by byte
+    if kind == "octet":
+        return bytes([value])
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        inner = kind.removeprefix("sequence<").removesuffix(">").removesuffix("[]")
+        return [native(inner, entry) for entry in value]
+    return value
+
+
+@cache
+def _points(triangles: Triangles) -> list[Any]:
+    return [native("geometry_msgs/Point", point) for point in triangles.points]

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from dopepp.core.checks import check_flag, check_number
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
@@ -59,9 +59,9 @@ class Settings:
     overlay: bool = False
 
     def __post_init__(self) -> None:
-        check_number("confidence", self.confidence, 0, 1)
-        check_flag("refine", self.refine)
-        check_flag("overlay", self.overlay)
+        check("confidence", self.confidence, float, Range(0, 1))
+        check("refine", self.refine, bool)
+        check("overlay", self.overlay, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +265,5 @@ class Worker:
 
 
 def stamp_of(stamp: Any) -> Stamp:
-    """Return a message's stamp; ROS 1 and 2 name its fields differently."""
-    if hasattr(stamp, "secs"):
-        return Stamp(int(stamp.secs), int(stamp.nsecs))
+    """Return a message's stamp."""
     return Stamp(int(stamp.sec), int(stamp.nanosec))

@@ -57,7 +57,7 @@ def test_datagrams_hold_a_line_each(seen, four):
         (("{pictures}", "--json", "--conf", 2, "--K", 9, 9, 9, 9), "confidence=2"),
         (("{pictures}", "--json", "--params", "p.yaml"), "--params with --json"),
         (("{pictures}", "--bag", "a.bag", "--out", "b.mcap"), "--bag with"),
-        (("--ros1", "camera"), "--ros1 with"),
+        (("camera", "--ros2"), "--ros2 with"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(seen, words, said):

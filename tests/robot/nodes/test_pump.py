@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from dopepp.robot.nodes.pump import Pace, Slot
+from dopepp.robot.nodes.ros2 import Pace, Slot
 
 
 def test_whoever_is_slow_gets_the_newest():

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 def test_messages_are_filled_by_their_own_types():
     pytest.importorskip("rclpy", reason="needs the extra ros2")
     from dopepp.robot.nodes.messages import diagnosis, picture
-    from dopepp.robot.nodes.native import native
+    from dopepp.robot.nodes.ros2 import native
     from dopepp.robot.nodes.worker import Stamp
 
     message = diagnosis(Stamp(3, 4), "dope", "oh", {"rate": "30"})
@@ -46,7 +46,7 @@ def test_parameters_change_while_it_runs(estimator, tmp_path):
             assert result.successful == taken
         assert "a number from 0 to 1" in result.reason
         assert worker.settings == Settings(confidence=0.75)
-        node.stop()
+        node.slot.stop()
     finally:
         rclpy.try_shutdown()
 
@@ -57,8 +57,7 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
     from rclpy.qos import qos_profile_sensor_data
 
     from dopepp.robot.nodes.messages import picture
-    from dopepp.robot.nodes.native import native
-    from dopepp.robot.nodes.ros2 import _Node
+    from dopepp.robot.nodes.ros2 import _Node, native
     from dopepp.robot.nodes.worker import Worker
 
     rclpy.init()
@@ -74,11 +73,11 @@ def test_a_camera_that_offers_less_is_heard(estimator, seen, caplog):
         for _ in range(100):
             publisher.publish(image)
             executor.spin_once(timeout_sec=0.1)
-            if node._pump.slot.received:
+            if node.slot.received:
                 break
-        assert node._pump.slot.received
+        assert node.slot.received
         assert "best effort" in caplog.text
-        node.stop()
+        node.slot.stop()
     finally:
         rclpy.try_shutdown()
 

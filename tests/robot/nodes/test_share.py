@@ -1,11 +1,9 @@
 """Launch files, parameters and layouts of the package name what there is."""
 
-import os
 import runpy
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from xml.etree import ElementTree
 
 import typer.main
 import yaml
@@ -46,15 +44,6 @@ def test_the_launch_file_starts_the_command_with_options_it_has(monkeypatch):
     assert seen[:4] == ["dopepp", "node", "<model>", "--ros2"]
     assert {f"<{one}>" for one in declared[:-1]} == {one for one in seen if one[0] == "<"}
     assert {one for one in seen if one.startswith("--")} <= options()
-
-
-def test_the_launch_file_of_ros_1_starts_it_too():
-    root = ElementTree.parse(SHARE / "dope.launch").getroot()
-    (node,) = root.iter("node")
-    assert os.access(SHARE / node.get("type"), os.X_OK)
-    assert ElementTree.parse(SHARE / "package.xml").find("name").text == node.get("pkg")
-    assert {one for one in node.get("args").split() if one.startswith("--")} <= options()
-    assert {one.get("name") for one in node.iter("param")} == set(vars(Settings()))
 
 
 def options():
