@@ -22,7 +22,7 @@ import torch
 from dopepp.geometry.camera import resize_camera, transform
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.scales import Distances, letterboxes
+from dopepp.inference.picture import Distances, letterboxes
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory, Scene, render
 from dopepp.virtual.sensor import capture

@@ -29,8 +29,7 @@ from dopepp.geometry.camera import Transform, crop_camera, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.silhouette import filled_mask, posed
+from dopepp.inference.refinement.outline import filled_mask, make_outline_mesh, posed
 from dopepp.metrics.pose import assign
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.part import Mesh, Part

@@ -95,7 +95,7 @@ def candidates(network, checkpoint, size: int, folder: Path) -> Iterator[tuple[s
 
     from dopepp.inference import runtimes
     from dopepp.inference.export import EXPORTERS
-    from dopepp.inference.runtimes.description import Export
+    from dopepp.inference.runtimes.runtime import Export
 
     yield "pytorch fp32", torch_run(network, size)
     rng = np.random.default_rng(0)

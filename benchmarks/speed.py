@@ -55,7 +55,7 @@ def export(name: str, layout: str, precision: str, folder: Path) -> Path:
     from dopepp.experiment.assembly.parts import build_parts
     from dopepp.experiment.assembly.system import build_untrained
     from dopepp.inference.export import EXPORTERS
-    from dopepp.inference.runtimes.description import Export
+    from dopepp.inference.runtimes.runtime import Export
     from dopepp.models.checkpoint import load_network
 
     exporter, ending = EXPORTERS[layout]

@@ -40,8 +40,8 @@ def doctor(
     from dopepp.core.errors import UserError
     from dopepp.drawing.pictures import read_photo
     from dopepp.geometry.camera import camera_matrix
-    from dopepp.inference.lens import Lens, one_camera
-    from dopepp.inference.sources.pictures import Pictures
+    from dopepp.inference.sources.files import Pictures
+    from dopepp.inference.sources.source import Lens, one_camera
 
     with report_errors():
         if refine not in (None, "region"):

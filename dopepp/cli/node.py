@@ -79,7 +79,7 @@ def node(
             raise UserError(f"--refine {refine}", "region, or none", "leave it out")
 
         from dopepp.geometry.camera import camera_matrix
-        from dopepp.inference.lens import given_camera, one_camera
+        from dopepp.inference.sources.source import given_camera, one_camera
 
         known = given_camera(None if intrinsics is None else camera_matrix(*intrinsics), camera)
 

@@ -96,8 +96,8 @@ def predict(
     with resumable("what was written is complete"):
         from dopepp.cli.outputs import Outputs
         from dopepp.geometry.camera import camera_matrix
-        from dopepp.inference.lens import one_camera
         from dopepp.inference.sources import open_sources
+        from dopepp.inference.sources.source import one_camera
 
         terms = () if refine is None else tuple(refine.split(","))
         _check_options(terms, depth, track, verify, distance or roi)
@@ -217,7 +217,7 @@ class _Session:
 
     def _searched(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
         """Look at any distance where nothing was found, or say why nothing is."""
-        from dopepp.inference.lens import Lens
+        from dopepp.inference.sources.source import Lens
         from dopepp.recovery.silence import explained
 
         own, image, K = self._options, result.image, result.K

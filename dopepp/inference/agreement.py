@@ -14,8 +14,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import letterboxed
-from dopepp.inference.scales import letterboxes
+from dopepp.inference.picture import letterboxed, letterboxes
 from dopepp.recovery.detection import Detection
 
 MAX_MAPS: Final = 1e-4

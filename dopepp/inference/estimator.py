@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import cv2
 import numpy as np
@@ -17,24 +17,24 @@ from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import (
-    CameraMatrix,
-    Letterbox,
-    project_keypoints,
-)
-from dopepp.geometry.cuboid import Cuboid
+from dopepp.geometry.camera import CameraMatrix, Letterbox, project_keypoints
 from dopepp.inference import runtimes
 from dopepp.inference.picture import (
+    Coefficients,
+    Depth,
+    Distances,
     Region,
+    checked_depth,
     checked_distortion,
     checked_picture,
     cut,
     letterboxed,
+    letterboxes,
+    merged,
+    undistorted_depth,
 )
-from dopepp.inference.refinement.view import Coefficients, checked_depth, undistorted_depth
-from dopepp.inference.refinement.visible import Depth
+from dopepp.inference.results import STEPS
 from dopepp.inference.runtimes.runtime import Runtime
-from dopepp.inference.scales import Distances, letterboxes, merged
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import RecoveryOptions, rescored
@@ -44,16 +44,10 @@ from dopepp.recovery.silence import Reason, rejected_refined
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera
-    from dopepp.inference.refinement.refiner import Refine, Refiner
+    from dopepp.inference.refinement.refiner import Refine
     from dopepp.inference.results import PoseResult
     from dopepp.inference.sources import SourceLike
     from dopepp.inference.stream import StreamOptions
-
-STEPS: Final = ("pre", "network", "decode", "refine")
-"""What a picture's time is spent on: undistorting and resizing, the network, from its maps to
-poses, and making these precise."""
-
-Decoded = TypeVar("Decoded")
 
 Maps = tuple[
     Float[torch.Tensor, "beliefs height width"], Float[torch.Tensor, "fields height width"]
@@ -70,8 +64,7 @@ class PoseEstimator:
         refine: What refines poses (:mod:`dopepp.inference.refinement.refiner`): ``region``, the
             picture; ``depth``, the depth that :meth:`predict` is given; or both, ``("region",
             "depth")``. None does not.
-        parts: The checkpoint's parts with their meshes, where it has none itself (an earlier
-            version's).
+        parts: The checkpoint's parts with other meshes, or with some where it has none.
         max_ms: Milliseconds of refining a picture after which its further detections, the best
             score first, keep the network's poses; None sets no limit.
 
@@ -91,18 +84,19 @@ class PoseEstimator:
         self.checkpoint = checkpoint
         self.refine, self.refiner = refine, None
         if refine is not None:  # its solvers take as long to import as all else but torch
-            from dopepp.inference.refinement.refiner import make_refiner
+            from dopepp.inference.refinement.refiner import Refiner
 
-            self.refiner = make_refiner(refine, parts or checkpoint.parts)
+            self.refiner = Refiner(refine, parts or checkpoint.parts)
         self.max_ms = max_ms
         self.device = checked_device(device)
         self.solid_parts = tuple(parts or checkpoint.parts)
         """Its parts, with the meshes that it was given."""
         self.spent_ms = dict.fromkeys(STEPS, 0.0)
-        """Milliseconds since it was made, by step of :data:`STEPS`."""
+        """Milliseconds since it was made, by step of :data:`~dopepp.inference.results.STEPS`."""
         self.network = runtimes.placed(network, self.device)
         self.cuboids = np.stack([part.cuboid for part in checkpoint.parts])
-        self._cuboid_of = {part.name: part.cuboid for part in checkpoint.parts}
+        self._names = [part.name for part in checkpoint.parts]
+        self._cuboid_of = dict(zip(self._names, self.cuboids, strict=True))
         self.recovery = RecoveryOptions.of({"sigma": checkpoint.sigma, **checkpoint.recovery})
 
     @classmethod
@@ -164,8 +158,7 @@ class PoseEstimator:
         """Find all known objects on one image.
 
         The image is resized until parts have the size that they had in training
-        (:mod:`dopepp.inference.scales`); a checkpoint of an earlier version, which does not know
-        that size, gets it in the size of the training's images.
+        (:mod:`dopepp.inference.picture`).
 
         Args:
             image: RGB, uint8, any size.
@@ -216,35 +209,25 @@ class PoseEstimator:
         """
         if self.refiner is None:
             return list(detections)
-        with self._timed("refine"):
-            return self._refined(self.refiner, detections, image, K, depth)
-
-    def _refined(
-        self,
-        refiner: Refiner,
-        detections: Sequence[Detection],
-        image: Picture,
-        K: CameraMatrix,
-        depth: Depth | None,
-    ) -> list[Detection]:
         refined: list[Detection] = []
         start = time.perf_counter()
-        for one in detections:
-            if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
-                refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
-                continue
-            result = refiner(one, image, K, depth)
-            if result.covariance is None:
-                refined.append(replace(one, kept=result.reason, agreement=None, support=None))
-                continue
-            T, covariance = result.T_cam_obj, result.covariance
-            keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
-            refined.append(
-                replace(
-                    one, T_cam_obj=T, keypoints=keypoints, covariance=covariance, kept="",
-                    agreement=result.agreement, support=result.support,
-                )
-            )  # fmt: skip
+        with self._timed("refine"):
+            for one in detections:
+                if self.max_ms is not None and 1000 * (time.perf_counter() - start) > self.max_ms:
+                    refined.append(replace(one, kept=f"max_ms={self.max_ms:g} was spent"))
+                    continue
+                result = self.refiner(one, image, K, depth)
+                if result.covariance is None:
+                    refined.append(replace(one, kept=result.reason, agreement=None, support=None))
+                    continue
+                T = result.T_cam_obj
+                keypoints = project_keypoints(self._cuboid_of[one.object], T, K)
+                refined.append(
+                    replace(
+                        one, T_cam_obj=T, keypoints=keypoints, covariance=result.covariance,
+                        kept="", agreement=result.agreement, support=result.support,
+                    )
+                )  # fmt: skip
         return refined
 
     def stream(
@@ -259,7 +242,7 @@ class PoseEstimator:
         The source is a path (a picture, a folder, a video, a ROS bag), a glob pattern, a camera's
         number or a stream's URL. K, the camera or its file may be left out where a bag has it.
         """
-        from dopepp.inference.stream import stream  # which follows parts with an estimator
+        from dopepp.inference.stream import stream  # which needs sources, drawing and a tracker
 
         return stream(self, source, K, camera, **options)
 
@@ -278,8 +261,13 @@ class PoseEstimator:
         """
         image, K = checked_picture(image, K, cropped)
         window, K_window, _ = cut(image, K, roi)
-        boxes = letterboxes(self.checkpoint, K_window, window, distances)
-        reasons = [one for box in boxes for one in self._decode(explain, window, K_window, box)]
+        reasons: list[Reason] = []
+        for box in letterboxes(self.checkpoint, K_window, window, distances):
+            belief, field = self._look(window, box)
+            reasons += explain(
+                belief, field, self.cuboids, box.camera(K_window), self.network.stride,
+                self._names, **self._recovery_options(),
+            )  # fmt: skip
         least = self.recovery.refined_min_score
         if self.refiner is None or least == 0:
             return reasons
@@ -297,33 +285,39 @@ class PoseEstimator:
     ) -> list[Detection]:
         """Return the network's detections, in the image's pixels."""
         window, K_window, corner = cut(image, K, roi)
-        return merged(
-            [
-                [
-                    _in_original(one, self._cuboid_of[one.object], box, corner, K)
-                    for one in self._decode(recover, window, K_window, box)
-                ]
-                for box in letterboxes(self.checkpoint, K_window, window, distances)
-            ]
-        )
+        scales: list[list[Detection]] = []
+        for box in letterboxes(self.checkpoint, K_window, window, distances):
+            belief, field = self._look(window, box)
+            with self._timed("decode"):
+                found = recover(
+                    belief, field, self.cuboids, box.camera(K_window), self.network.stride,
+                    self._names, **self._recovery_options(),
+                )  # fmt: skip
+            scales.append([self._in_original(one, box, corner, K) for one in found])
+        return merged(scales)
 
-    def _decode(
-        self,
-        decoder: Callable[..., list[Decoded]],
-        image: Picture,
-        K: CameraMatrix,
-        letterbox: Letterbox,
-    ) -> list[Decoded]:
-        """Give an image's maps to :func:`recover` or :func:`explain`."""
+    def _look(self, window: Picture, box: Letterbox) -> Maps:
+        """Run the network on a window in one of its sizes."""
         with self._timed("pre"):
-            image = letterboxed(image, letterbox, self.network.size_multiple)
+            pixels = letterboxed(window, box, self.network.size_multiple)
         with self._timed("network"):
-            belief, field = self.maps(image)
-        names = [part.name for part in self.parts]
-        K, stride = letterbox.camera(K), self.network.stride
-        options = self.recovery if self.refiner is None else self.recovery.of_candidates()
-        with self._timed("decode"):
-            return decoder(belief, field, self.cuboids, K, stride, names, **vars(options))
+            return self.maps(pixels)
+
+    def _recovery_options(self) -> dict[str, float]:
+        """Return the thresholds; candidates for refinement pass lower ones."""
+        return vars(self.recovery if self.refiner is None else self.recovery.of_candidates())
+
+    def _in_original(
+        self, detection: Detection, box: Letterbox, corner: tuple[int, int], K: CameraMatrix
+    ) -> Detection:
+        """Express a detection's pixels in the original image; the pose is the same in both."""
+        cuboid = self._cuboid_of[detection.object]
+        return replace(
+            detection,
+            keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
+            peaks=box.original_points(detection.peaks) + np.array(corner),
+            reprojection_error_px=detection.reprojection_error_px / box.scale_x,
+        )
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
@@ -352,19 +346,3 @@ def checked_device(device: str | torch.device) -> torch.device:
         reason = str(error).partition("\n")[0]
         raise UserError(f"device {device} ({reason:.100})", there, "pass one of these") from error
     return chosen
-
-
-def _in_original(
-    detection: Detection,
-    cuboid: Cuboid,
-    letterbox: Letterbox,
-    corner: tuple[int, int],
-    K: CameraMatrix,
-) -> Detection:
-    """Express a detection's pixels in the original image; the pose is the same in both."""
-    return replace(
-        detection,
-        keypoints=project_keypoints(cuboid, detection.T_cam_obj, K),
-        peaks=letterbox.original_points(detection.peaks) + np.array(corner),
-        reprojection_error_px=detection.reprojection_error_px / letterbox.scale_x,
-    )

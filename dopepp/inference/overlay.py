@@ -34,8 +34,7 @@ from dopepp.geometry.camera import (
     resize_points,
     transform,
 )
-from dopepp.inference.refinement.mesh import OutlineMesh, make_outline_mesh
-from dopepp.inference.refinement.silhouette import filled_mask, posed
+from dopepp.inference.refinement.outline import OutlineMesh, filled_mask, make_outline_mesh, posed
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 

@@ -34,9 +34,8 @@ from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.overlay import make_shape
-from dopepp.inference.picture import letterboxed
+from dopepp.inference.picture import letterboxed, letterboxes
 from dopepp.inference.results import PoseResult
-from dopepp.inference.scales import letterboxes
 from dopepp.parts.size import part_in_words
 from dopepp.recovery.silence import explained
 

@@ -20,12 +20,15 @@ from dopepp.core.files import PICTURES, check_target, write_picture
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.rotation import matrix_to_quaternion
-from dopepp.inference.estimator import STEPS
 from dopepp.inference.overlay import Shape, draw_poses
 from dopepp.recovery.detection import Detection
 
 if TYPE_CHECKING:
     import pandas as pd
+
+STEPS: Final = ("pre", "network", "decode", "refine")
+"""What a picture's time is spent on: undistorting and resizing, the network, from its maps to
+poses, and making these precise."""
 
 FRAME: Final = "camera, OpenCV: x right, y down, z forward; metres"
 """The frame of all poses: ``T_cam_obj`` maps the mesh's frame into it."""
@@ -39,7 +42,7 @@ class PoseResult:
         image: RGB, without lens distortion: keypoints and K refer to it.
         K: Camera matrix, pixels.
         detections: Best score first; of a tracker, in the order of their identities.
-        speed: Milliseconds spent in each of :data:`~dopepp.inference.estimator.STEPS`.
+        speed: Milliseconds spent in each of :data:`STEPS`.
         name: The picture's file, or its source.
         number: Its place in the source, from 0.
         time: Seconds: of a video since its start, of a camera or a bag since 1970; None of a

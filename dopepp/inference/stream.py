@@ -6,21 +6,22 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TypedDict, Unpack
+from typing import TYPE_CHECKING, TypedDict, Unpack
 
 from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
-from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.lens import Lens, one_camera
 from dopepp.inference.overlay import make_shape
-from dopepp.inference.picture import Region
+from dopepp.inference.picture import Distances, Region
 from dopepp.inference.results import PoseResult, spent_between
-from dopepp.inference.scales import Distances
 from dopepp.inference.sources import Frame, SourceLike, open_sources
+from dopepp.inference.sources.source import Lens, one_camera
 from dopepp.inference.tracker import PoseTracker
+
+if TYPE_CHECKING:
+    from dopepp.inference.estimator import PoseEstimator
 
 
 class StreamOptions(TypedDict, total=False):

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
-from dopepp.inference.estimator import STEPS, PoseEstimator
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.results import STEPS
 
 WARM_UP: Final = 3
 """Frames behind the first one that are not timed: memory is allocated, kernels are chosen."""

@@ -27,9 +27,8 @@ from dopepp.geometry.cuboid import CENTROID, EDGES
 from dopepp.geometry.rotation import matrix_to_quaternion
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.overlay import AXIS, COLOURS, silhouette
-from dopepp.inference.picture import letterboxed
+from dopepp.inference.picture import letterboxed, letterboxes
 from dopepp.inference.results import PoseResult
-from dopepp.inference.scales import letterboxes
 from dopepp.inference.sources import Source
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection

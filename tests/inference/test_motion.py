@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from dopepp.geometry.camera import make_transform, moved, step_between
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.inference.motion import PERSISTENCE, SUDDEN, Motion, at_rest
+from dopepp.inference.tracker import PERSISTENCE, SUDDEN, Motion, at_rest
 
 START = make_transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 1.0])), [0.02, -0.01, 0.3])
 NOISE = np.repeat([math.radians(0.5), 0.0005], 3)

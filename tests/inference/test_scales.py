@@ -15,7 +15,7 @@ from hypothesis import given
 from dopepp import PoseEstimator
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Letterbox, camera_matrix, resize_camera, transform
-from dopepp.inference.scales import MARGIN, MAX_PIXELS, letterboxes, merged
+from dopepp.inference.picture import MARGIN, MAX_PIXELS, letterboxes, merged
 from dopepp.parts.catalogue import load_part
 from dopepp.parts.size import Seen
 from dopepp.virtual import PRESETS, Factory, render

@@ -24,10 +24,8 @@ from dopepp.inference import runtimes
 from dopepp.inference.agreement import Agreement, compare
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.export import EXPORTERS, PRECISIONS, check_possible
-from dopepp.inference.picture import letterboxed
-from dopepp.inference.runtimes.description import Export
-from dopepp.inference.runtimes.runtime import Pixels
-from dopepp.inference.scales import letterboxes
+from dopepp.inference.picture import letterboxed, letterboxes
+from dopepp.inference.runtimes.runtime import Export, Pixels
 from dopepp.models.checkpoint import FOLDER, Checkpoint, load_network
 from dopepp.models.network import network_cost
 

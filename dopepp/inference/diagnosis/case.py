@@ -14,8 +14,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, focal_length
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.picture import letterboxed
-from dopepp.inference.scales import letterboxes
+from dopepp.inference.picture import letterboxed, letterboxes
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
 from dopepp.recovery.detection import Detection

@@ -15,8 +15,8 @@ from dopepp.geometry.camera import Letterbox, focal_length
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.focal import focal_factor
 from dopepp.inference.diagnosis.case import Case, num_keypoints
-from dopepp.inference.quality import clipped, edge_width, highlights
-from dopepp.inference.scales import MARGIN
+from dopepp.inference.diagnosis.quality import clipped, edge_width, highlights
+from dopepp.inference.picture import MARGIN
 from dopepp.parts.part import UNITS
 from dopepp.parts.size import is_plausible, size_in_words
 

@@ -9,21 +9,31 @@ picture refines alone, and depth alone where part and background are of one colo
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
+from itertools import combinations
 from typing import Final
 
+import cv2
 import numpy as np
+from jaxtyping import Float
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
+from dopepp.geometry.cuboid import Cuboid
+from dopepp.geometry.rotation import rotation_vector_to_matrix
+from dopepp.inference.picture import Depth
 from dopepp.inference.refinement.depth import DepthEvidence
-from dopepp.inference.refinement.fit import make_prior
 from dopepp.inference.refinement.region import RegionRefiner, Starts, refinement
-from dopepp.inference.refinement.solver import Refinement, Solution, UndecidedError
-from dopepp.inference.refinement.starts import poses_of_four
-from dopepp.inference.refinement.visible import FEWEST_POINTS, Depth, PoseMatrix, surface_points
+from dopepp.inference.refinement.solver import (
+    PoseMatrix,
+    Refinement,
+    Solution,
+    UndecidedError,
+    make_prior,
+)
+from dopepp.inference.refinement.surface import FEWEST_POINTS, surface_points
 from dopepp.parts.part import Part
 from dopepp.recovery.detection import Detection
 
@@ -33,34 +43,39 @@ LOOSER: Final = 3.0
 """Factor on the deviations of a network's pose: its covariance was learned on pictures like those
 of its training, and it is farther off on others."""
 
+FEW: Final = 4
+"""Keypoints that fix a pose."""
+
+NUM_QUADRUPLES: Final = 40
+"""Of the 126 of nine keypoints."""
+
 Refine = str | Sequence[str]
 """What ``refine=`` takes: one of :data:`TERMS`, or several."""
 
-Refiner = Callable[[Detection, Picture, CameraMatrix, Depth | None], Refinement]
-"""From a detection on a picture, with its depth where there is one, to the refined pose, or to the
-given one and why it was kept."""
 
+class Refiner:
+    """Refines the detections of some parts by one or several of :data:`TERMS`.
 
-def make_refiner(refine: Refine, parts: Sequence[Part]) -> Refiner:
-    """Return what refines the poses of these parts by one or several of :data:`TERMS`.
-
-    A :class:`UserError`: there is none of that name, or a part has no mesh whose outline it could
-    use.
+    Raises:
+        UserError: There is no such term, or a part has no mesh whose outline it could use.
     """
-    terms = checked_terms(refine)
-    refiners = {part.name: PartRefiner(part, terms) for part in parts}
-    cuboids = {part.name: part.cuboid for part in parts}
 
-    def refined(one: Detection, image: Picture, K: CameraMatrix, depth: Depth | None) -> Refinement:
-        followed = one.agreement is not None  # which only refinement gives
+    def __init__(self, refine: Refine, parts: Sequence[Part]) -> None:
+        terms = checked_terms(refine)
+        self._refiners = {part.name: PartRefiner(part, terms) for part in parts}
+        self._cuboids = {part.name: part.cuboid for part in parts}
+
+    def __call__(
+        self, detection: Detection, image: Picture, K: CameraMatrix, depth: Depth | None
+    ) -> Refinement:
+        """Return the refined pose of a detection, or its own and why it was kept."""
+        name, T_cam_obj, covariance = detection.object, detection.T_cam_obj, detection.covariance
+        refine = self._refiners[name].refine
+        if detection.agreement is not None:  # only refinement gives an agreement: it is followed
+            return refine(image, K, T_cam_obj, covariance, depth, followed=True)
         # A tracker knows how far a part may have moved; a network may be wrong about that.
-        starts = None if followed else partial(poses_of_four, cuboids[one.object], one.peaks, K)
-        covariance = one.covariance if followed else LOOSER**2 * one.covariance
-        return refiners[one.object].refine(
-            image, K, one.T_cam_obj, covariance, depth, followed, starts
-        )
-
-    return refined
+        starts = partial(poses_of_four, self._cuboids[name], detection.peaks, K)
+        return refine(image, K, T_cam_obj, LOOSER**2 * covariance, depth, starts=starts)
 
 
 def checked_terms(refine: Refine) -> tuple[str, ...]:
@@ -125,7 +140,7 @@ class PartRefiner:
         try:
             measured = self._measured(K, given, covariance, depth)
             if self._region is None or alone is None:
-                return _by_depth(measured)
+                return _by_depth(measured, measured.descend())
             return _by_both(self._region, image, K, alone, measured)
         except UndecidedError as undecided:
             return alone or Refinement(given, reason=str(undecided))
@@ -146,14 +161,38 @@ class PartRefiner:
         return DepthEvidence(self._surface, self._diameter, depth, K, prior)
 
 
-def _by_depth(measured: DepthEvidence) -> Refinement:
-    """Refine with depth alone; an :class:`UndecidedError` where it does not decide."""
-    end = measured.descend()
+def poses_of_four(
+    cuboid: Cuboid, peaks: Float[np.ndarray, "9 2"], K: CameraMatrix
+) -> list[Transform]:
+    """Return the poses of several quadruples of measured keypoints, always the same ones.
+
+    What hides a part, or looks like it, puts several keypoints wrong together, which no keypoint's
+    own covariance tells; the others are right.
+
+    Args:
+        cuboid: The part's keypoints, metres.
+        peaks: Those measured on the picture, pixels; NaN where there is none.
+        K: Camera matrix.
+    """
+    quadruples = list(combinations(np.flatnonzero(np.isfinite(peaks).all(axis=1)), FEW))
+    order = np.random.default_rng(0).permutation(len(quadruples))[:NUM_QUADRUPLES]
+    poses = []
+    for number in order:
+        few = list(quadruples[number])
+        try:
+            found, turn, place = cv2.solvePnP(
+                cuboid[few], peaks[few], K, None, flags=cv2.SOLVEPNP_SQPNP
+            )
+        except cv2.error:  # all four in one place
+            continue
+        if found and np.isfinite(turn).all() and place[2, 0] > 0:
+            poses.append(make_transform(rotation_vector_to_matrix(turn[:, 0]), place[:, 0]))
+    return poses
+
+
+def _by_depth(measured: DepthEvidence, end: Solution) -> Refinement:
+    """Return depth's own end; an :class:`UndecidedError` where depth does not decide for it."""
     measured.check(end.T_cam_obj)
-    return _of_depth(end)
-
-
-def _of_depth(end: Solution) -> Refinement:
     return Refinement(end.T_cam_obj, np.linalg.inv(end.information))
 
 
@@ -171,31 +210,22 @@ def _by_both(
     Raises:
         UndecidedError: Depth does not decide, or contradicts what the picture has decided.
     """
+
+    def together(start: Solution) -> Refinement:
+        end, agreement = region.refine_with(image, K, measured, start)
+        measured.check(end.T_cam_obj)
+        return refinement(end, agreement)
+
     if alone.covariance is not None:
-        start = Solution(alone.T_cam_obj, np.linalg.inv(alone.covariance))
         with contextlib.suppress(UndecidedError):  # too far from the surface that depth shows
-            return _together(region, image, K, start, measured)
+            return together(Solution(alone.T_cam_obj, np.linalg.inv(alone.covariance)))
     start = measured.descend()
     try:
-        return _together(region, image, K, start, measured)
+        return together(start)
     except UndecidedError:
         if alone.covariance is not None:
             raise
-        measured.check(start.T_cam_obj)
-        return _of_depth(start)
-
-
-def _together(
-    region: RegionRefiner,
-    image: Picture,
-    K: CameraMatrix,
-    start: Solution,
-    measured: DepthEvidence,
-) -> Refinement:
-    """Refine on both; an :class:`UndecidedError` where one of them speaks against the end."""
-    end, agreement = region.refine_with(image, K, measured, start)
-    measured.check(end.T_cam_obj)
-    return refinement(end, agreement)
+        return _by_depth(measured, start)
 
 
 def _region(part: Part) -> RegionRefiner:

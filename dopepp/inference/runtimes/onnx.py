@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from dopepp.core.errors import require
-from dopepp.inference.runtimes.description import Export, unpack
 from dopepp.inference.runtimes.runtime import (
     INPUT,
     OUTPUTS,
     Arrays,
+    Export,
     ExportedNetwork,
     Pixels,
     check_shapes,
     num_threads,
     read_bytes,
     refused,
+    unpack,
 )
 from dopepp.models.checkpoint import KEY, Checkpoint
 

@@ -14,15 +14,16 @@ from typing import Any, Final
 from lxml import etree
 
 from dopepp.core.errors import require
-from dopepp.inference.runtimes.description import Export, unpack
 from dopepp.inference.runtimes.runtime import (
     Arrays,
+    Export,
     ExportedNetwork,
     Pixels,
     check_shapes,
     num_threads,
     read_bytes,
     refused,
+    unpack,
 )
 from dopepp.models.checkpoint import KEY, Checkpoint
 from dopepp.models.storage import MAX_HEADER_BYTES

@@ -1,24 +1,31 @@
-"""What every runtime has in common: pixels in, maps out, on as many threads as there are cores."""
+"""What every runtime has in common: pixels in, maps out, and an exported file's description.
+
+The description is the checkpoint's, with how it was exported. It is one JSON text in the file's own
+metadata, under ``dopepp``, so a renamed file loads the same.
+"""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
 from dopepp.core.errors import UserError
+from dopepp.core.json import parse_json
 from dopepp.core.pool import physical_cores
+from dopepp.core.validation import STRICT, Range, check, parse
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
-from dopepp.inference.runtimes.description import Export
-from dopepp.models.checkpoint import Checkpoint
+from dopepp.models.checkpoint import KEY, Checkpoint, packed, parse_description
 from dopepp.models.heads import Stage
-from dopepp.models.network import Images
+from dopepp.models.network import Images, check_spec
+from dopepp.models.storage import MAX_HEADER_BYTES
 
 INPUT: Final = "pixels"
 OUTPUTS: Final = ("belief", "field")
@@ -30,10 +37,40 @@ MAX_BYTES: Final = 2**30
 _MAX_PER_PIXEL: Final = 512
 """Numbers of a tensor in a graph for every pixel of its input; VGG19 has 64."""
 
+_SECTION: Final = "export"
+
+Count = Annotated[int, Range(0, 10**12)]
+
 Pixels = UInt8[np.ndarray, "batch 3 height width"]
 Arrays = tuple[
     Float[np.ndarray, "batch beliefs rows columns"], Float[np.ndarray, "batch fields rows columns"]
 ]
+
+
+@dataclass(frozen=True)
+class Export:
+    """How a network was exported.
+
+    Attributes:
+        format: ``onnx``, ``openvino`` or ``safetensors``.
+        precision: ``fp32``, ``fp16`` (weights) or ``int8``.
+        size_multiple: Image height and width must be multiples of this.
+        parameters: Trained numbers of the network.
+        gmacs: 10⁹ multiply-accumulates for one image of the training's size.
+        add_01d: Share of instances with ADD below a tenth of the diameter on validation scenes, by
+            precision; where it was quantised, before and after.
+        num_images: How many scenes that were.
+    """
+
+    __pydantic_config__ = STRICT
+
+    format: str
+    precision: str
+    size_multiple: Annotated[int, Range(1, 1024)]
+    parameters: Count
+    gmacs: Annotated[float, Range(0, 1e12)]
+    add_01d: Mapping[str, Annotated[float, Range(0, 1)]] = field(default_factory=dict)
+    num_images: Count = 0
 
 
 class Runtime(Protocol):
@@ -129,3 +166,41 @@ def refused(path: Path, got: object, allowed: str = "") -> UserError:
         allowed or "a whole file written by `dopepp export`",
         "export the checkpoint again; load no file that you do not trust",
     )
+
+
+def pack(checkpoint: Checkpoint, export: Export) -> str:
+    """Return the text for a file's metadata."""
+    return packed(described(checkpoint, export)[KEY])
+
+
+def described(checkpoint: Checkpoint, export: Export) -> dict[str, Any]:
+    """Return a checkpoint's content (:meth:`Checkpoint.to_file`) with how it was exported."""
+    content = checkpoint.to_file()
+    content[KEY][_SECTION] = asdict(export)
+    return content
+
+
+def unpack(text: str | None, path: Path) -> tuple[Checkpoint, Export]:
+    """Read a file's text, which anybody may have written; None is a file without one.
+
+    A :class:`UserError`: it is missing, damaged, too long, of a newer version, or names what may
+    not be built. Nothing is built.
+    """
+    if text is None or len(text) > MAX_HEADER_BYTES:
+        got = "no description" if text is None else f"a description of {len(text)} characters"
+        allowed = f"one of at most {MAX_HEADER_BYTES} under {KEY!r}, as `dopepp export` writes it"
+        raise UserError(f"{path}: {got}", allowed, "export the checkpoint again")
+    payload = parse_json(text, f"{path}, description under {KEY!r}")
+    try:
+        checkpoint = parse_description(payload)
+        check_spec(checkpoint.spec)
+        section = payload.get(_SECTION)  # type: ignore[attr-defined]
+        export = parse(Export, section, _SECTION, "export the checkpoint again")
+        check("stride", checkpoint.stride, int, Range(1, 256))
+        if export.size_multiple % checkpoint.stride or not checkpoint.parts:
+            got = f"size_multiple {export.size_multiple} and {len(checkpoint.parts)} parts"
+            allowed = f"a multiple of the stride {checkpoint.stride}, and a part at least"
+            raise UserError(got, allowed, "export the checkpoint again")
+    except UserError as error:
+        raise UserError(f"{error.got}, in {path}", error.allowed, error.fix) from error
+    return checkpoint, export

@@ -1,6 +1,6 @@
 """Where pictures come from: files, folders, videos, cameras, streams, recordings of robots.
 
-To add a kind, write a class with what :class:`~dopepp.inference.sources.frame.Source` has in a
+To add a kind, write a class with what :class:`~dopepp.inference.sources.source.Source` has in a
 module of its own, and a line in :func:`_source`.
 """
 
@@ -12,10 +12,9 @@ from pathlib import Path
 
 from dopepp.core.errors import UserError
 from dopepp.inference.sources.bag import BAGS, Bag
-from dopepp.inference.sources.frame import Frame, Source
+from dopepp.inference.sources.files import VIDEOS, Pictures, Video, in_order, pictures_of
 from dopepp.inference.sources.live import Live, is_url
-from dopepp.inference.sources.pictures import Pictures, in_order, pictures_of
-from dopepp.inference.sources.video import VIDEOS, Video
+from dopepp.inference.sources.source import Frame, Source
 
 __all__ = ["Frame", "Source", "SourceLike", "open_sources"]
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from dopepp.core.errors import UserError, require
 from dopepp.geometry.camera_file import Camera
-from dopepp.inference.sources.frame import Frame
 from dopepp.inference.sources.message import (
     CAMERA,
     COMPRESSED,
@@ -23,6 +22,7 @@ from dopepp.inference.sources.message import (
     is_rectified,
     picture_of,
 )
+from dopepp.inference.sources.source import Frame
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

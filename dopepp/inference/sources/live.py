@@ -18,8 +18,8 @@ from urllib.parse import urlsplit
 import cv2
 
 from dopepp.core.errors import RunError, UserError
-from dopepp.inference.sources.frame import Frame
-from dopepp.inference.sources.video import as_rgb, checked_rate, open_capture
+from dopepp.inference.sources.files import as_rgb, checked_rate, open_capture
+from dopepp.inference.sources.source import Frame
 
 SCHEMES: Final = ("rtsp", "rtsps", "http", "https")
 

@@ -11,18 +11,17 @@ from numpy.testing import assert_allclose
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, transform
 from dopepp.geometry.rotation import random_rotation, rotation_vector_to_matrix
+from dopepp.inference.picture import checked_depth, read_depth, undistorted_depth
 from dopepp.inference.refinement.depth import DepthEvidence
-from dopepp.inference.refinement.fit import make_prior, outline_terms
-from dopepp.inference.refinement.planes import plane_terms
+from dopepp.inference.refinement.depth.terms import outline_terms, plane_terms
 from dopepp.inference.refinement.refiner import PartRefiner
-from dopepp.inference.refinement.view import (
-    checked_depth,
+from dopepp.inference.refinement.solver import make_prior
+from dopepp.inference.refinement.surface import (
     lay_over,
-    read_depth,
-    undistorted_depth,
+    surface_points,
     view_around,
+    visible,
 )
-from dopepp.inference.refinement.visible import surface_points, visible
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body

@@ -15,23 +15,25 @@ from scipy import ndimage
 
 from dopepp.geometry.camera import camera_matrix, make_transform, moved, project, transform
 from dopepp.geometry.rotation import rotation_angle, rotation_vector_to_matrix
-from dopepp.inference.refinement.colour import colour_bins, log_odds
-from dopepp.inference.refinement.contour import Contour, find_contour
-from dopepp.inference.refinement.crop import crop_around
-from dopepp.inference.refinement.fit import Prior
-from dopepp.inference.refinement.lines import (
+from dopepp.inference.refinement.colour import colour_bins, crop_around, log_odds
+from dopepp.inference.refinement.outline import (
+    Contour,
+    filled_mask,
+    find_contour,
+    make_outline_mesh,
+    outline_rows,
+    posed,
+)
+from dopepp.inference.refinement.refiner import NUM_QUADRUPLES, poses_of_four
+from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
+from dopepp.inference.refinement.region.round import Round
+from dopepp.inference.refinement.region.shifts import (
     OFFSET_PX,
     Shifts,
     find_shifts,
-    outline_rows,
     region_terms,
 )
-from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.region import FINE, FOLLOWED, FOUND, SURE, RegionRefiner
-from dopepp.inference.refinement.rounds import Round
-from dopepp.inference.refinement.silhouette import filled_mask, posed
-from dopepp.inference.refinement.solver import descend
-from dopepp.inference.refinement.starts import NUM_QUADRUPLES, poses_of_four
+from dopepp.inference.refinement.solver import Prior, descend
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 

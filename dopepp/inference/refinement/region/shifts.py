@@ -19,11 +19,9 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.geometry.camera import CameraMatrix, Transform
 from dopepp.geometry.refine import solve_damped
-from dopepp.inference.refinement.contour import Contour
-from dopepp.inference.refinement.fit import Terms
-from dopepp.inference.refinement.solver import DAMPING
+from dopepp.inference.refinement.outline import Contour
+from dopepp.inference.refinement.solver import DAMPING, NormalEquations
 
 LEAST_CHANGE: Final = 3.0
 """Grey levels that are noise: a picture that changes less has no edges."""
@@ -113,22 +111,13 @@ def find_shifts(
     return Shifts(found[:, 0], found[:, 1])
 
 
-def outline_rows(
-    contour: Contour, T_cam_obj: Transform, K: CameraMatrix
-) -> Float[np.ndarray, "points 6"]:
-    """Return how each point moves along its normal, pixels, with (turn, shift) of the pose."""
-    rows = np.empty((len(contour), 6))
-    _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
-    return rows
-
-
 def region_terms(
     rows: Float[np.ndarray, "points 6"],
     shifts: Shifts,
-    prior: Terms,
+    prior: NormalEquations,
     spacing: float,
     extent: float,
-) -> Terms:
+) -> NormalEquations:
     """Return the pull of an outline whose points have one unknown offset in common.
 
     The offset is a seventh unknown with a prior. Points are weighted by what remains of their
@@ -150,18 +139,6 @@ def region_terms(
     # Without the seventh unknown: its Schur complement.
     last = H[:6, 6] / (H[6, 6] + 1.0 / OFFSET_PX**2)
     return H[:6, :6] - np.outer(last, H[:6, 6]), g[:6] - last * g[6]
-
-
-@compiled()
-def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
-    """Write a point's move: along n·du with du = f (dX/Z − X dZ/Z²), and arm × that for a turn."""
-    for i in range(len(arms)):
-        x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
-        inverse = 1.0 / (z + T[2, 3])
-        a, b = normals[i, 0] * K[0, 0] * inverse, normals[i, 1] * K[1, 1] * inverse
-        c = -(a * (x + T[0, 3]) + b * (y + T[1, 3])) * inverse
-        rows[i, 0], rows[i, 1], rows[i, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-        rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c
 
 
 @compiled()

@@ -2,17 +2,15 @@
 
 Colours inside a part's outline and around it are learned at the pose that is to be refined. Along
 the normals of the outline they and the picture's edges tell where the part ends
-(:mod:`~dopepp.inference.refinement.lines`), and a few Gauss–Newton steps follow, from coarse to
-fine, with the given pose and its covariance as prior. Where the picture does not agree with what
-that leads to, the descent starts from elsewhere too (:mod:`~dopepp.inference.refinement.starts`),
-with a prior that lets go, and the end that the picture agrees with best is taken. That is for poses
-whose covariance may be wrong, as a network's of a part that is hidden. Where the picture does not
-decide, the given pose is kept.
+(:mod:`~dopepp.inference.refinement.region.shifts`), and a few Gauss–Newton steps follow, from
+coarse to fine, with the given pose and its covariance as prior. Where the picture does not agree
+with what that leads to, the descent starts from elsewhere too, with a prior that lets go, and the
+end that the picture agrees with best is taken. That is for poses whose covariance may be wrong, as
+a network's of a part that is hidden. Where the picture does not decide, the given pose is kept.
 
 Errors of neighbouring points are alike, and an offset may be common to all: a covariance that took
-them for independent would let a blurred edge overrule the network's distance. Edges and creases
-inside the outline were tried and made no pose better. The idea of regions is that of PWP3D and
-RBOT, that of probabilistic lines SRT3D's (Stoiber et al. 2022).
+them for independent would let a blurred edge overrule the network's distance. The idea of regions
+is that of PWP3D and RBOT, that of probabilistic lines SRT3D's (Stoiber et al. 2022).
 """
 
 from __future__ import annotations
@@ -20,27 +18,31 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
+from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Transform
-from dopepp.inference.refinement.crop import EDGE_PX, crop_around
+from dopepp.inference.refinement.colour import EDGE_PX, crop_around
 from dopepp.inference.refinement.depth import DepthEvidence
-from dopepp.inference.refinement.fit import Prior, make_prior
-from dopepp.inference.refinement.lines import FOLLOWED, FOUND, Weights, outline_rows
-from dopepp.inference.refinement.mesh import make_outline_mesh
-from dopepp.inference.refinement.rounds import Agreement, Round, Stage
-from dopepp.inference.refinement.silhouette import posed
-from dopepp.inference.refinement.solver import Evidence, Refinement, Solution, UndecidedError
-from dopepp.inference.refinement.starts import drawn_poses
+from dopepp.inference.refinement.outline import make_outline_mesh, outline_rows, posed
+from dopepp.inference.refinement.region.round import Agreement, Round, Stage
+from dopepp.inference.refinement.region.shifts import FOLLOWED, FOUND, Weights
+from dopepp.inference.refinement.solver import (
+    PoseMatrix,
+    Prior,
+    Refinement,
+    Solution,
+    Term,
+    UndecidedError,
+    make_prior,
+)
 from dopepp.parts.mesh import Faces, Vertices, largest_distance
 
-COARSE: Final = Stage(120, reach=1.0, steps=3, points=100, tiles=1, weights=FOUND)
-MIDDLE: Final = Stage(200, reach=0.5, steps=2, points=120, tiles=2, weights=FOUND)
-FINE: Final = Stage(300, reach=0.25, steps=3, points=160, tiles=3, weights=FOUND)
+COARSE: Final = Stage(120, reach=1.0, steps=3, points=100, tiles=1)
+MIDDLE: Final = Stage(200, reach=0.5, steps=2, points=120, tiles=2)
+FINE: Final = Stage(300, reach=0.25, steps=3, points=160, tiles=3)
 """The coarse round is every start's, the others only the best one's."""
 
 WIDENED: Final = 2.0
@@ -59,8 +61,9 @@ FAR: Final = 3.0
 """Deviations there, besides the given pose's own: so many times those of a pose that nothing is
 known about."""
 
+NUM_DRAWS: Final = 4
 NUM_STARTS: Final = 4
-"""The likeliest ones there, besides the given pose."""
+"""Poses that are drawn there, and the likeliest starts that are tried besides the given pose."""
 
 CERTAIN: Final = 0.95
 """Share of what the picture tells that ends the search."""
@@ -71,7 +74,6 @@ REACH: Final = (2.5, 0.15)
 ENOUGH: Final = 0.6
 """Of the first reach, which is then one and a half standard deviations: a round that looks as far
 needs none before it."""
-
 
 Starts = Callable[[], Sequence[Transform]]
 """Where else a part may be; called where that is asked for."""
@@ -97,63 +99,40 @@ class RegionRefiner:
 
     def refine(
         self,
-        image: UInt8[np.ndarray, "height width 3"],
+        image: Picture,
         K: CameraMatrix,
         T_cam_obj: Transform,
-        covariance: Float[np.ndarray, "6 6"] | None = None,
+        covariance: PoseMatrix | None = None,
         followed: bool = False,
         starts: Starts | None = None,
     ) -> Refinement:
-        """Refine one pose.
+        """Refine one pose; see :meth:`~dopepp.inference.refinement.refiner.PartRefiner.refine`.
 
-        Args:
-            image: RGB.
-            K: Its camera matrix, pixels.
-            T_cam_obj: The pose to start from, metres.
-            covariance: Of the given pose: rotation vector about the object's origin and shift, both
-                in camera axes, radians and metres. Without it, a broad one is taken.
-            followed: Whether the pose follows from one that was refined on the frame before.
-            starts: Asked for further poses, where the picture does not agree with what is near the
-                given one: then those, and some that are drawn, are started from too. None: the
-                covariance is believed.
-
-        Returns:
-            The refined pose with its covariance, or the given one with the reason why it was kept.
+        ``starts`` is asked for further poses where the picture does not agree with what is near the
+        given one: then those, and some that are drawn, are started from too. None: the covariance
+        is believed.
         """
         given = np.asarray(T_cam_obj, np.float64)
         if not np.isfinite(given).all():
             return Refinement(given, reason="the pose is not finite")
         try:
             prior = _prior(given, self._diameter, covariance)
-            loose, weights = _loosened(prior, self._diameter), FOLLOWED if followed else FOUND
-            rounds = self._rounds(image, K, given, weights)
+            loose = _loosened(prior, self._diameter)
+            rounds = self._rounds(image, K, given, FOLLOWED if followed else FOUND)
             return refinement(*_search(rounds, prior, loose, starts))
         except UndecidedError as undecided:
             return Refinement(given, reason=str(undecided))
 
     def refine_with(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],
-        K: CameraMatrix,
-        depth: DepthEvidence,
-        start: Solution,
+        self, image: Picture, K: CameraMatrix, depth: DepthEvidence, start: Solution
     ) -> Found:
-        """Refine a pose on the picture and with depth at once.
-
-        Args:
-            image: RGB.
-            K: Its camera matrix, pixels.
-            depth: What pulls beside the outline.
-            start: Where one of them alone has led.
-
-        Returns:
-            The end, and how well the outline agrees there.
+        """Refine on the picture and with depth at once, from where one of them alone has led.
 
         Raises:
             UndecidedError: The picture does not decide.
         """
         seen = depth.seen(start.T_cam_obj)
-        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.evidence(seen)])
+        rounds = self._rounds(image, K, start.T_cam_obj, more=[depth.term(seen)])
         reach = _first_reach(rounds[0], Prior(start.T_cam_obj, start.information))
         end = _descended(_needed(rounds, reach), start.T_cam_obj, depth.prior, reach)
         known = depth.information(end.T_cam_obj, seen)
@@ -161,11 +140,11 @@ class RegionRefiner:
 
     def _rounds(
         self,
-        image: UInt8[np.ndarray, "height width 3"],
+        image: Picture,
         K: CameraMatrix,
         pose: Transform,
         weights: Weights = FOUND,
-        more: Sequence[Evidence] = (),
+        more: Sequence[Term] = (),
     ) -> list[Round]:
         """Return the rounds around a pose; an :class:`UndecidedError` where it is not in view."""
         K = np.asarray(K, np.float64)
@@ -178,7 +157,7 @@ class RegionRefiner:
             crop = crop_around(image, K, corners, stage.longest_px)
             if isinstance(crop, str):
                 raise UndecidedError(crop)
-            rounds.append(Round(self._mesh, crop, replace(stage, weights=weights), more))
+            rounds.append(Round(self._mesh, crop, stage, weights, more))
         return rounds
 
 
@@ -188,7 +167,7 @@ def refinement(end: Solution, agreement: Agreement) -> Refinement:
     return Refinement(end.T_cam_obj, covariance, "", agreement.share, agreement.support)
 
 
-def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6"] | None) -> Prior:
+def _prior(given: Transform, diameter: float, covariance: PoseMatrix | None) -> Prior:
     """Return the given pose with its covariance as it is, or with a broad one."""
     if covariance is None or not np.isfinite(covariance).all():
         return make_prior(given, diameter)
@@ -198,7 +177,7 @@ def _prior(given: Transform, diameter: float, covariance: Float[np.ndarray, "6 6
 
 
 def _loosened(prior: Prior, diameter: float) -> Prior:
-    """Return a prior around the same pose that lets go of it."""
+    """Return a weaker prior (larger covariance) at the same pose."""
     broad = make_prior(prior.T_cam_obj, diameter).information
     covariance = np.linalg.inv(prior.information) + FAR**2 * np.linalg.inv(broad)
     return Prior(prior.T_cam_obj, np.linalg.inv(covariance))
@@ -252,14 +231,13 @@ def _far(
         before = rounds[-1].agreement(prior.T_cam_obj, reach) if near is None else near[1]
         supported = max(SUPPORTED, before.support + MORE)
         rounds[0].learn(prior.T_cam_obj, reach)
-        others = [*starts, *drawn_poses(loose, 1 / FAR)]
+        others = [*starts, *loose.draws(1 / FAR, NUM_DRAWS)]
         others.sort(key=lambda start: -rounds[0].log_likelihood(start, loose))
         for start in (prior.T_cam_obj, *others[:NUM_STARTS]):
             with contextlib.suppress(UndecidedError):
                 end, _ = _from_afar(rounds, start, loose, reach)
                 # A prior that admits where that led, and holds the pose no less than it must.
-                away = prior.offset(end.T_cam_obj)
-                surprise = max(1.0, float(away @ prior.information @ away) / len(away))
+                surprise = max(1.0, prior.squared_distance(end.T_cam_obj) / 6)
                 admitting = Prior(prior.T_cam_obj, prior.information / surprise)
                 found = _refined(rounds[-1:], end.T_cam_obj, admitting, reach)
                 least = SURE if best is None else best[1].share

@@ -1,20 +1,69 @@
-"""Lens: what is known of the camera behind some pictures, and how the pictures came about."""
+"""What every source of pictures hands out, and the camera behind it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop, read_camera
 from dopepp.geometry.camera_formats import Size
-from dopepp.inference.sources import Source
 
 if TYPE_CHECKING:
-    from dopepp.inference.refinement.view import Depth32
+    from dopepp.inference.picture import Depth32
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of a source.
+
+    Attributes:
+        image: RGB, as the camera took it.
+        name: The picture's file, or the source where that has many.
+        number: Its place in the source, counted from 0; where all pictures' files are named by
+            numbers alone, as BOP's are, that number.
+        time: Seconds: of a video since its start, of a camera or a bag since 1970; None of a
+            picture.
+    """
+
+    image: Picture
+    name: str
+    number: int
+    time: float | None = None
+
+
+class Source(Protocol):
+    """Where pictures come from.
+
+    Attributes:
+        name: For messages, and for what is written about it; without passwords.
+        stem: What a file about it is called, without suffix.
+        count: How many frames it has; None where nobody knows.
+        rate: Frames a second, of a sequence in time; None of single pictures.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def stem(self) -> str: ...  # noqa: D102
+
+    @property
+    def count(self) -> int | None: ...  # noqa: D102
+
+    @property
+    def rate(self) -> float | None: ...  # noqa: D102
+
+    @property
+    def camera(self) -> Camera | None:
+        """The camera that the source itself knows."""
+
+    def frames(self, stride: int = 1) -> Iterator[Frame]:
+        """Yield every so manieth frame, in order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +88,7 @@ class Lens:
 
     def depth(self, path: Path, scale: float, K: CameraMatrix) -> Depth32:
         """Read a depth image, metres, and return it without distortion."""
-        from dopepp.inference.refinement.view import read_depth, undistorted_depth
+        from dopepp.inference.picture import read_depth, undistorted_depth
 
         metres, lens = read_depth(path, scale), self.camera.coefficients
         return metres if lens is None else undistorted_depth(metres, K, lens)

@@ -9,28 +9,34 @@ from typing import Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from dopepp.geometry.camera import Transform
-from dopepp.inference.refinement.colour import log_odds
-from dopepp.inference.refinement.contour import Contour, find_contour
-from dopepp.inference.refinement.crop import EDGE_PX, Crop
-from dopepp.inference.refinement.fit import Prior, Terms
-from dopepp.inference.refinement.lines import (
+from dopepp.inference.refinement.colour import EDGE_PX, Crop, log_odds
+from dopepp.inference.refinement.outline import (
+    Contour,
+    OutlineMesh,
+    Posed,
+    filled_mask,
+    find_contour,
+    outline_rows,
+    posed,
+)
+from dopepp.inference.refinement.region.shifts import (
     FOLLOWED,
     INDEPENDENT_PX,
     LEAST_INFORMATION,
     Shifts,
     Weights,
     find_shifts,
-    outline_rows,
     region_terms,
 )
-from dopepp.inference.refinement.mesh import OutlineMesh
-from dopepp.inference.refinement.silhouette import Posed, filled_mask, posed
 from dopepp.inference.refinement.solver import (
-    Evidence,
+    NormalEquations,
+    PoseMatrix,
+    Prior,
     Solution,
+    Term,
     UndecidedError,
     descend,
 )
@@ -71,7 +77,6 @@ class Stage:
         steps: Gauss–Newton steps.
         points: About so many on the outline.
         tiles: Along each side of the part, with colours of their own.
-        weights: Of colours and edges.
     """
 
     longest_px: int
@@ -79,7 +84,6 @@ class Stage:
     steps: int
     points: int
     tiles: int
-    weights: Weights
 
 
 @dataclass(frozen=True)
@@ -96,14 +100,6 @@ class Agreement:
     support: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Silhouette:
-    """A mesh at a pose and the pixels it covers."""
-
-    at: Posed
-    mask: UInt8[np.ndarray, "height width"]
-
-
 class Round:
     """One stage on its crop, with the colours that it has learned.
 
@@ -111,26 +107,33 @@ class Round:
         mesh: The part.
         crop: The picture at the stage's size.
         stage: The stage.
-        more: What pulls beside the outline.
+        weights: Of colours and edges.
+        more: Terms that pull beside the outline.
     """
 
     def __init__(
-        self, mesh: OutlineMesh, crop: Crop, stage: Stage, more: Sequence[Evidence] = ()
+        self,
+        mesh: OutlineMesh,
+        crop: Crop,
+        stage: Stage,
+        weights: Weights,
+        more: Sequence[Term] = (),
     ) -> None:
-        self.crop, self.stage, self._mesh, self._more = crop, stage, mesh, more
+        self.crop, self.stage, self._weights = crop, stage, weights
+        self._mesh, self._more = mesh, more
         self._spacing = max(1.5, 3.0 * crop.extent / stage.points)
         self._odds: Float32[np.ndarray, "height width"] = np.zeros(crop.size[::-1], np.float32)
         self._soft = self._odds
-        self._last: tuple[Transform, _Silhouette | None] = np.empty((0, 0)), None
+        self._last_pose: Transform = np.empty((0, 0))
+        self._last: tuple[Posed, UInt8[np.ndarray, "height width"]] | None = None
 
     def learn(self, pose: Transform, reach: float) -> None:
         """Learn the colours at a pose that may be off by the stage's share of ``reach``."""
         silhouette = self._silhouette(pose)
-        reach = self.reach(reach)
-        ring = RING * self.crop.extent
+        reach, ring = self.reach(reach), RING * self.crop.extent
         odds = None
         if silhouette is not None:
-            odds = log_odds(self.crop.bins, silhouette.mask, 0.5 * reach, ring, self.stage.tiles)
+            odds = log_odds(self.crop.bins, silhouette[1], 0.5 * reach, ring, self.stage.tiles)
         if odds is None:
             raise UndecidedError("too few pixels of the part and around it are on the picture")
         self._odds = self._soft = odds
@@ -143,13 +146,13 @@ class Round:
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return None
-        contour = find_contour(self._mesh, silhouette.at, silhouette.mask, self._spacing)
+        contour = find_contour(self._mesh, *silhouette, self._spacing)
         return contour if len(contour) >= FEWEST_POINTS else None
 
-    def evidence(self, reach: float) -> Sequence[Evidence]:
-        """Return what pulls, as functions of the pose."""
+    def terms(self, reach: float) -> list[Term]:
+        """Return the pull of the outline and of what there is besides."""
 
-        def outline(pose: Transform, known: Terms) -> Terms | None:
+        def outline(pose: Transform, known: NormalEquations) -> NormalEquations | None:
             contour = self.contour(pose)
             if contour is None:
                 return None
@@ -161,7 +164,7 @@ class Round:
 
     def descend(self, start: Transform, prior: Prior, reach: float) -> Solution:
         """Take the stage's steps; an :class:`UndecidedError` where they leave the picture."""
-        end = descend(start, prior, self.evidence(reach), self.stage.steps)
+        end = descend(start, prior, self.terms(reach), self.stage.steps)
         if end is None:
             raise UndecidedError("the part's outline left the picture")
         return end
@@ -171,18 +174,15 @@ class Round:
         silhouette = self._silhouette(pose)
         if silhouette is None:
             return -math.inf
-        inside = float(self._odds.ravel() @ silhouette.mask.ravel())
-        inside *= self.stage.weights.colour / INDEPENDENT_PX
-        offset = prior.offset(pose)
-        return inside - 0.5 * float(offset @ prior.information @ offset)
+        inside = float(self._odds.ravel() @ silhouette[1].ravel())
+        inside *= self._weights.colour / INDEPENDENT_PX
+        return inside - 0.5 * prior.squared_distance(pose)
 
     def agreement(self, pose: Transform, reach: float) -> Agreement:
         """Return how well an outline agrees with the picture, in the colours learned last."""
         return self._agreement(self._outline(pose), reach)
 
-    def believed(
-        self, end: Solution, prior: Prior, reach: float, known: Float[np.ndarray, "6 6"]
-    ) -> Agreement:
+    def believed(self, end: Solution, prior: Prior, reach: float, known: PoseMatrix) -> Agreement:
         """Return how well the outline agrees where a descent has ended.
 
         ``known`` is the information that was there without the outline.
@@ -198,14 +198,13 @@ class Round:
             raise UndecidedError(
                 f"only {agreement.share:.0%} of the outline agrees with the picture"
             )
-        offset = prior.offset(end.T_cam_obj)
-        distance = math.sqrt(float(offset @ prior.information @ offset))
+        distance = math.sqrt(prior.squared_distance(end.T_cam_obj))
         if distance > FARTHEST:
             raise UndecidedError(
                 f"{distance:.1f} standard deviations from the given pose, more than {FARTHEST:g}"
             )
         rows = outline_rows(contour, end.T_cam_obj, self.crop.K)
-        near = self._followed and np.mean((rows @ offset) ** 2) < 1.0
+        near = self._followed and np.mean((rows @ prior.offset(end.T_cam_obj)) ** 2) < 1.0
         # Of a followed part within a pixel, single pixels would decide; what pulls besides may
         # well move a pose to where the picture alone fits less.
         if not near and not self._more:
@@ -213,6 +212,18 @@ class Round:
             if after <= self.log_likelihood(prior.T_cam_obj, prior):
                 raise UndecidedError("the picture fits the given pose no worse")
         return agreement
+
+    def reach(self, reach: float) -> float:
+        """Return the stage's share of a reach, in pixels of its crop."""
+        return max(EDGE_PX, self.stage.reach * reach * self.crop.scale)
+
+    def farthest(self, reach: float) -> float:
+        """Return the same in pixels of the picture."""
+        return self.reach(reach) / self.crop.scale
+
+    @property
+    def _followed(self) -> bool:
+        return self._weights == FOLLOWED
 
     def _outline(self, pose: Transform) -> Contour:
         contour = self.contour(pose)
@@ -228,46 +239,33 @@ class Round:
         share = float(weights[agrees].sum() / max(weights.sum(), LEAST_INFORMATION))
         return Agreement(share, float((agrees & (weights > TOLD)).mean()))
 
-    def _gain(self, end: Solution, prior: Prior, known: Float[np.ndarray, "6 6"]) -> float:
-        """Return by how much the outline makes the prior's volume smaller, its logarithm.
+    def _gain(self, end: Solution, prior: Prior, known: PoseMatrix) -> float:
+        """Return the logarithm by which the outline makes the prior's volume smaller.
 
-        What it says of a followed part, whose pose was known well, is measured against one that
-        was known less.
+        For a followed part, whose pose was known well, the gain is relative to a weaker prior.
         """
-        said, before = end.information - known, prior.information
+        added, before = end.information - known, prior.information
         if self._followed:
             turn, shift = FIRM
             firm = np.repeat([turn, shift * float(end.T_cam_obj[2, 3])], 3) ** 2
             before = np.linalg.inv(np.linalg.inv(before) + np.diag(firm))
-        return float(np.linalg.slogdet(before + said)[1] - np.linalg.slogdet(before)[1])
-
-    @property
-    def _followed(self) -> bool:
-        return self.stage.weights == FOLLOWED
-
-    def reach(self, reach: float) -> float:
-        """Return the stage's share of a reach, in pixels of its crop."""
-        return max(EDGE_PX, self.stage.reach * reach * self.crop.scale)
-
-    def farthest(self, reach: float) -> float:
-        """Return the same in pixels of the picture."""
-        return self.reach(reach) / self.crop.scale
+        return float(np.linalg.slogdet(before + added)[1] - np.linalg.slogdet(before)[1])
 
     def _shifts(self, contour: Contour, reach: float) -> Shifts:
         reach = self.reach(reach)
         return find_shifts(
-            self._soft, self.crop.colours, contour, reach, _step(reach), self.stage.weights
+            self._soft, self.crop.colours, contour, reach, _step(reach), self._weights
         )
 
-    def _silhouette(self, pose: Transform) -> _Silhouette | None:
-        """Return that of a pose, kept while the same pose is asked for."""
-        if self._last[0] is not pose:
+    def _silhouette(
+        self, pose: Transform
+    ) -> tuple[Posed, UInt8[np.ndarray, "height width"]] | None:
+        """Return the mesh at a pose and its mask, kept while the same pose is asked for."""
+        if self._last_pose is not pose:
             at = posed(self._mesh, pose, self.crop.K)
-            silhouette = None
-            if at is not None:
-                silhouette = _Silhouette(at, filled_mask(self._mesh, at, self.crop.size))
-            self._last = pose, silhouette
-        return self._last[1]
+            self._last = None if at is None else (at, filled_mask(self._mesh, at, self.crop.size))
+            self._last_pose = pose
+        return self._last
 
 
 def _step(reach: float) -> float:

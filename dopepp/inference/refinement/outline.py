@@ -1,0 +1,356 @@
+"""The outline of a mesh at a pose: its silhouette, and points on the silhouette's border.
+
+The triangles of a closed mesh that face the camera cover all that the mesh covers, and each covers
+a pixel once. So does their common border wind around it as often as they cover it, and few edges
+are on that border: they are crossed row by row. Of an open mesh every triangle is filled.
+
+An edge may belong to the outline where one of its triangles faces the camera and the other does
+not, or where it has one triangle only. Which of these edges really do is read off the filled mask:
+the part ends there. Edges behind or before other surface of the part have the part on both sides.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.geometry.camera import CameraMatrix, Transform
+from dopepp.parts.mesh import Faces, Vertices, face_areas, weld
+from dopepp.parts.mesh.decimate import decimate
+from dopepp.parts.part import MAX_LIGHT_FACES
+
+NEAR: Final = 1e-3
+"""Metres before the camera that every vertex must keep."""
+
+WINDOW_PX: Final = 3.0
+"""Radius of the disc of the mask in which a point's outward direction is read."""
+
+BESIDE_PX: Final = 1.25
+"""Distance from the outline at which there is part on one side and none on the other."""
+
+LONG_PX: Final = 4.0
+"""Edges of at least this length have their own normal; shorter ones zigzag about the outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineMesh:
+    """Triangles with what their outlines need.
+
+    Attributes:
+        vertices: Positions, metres.
+        faces: Corners of each triangle.
+        planes: Normal of each triangle (of any length) and its product with a corner.
+        edges: The two vertices of each edge.
+        sides: The two triangles at it; the second is −1 where there is one only.
+        opposed: 1 where these two run along it in the same direction, else 0.
+        is_closed: Whether the triangles that face the camera hide all others.
+    """
+
+    vertices: Vertices
+    faces: Faces
+    planes: Float[np.ndarray, "faces 4"]
+    edges: Int[np.ndarray, "edges 2"]
+    sides: Int[np.ndarray, "edges 2"]
+    opposed: UInt8[np.ndarray, "edges"]
+    is_closed: bool
+
+
+def make_outline_mesh(
+    vertices: Vertices, faces: Faces, max_faces: int = MAX_LIGHT_FACES
+) -> OutlineMesh:
+    """Prepare triangles; more than ``max_faces`` of them are replaced by fewer.
+
+    Raises:
+        ValueError: The triangles have no area.
+    """
+    vertices, faces = weld(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
+    faces = faces[face_areas(vertices, faces) > 0]
+    if not len(faces):
+        raise ValueError("no triangle with an area")
+    if len(faces) > max_faces:
+        vertices, faces, *_ = decimate(vertices, faces, None, max_faces)
+        faces = faces[face_areas(vertices, faces) > 0]
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    planes = np.column_stack([normals, (normals * a).sum(axis=1)])
+    start, end = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    keys = np.minimum(start, end) * len(vertices) + np.maximum(start, end)
+    order = np.argsort(keys, kind="stable")
+    first = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    uses = np.diff(first, append=len(keys))
+    one, other = order[first], order[np.where(uses > 1, first + 1, first)]
+    opposed = (start[one] == start[other]) & (uses > 1)
+    return OutlineMesh(
+        vertices, faces, planes,
+        edges=np.stack([start[one], end[one]], axis=1),
+        sides=np.stack([one // 3, np.where(uses > 1, other // 3, -1)], axis=1),
+        opposed=opposed.astype(np.uint8),
+        is_closed=bool((uses == 2).all() and not opposed.any()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A mesh at a pose.
+
+    Attributes:
+        T_cam_obj: The pose.
+        arms: Vertices from the object's origin, camera axes, metres.
+        pixels: Where they are on the picture.
+        front: Which triangles face the camera.
+    """
+
+    T_cam_obj: Transform
+    arms: Float[np.ndarray, "vertices 3"]
+    pixels: Float[np.ndarray, "vertices 2"]
+    front: Bool[np.ndarray, "faces"]
+
+
+def posed(mesh: OutlineMesh, T_cam_obj: Transform, K: CameraMatrix) -> Posed | None:
+    """Put a mesh at a pose; None where some of it is not before the camera."""
+    arms, pixels = np.empty_like(mesh.vertices), np.empty((len(mesh.vertices), 2))
+    front = np.empty(len(mesh.faces), np.bool_)
+    if not _pose(mesh.vertices, mesh.planes, T_cam_obj, K, arms, pixels, front):
+        return None
+    return Posed(T_cam_obj, arms, pixels, front)
+
+
+def filled_mask(
+    mesh: OutlineMesh, at: Posed, size: tuple[int, int]
+) -> UInt8[np.ndarray, "height width"]:
+    """Return 1 at the pixels of (width, height) whose centres a posed mesh covers, else 0."""
+    width, height = size
+    mask = np.zeros((height, width), np.uint8)
+    if mesh.is_closed:
+        turns = np.zeros((height, width + 1), np.int32)
+        _wind(at.pixels, mesh.edges, mesh.sides, at.front, turns, mask)
+    else:
+        _fill(at.pixels, mesh.faces, mask)
+    return mask
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """Points on the outline of a posed part.
+
+    Attributes:
+        arms: From the object's origin to each, camera axes, metres.
+        pixels: Where they are on the picture.
+        normals: Unit vectors on the picture that point away from the part.
+    """
+
+    arms: Float[np.ndarray, "points 3"]
+    pixels: Float[np.ndarray, "points 2"]
+    normals: Float[np.ndarray, "points 2"]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def find_contour(
+    mesh: OutlineMesh, at: Posed, mask: UInt8[np.ndarray, "height width"], spacing: float
+) -> Contour:
+    """Find the points of an outline, about ``spacing`` pixels apart, that are on the picture.
+
+    Args:
+        mesh: The mesh.
+        at: It at the pose.
+        mask: It filled.
+        spacing: Pixels.
+    """
+    rows = _walk(
+        mesh.edges, mesh.sides, mesh.opposed, at.front, at.arms, at.pixels,
+        float(at.T_cam_obj[2, 3]), mask, spacing,
+    )  # fmt: skip
+    return Contour(rows[:, :3], rows[:, 3:5], rows[:, 5:])
+
+
+def outline_rows(
+    contour: Contour, T_cam_obj: Transform, K: CameraMatrix
+) -> Float[np.ndarray, "points 6"]:
+    """Return how each point moves along its normal, pixels, with (turn, shift) of the pose."""
+    rows = np.empty((len(contour), 6))
+    _rows(contour.arms, contour.normals, T_cam_obj, K, rows)
+    return rows
+
+
+@compiled()
+def _pose(
+    vertices: Array, planes: Array, T: Array, K: Array, arms: Array, pixels: Array, front: Array
+) -> bool:
+    """Write arms, pixels and facing; False where a vertex is not before the camera."""
+    for i in range(len(vertices)):
+        for r in range(3):
+            arms[i, r] = (
+                T[r, 0] * vertices[i, 0] + T[r, 1] * vertices[i, 1] + T[r, 2] * vertices[i, 2]
+            )
+        z = arms[i, 2] + T[2, 3]
+        if not z > NEAR:
+            return False
+        pixels[i, 0] = K[0, 0] * (arms[i, 0] + T[0, 3]) / z + K[0, 2]
+        pixels[i, 1] = K[1, 1] * (arms[i, 1] + T[1, 3]) / z + K[1, 2]
+    # The camera's place in the object's frame.
+    x = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
+    y = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])
+    z = -(T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3])
+    for f in range(len(planes)):
+        front[f] = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z > planes[f, 3]
+    return True
+
+
+@compiled()
+def _fill(pixels: Array, faces: Array, mask: Array) -> None:
+    """Set the pixels whose centres lie in a triangle, row by row."""
+    height, width = mask.shape
+    left, right = np.empty(height), np.empty(height)
+    for f in range(len(faces)):
+        top, bottom = height, -1
+        for c in range(3):
+            y = pixels[faces[f, c], 1]
+            top, bottom = min(top, max(0.0, math.ceil(y))), max(bottom, math.floor(y))
+        first, last = int(top), int(min(bottom, height - 1.0))
+        for v in range(first, last + 1):
+            left[v], right[v] = math.inf, -math.inf
+        for c in range(3):
+            i, j = faces[f, c], faces[f, (c + 1) % 3]
+            if pixels[i, 1] > pixels[j, 1]:
+                i, j = j, i
+            y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
+            slope = (pixels[j, 0] - pixels[i, 0]) / rise if rise > 0.0 else 0.0
+            low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.floor(pixels[j, 1]))
+            for v in range(int(low), int(high) + 1):
+                x = pixels[i, 0] + slope * (v - y)
+                left[v], right[v] = min(left[v], x), max(right[v], x)
+        for v in range(first, last + 1):
+            # Rounding must not open a gap between two triangles.
+            start, end = max(0.0, math.ceil(left[v] - 1e-9)), min(width - 1.0, right[v] + 1e-9)
+            if end >= start:
+                mask[v, int(start) : int(end) + 1] = 1
+
+
+@compiled()
+def _wind(
+    pixels: Array, edges: Array, sides: Array, front: Array, turns: Array, mask: Array
+) -> None:
+    """Set the pixels whose centres the border of the triangles that face the camera winds around.
+
+    ``turns`` is as high as the mask and wider by one, and zero: it counts crossings.
+    """
+    height, width = mask.shape
+    for e in range(len(edges)):
+        one, other = front[sides[e, 0]], front[sides[e, 1]]
+        if one == other:
+            continue
+        # An edge runs as its first triangle does, and against its second one.
+        i, j = (edges[e, 0], edges[e, 1]) if one else (edges[e, 1], edges[e, 0])
+        way = 1
+        if pixels[i, 1] > pixels[j, 1]:
+            i, j, way = j, i, -1
+        y, rise = pixels[i, 1], pixels[j, 1] - pixels[i, 1]
+        low, high = max(0.0, math.ceil(y)), min(height - 1.0, math.ceil(pixels[j, 1]) - 1.0)
+        for v in range(int(low), int(high) + 1):
+            x = pixels[i, 0] + (pixels[j, 0] - pixels[i, 0]) / rise * (v - y)
+            turns[v, int(min(max(0.0, math.ceil(x)), width))] += way
+    for v in range(height):
+        count = 0
+        for u in range(width):
+            count += turns[v, u]
+            mask[v, u] = count != 0
+
+
+@compiled()
+def _walk(
+    edges: Array,
+    sides: Array,
+    opposed: Array,
+    front: Array,
+    arms: Array,
+    pixels: Array,
+    distance: float,
+    mask: Array,
+    spacing: float,
+) -> Array:
+    """Return arm, pixel and normal of a point every ``spacing`` pixels along all edges in turn."""
+    rows, count, left = np.empty((256, 7)), 0, 0.5 * spacing
+    normal = np.empty(2)
+    for e in range(len(edges)):
+        one, other = sides[e, 0], sides[e, 1]
+        if other >= 0 and (front[one] != front[other]) == (opposed[e] == 1):
+            continue
+        i, j = edges[e, 0], edges[e, 1]
+        x, y = pixels[i, 0], pixels[i, 1]
+        dx, dy = pixels[j, 0] - x, pixels[j, 1] - y
+        length = math.hypot(dx, dy)
+        while left < length:
+            share = left / length
+            left += spacing
+            u, v = x + share * dx, y + share * dy
+            if not _outward(mask, u, v, dx, dy, length, normal):
+                continue
+            if count == len(rows):
+                longer = np.empty((2 * count, 7))
+                longer[:count] = rows
+                rows = longer
+            # Halfway on the picture is not halfway in space.
+            zi, zj = arms[i, 2] + distance, arms[j, 2] + distance
+            share = share * zi / (share * zi + (1.0 - share) * zj)
+            for c in range(3):
+                rows[count, c] = arms[i, c] + share * (arms[j, c] - arms[i, c])
+            rows[count, 3], rows[count, 4] = u, v
+            rows[count, 5], rows[count, 6] = normal[0], normal[1]
+            count += 1
+        left -= length
+    return rows[:count]
+
+
+@compiled()
+def _outward(
+    mask: Array, u: float, v: float, dx: float, dy: float, length: float, normal: Array
+) -> bool:
+    """Write the direction away from the mask; tell whether the mask ends at this point."""
+    height, width = mask.shape
+    if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+        return False
+    # The filled pixels around lie, on average, on the inside.
+    x = y = 0.0
+    for row in range(math.ceil(v - WINDOW_PX), math.floor(v + WINDOW_PX) + 1):
+        for column in range(math.ceil(u - WINDOW_PX), math.floor(u + WINDOW_PX) + 1):
+            a, b = column - u, row - v
+            inside = 0 <= row < height and 0 <= column < width and mask[row, column] == 1
+            if a * a + b * b <= WINDOW_PX**2 and inside:
+                x, y = x - a, y - b
+    size = math.hypot(x, y)
+    if size == 0.0:
+        return False
+    x, y = x / size, y / size
+    if length >= LONG_PX:
+        along = x * -dy + y * dx
+        if abs(along) < 0.5 * length:
+            return False
+        side = math.copysign(1.0 / length, along)
+        x, y = -dy * side, dx * side
+    normal[0], normal[1] = x, y
+    out_row, out_column = round(v + BESIDE_PX * y), round(u + BESIDE_PX * x)
+    in_row, in_column = round(v - BESIDE_PX * y), round(u - BESIDE_PX * x)
+    if not (0 <= out_row < height and 0 <= out_column < width):
+        return False
+    if not (0 <= in_row < height and 0 <= in_column < width):
+        return False
+    return bool(mask[in_row, in_column] == 1 and mask[out_row, out_column] == 0)
+
+
+@compiled()
+def _rows(arms: Array, normals: Array, T: Array, K: Array, rows: Array) -> None:
+    """Write a point's move: along n·du with du = f (dX/Z − X dZ/Z²), and arm × that for a turn."""
+    for i in range(len(arms)):
+        x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
+        inverse = 1.0 / (z + T[2, 3])
+        a, b = normals[i, 0] * K[0, 0] * inverse, normals[i, 1] * K[1, 1] * inverse
+        c = -(a * (x + T[0, 3]) + b * (y + T[1, 3])) * inverse
+        rows[i, 0], rows[i, 1], rows[i, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+        rows[i, 3], rows[i, 4], rows[i, 5] = a, b, c
