@@ -30,7 +30,7 @@ import torch
 import dopepp.experiment.run.train  # noqa: F401 -- the libraries, once
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 STEPS_PER_EPOCH = 8

@@ -31,7 +31,7 @@ from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.mesh.read import ycb_part
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body
-from dopepp.virtual.renderers.raster.rasteriser import render
+from dopepp.virtual.renderers.raster import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 
 SIZE = (640, 480)

@@ -23,9 +23,9 @@ from dopepp.geometry.camera import CameraMatrix, project_keypoints
 from dopepp.inference.diagnosis import Case, diagnose
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual import PRESETS, Factory
-from dopepp.virtual.presets.preset import Preset
-from dopepp.virtual.scene import Rendered, Sensor
-from dopepp.virtual.sensor import capture, defocus
+from dopepp.virtual.presets import Preset
+from dopepp.virtual.scene import Rendered
+from dopepp.virtual.sensor import Sensor, capture, defocus
 
 
 class Taken(NamedTuple):

@@ -34,7 +34,7 @@ from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Parts
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.backgrounds import find_backgrounds
-from dopepp.virtual.backgrounds.cluttered import ClutteredBackgrounds
+from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
 from dopepp.virtual.body import make_body
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Scene, SceneObject

@@ -24,7 +24,7 @@ from dopepp.core.errors import UserError
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.virtual import PRESETS, Factory, Rendered, Scene, render
 from dopepp.virtual.renderers import find_renderer
-from dopepp.virtual.renderers.photoreal.variant import VARIANT_SETTING, VARIANTS
+from dopepp.virtual.renderers.photoreal import VARIANT_SETTING, VARIANTS
 
 SCENES = ("paper", "table")
 LIMIT_M = 1e-3

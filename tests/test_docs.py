@@ -16,7 +16,7 @@ from hydra.errors import OverrideParseException
 
 from dopepp.cli import app
 from dopepp.experiment.command_line import EVALUATION_SHORT_NAMES, SHORT_NAMES
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 ROOT: Final = Path(__file__).parents[1]
 CONF: Final = ROOT / "conf"

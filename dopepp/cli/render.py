@@ -17,7 +17,7 @@ class RenderCommand(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help."""
-        from dopepp.virtual.presets.preset import PRESETS
+        from dopepp.virtual.presets import PRESETS
 
         (preset,) = (one for one in self.params if one.name == "preset")
         preset.help = ", ".join(PRESETS)  # type: ignore[attr-defined]

@@ -1,9 +1,9 @@
 """The virtual-reality factory: from parts to labelled images, without torch and without files."""
 
-from dopepp.virtual.arrange.random_scene import random_scene
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
-from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.distractors import Distractors
+from dopepp.virtual.body import Distractors
+from dopepp.virtual.factory import Factory, random_scene
+from dopepp.virtual.presets import PRESETS, Preset, preset_of
 from dopepp.virtual.presets.looks import Lighting, Materials
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
@@ -12,9 +12,8 @@ from dopepp.virtual.presets.placement import (
     FreeTurning,
     OffsetPlacement,
 )
-from dopepp.virtual.presets.preset import PRESETS, Preset, preset_of
 from dopepp.virtual.presets.table import Table
-from dopepp.virtual.renderers.raster.rasteriser import (
+from dopepp.virtual.renderers.raster import (
     Silhouette,
     render,
     silhouette,
@@ -29,9 +28,8 @@ from dopepp.virtual.scene import (
     Rendered,
     Scene,
     SceneObject,
-    Sensor,
 )
-from dopepp.virtual.sensor import Sensors, capture
+from dopepp.virtual.sensor import Sensor, Sensors, capture
 from dopepp.virtual.surface import Surface, make_surface
 
 __all__ = [

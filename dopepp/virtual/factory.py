@@ -10,17 +10,24 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.random import Generator
 
 from dopepp.core.errors import UserError
+from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.cuboid import CENTROID
+from dopepp.geometry.rotation import Vector
 from dopepp.parts.catalogue import BUILTIN
 from dopepp.parts.part import Part
-from dopepp.virtual.arrange.random_scene import random_scene
+from dopepp.virtual.arrangement import Composition, arrange_floating
 from dopepp.virtual.backgrounds import Backgrounds, ProceduralBackgrounds
-from dopepp.virtual.body import make_body
-from dopepp.virtual.presets.preset import Preset
+from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
+from dopepp.virtual.body import Body, make_body
+from dopepp.virtual.presets import Preset
+from dopepp.virtual.presets.table import plane_of
 from dopepp.virtual.renderers import find_renderer
-from dopepp.virtual.scene import Rendered, Scene
+from dopepp.virtual.scene import NEAR, Rendered, Scene, SceneObject, triple
 from dopepp.virtual.sensor import capture
+from dopepp.virtual.tabletop import arrange_on_table
 
 _PACKAGE: Final = Path(__file__).parents[1]
 _FOLDERS: Final = ("virtual", "parts", "geometry")
@@ -73,7 +80,7 @@ class Factory:
         """Render an image with its ground truth, as the scene's sensor takes it.
 
         ``scale`` is how many times as large its parts appear: the camera of the same scene, moved
-        (see :mod:`dopepp.virtual.arrange.random_scene`). A UserError, where the preset cannot show
+        (see :mod:`dopepp.virtual.factory`). A UserError, where the preset cannot show
         the part, or the camera cannot stand there.
         """
         rendered = self._render(self.scene(epoch, index, scale))
@@ -108,3 +115,89 @@ def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, 
     built_in = (make() for make in BUILTIN.values())
     others = [p for p in built_in if p.name not in known and p.mesh_hash not in hashes]
     return (*given, *others)
+
+
+def random_scene(
+    preset: Preset,
+    targets: Sequence[Body],
+    negatives: Sequence[Body],
+    rng: Generator,
+    backgrounds: Backgrounds,
+    scale: float = 1.0,
+) -> Scene:
+    """Draw a scene.
+
+    The scene is a pure function of the state of ``rng``. A distractor may be one of ``negatives``
+    instead of a primitive. ``scale`` is how many times as large the targets appear as the preset
+    has it: it decides from where the scene is seen, nothing else. A UserError: the part is too
+    large or too small for the preset to show it, or the scale takes the camera below the table.
+    """
+    if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):
+        backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter, preset.background_contrast)
+    order = rng.permutation(len(targets))
+    low, high = preset.targets_per_image
+    count = int(rng.integers(low, high + 1))
+    chosen = [targets[int(order[number % len(targets)])] for number in range(count)]
+    composition = Composition(preset, rng, negatives)
+    if preset.table is None:
+        # An image without targets has its distractors where a target's would be.
+        depth = arrange_floating(composition, chosen, targets[int(order[0])])
+        shift = approach(composition.objects, scale)
+        lights, ambient = preset.lighting.draw(rng, np.array([0.0, 0.0, depth]))
+        background, plane = backgrounds.draw(rng, *composition.size), None
+    else:
+        T_cam_table = arrange_on_table(composition, preset.table, chosen)
+        shift = approach(composition.objects, scale)
+        lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
+        picture = preset.table.draw_picture(
+            rng, backgrounds, composition.K, composition.size, T_cam_table
+        )
+        T_cam_table = _moved(T_cam_table, shift)
+        plane = plane_of(T_cam_table)
+        if plane.offset >= 0:
+            raise UserError(
+                f"scale {scale:g} of a scene whose parts reach higher than the camera",
+                "a scale at which the camera is above the table",
+                "choose a larger scale",
+            )
+        background = picture.seen(composition.K, composition.size, T_cam_table)
+    if chosen and not any(item.is_target for item in composition.objects):
+        part = chosen[0].part
+        assert part is not None
+        raise UserError(
+            f"part {part.name} of diameter {part.diameter:.3g} m, which found no place in any draw "
+            f"of preset {preset.name}",
+            "a part that the preset's distances and field of view can show",
+            "check the mesh's unit, or replace the preset's distances or field of view",
+        )
+    there = (replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects)
+    # The camera may have reached or passed some of them.
+    objects = tuple(
+        item for item in there if transform(item.T_cam_obj, item.surface.hull)[:, 2].min() > NEAR
+    )
+    # How strongly a lamp lights the scene stays the same.
+    lights = tuple(
+        replace(light, position=triple(np.array(light.position) + shift)) for light in lights
+    )
+    sensor = preset.sensors.draw(rng)
+    return Scene(composition.K, background, objects, lights, ambient, plane, sensor)
+
+
+def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
+    """Return by how much the world moves in the camera frame, metres.
+
+    The distance from the camera to the mean of the targets' cuboids' centres is divided by the
+    positive ``scale``: as many times as large they appear. Without a target the camera stays.
+    """
+    centres = [
+        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
+        for item in objects
+        if item.part is not None
+    ]
+    if not centres or scale == 1:
+        return np.zeros(3)
+    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
+
+
+def _moved(T_cam: Transform, shift: Vector) -> Transform:
+    return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)

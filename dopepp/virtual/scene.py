@@ -13,6 +13,7 @@ from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.parts.part import Part
+from dopepp.virtual.sensor import Sensor
 from dopepp.virtual.surface import Surface
 
 NEAR: Final = 0.01
@@ -118,27 +119,6 @@ class Plane:
 
     normal: Triple
     offset: float
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """What the camera does to the light, applied to the whole picture after rendering.
-
-    Attributes:
-        exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
-        motion_px: Displacement (x, y) of the image during the exposure, pixels.
-        read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
-            it falls with the square root of the signal.
-    """
-
-    exposure_ev: float = 0.0
-    blur_px: float = 0.0
-    motion_px: tuple[float, float] = (0.0, 0.0)
-    read_noise: float = 0.0
-    shot_noise: float = 0.0
-    jpeg_quality: int | None = None
-    noise_seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,13 @@ from typing import Annotated, Final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.core.validation import Checked, Pair, Range, Span
 from dopepp.drawing.pictures import Picture
-from dopepp.virtual.scene import Sensor
-from dopepp.virtual.tone import decode_srgb, encode_srgb
 
 Probability = Annotated[float, Range(0.0, 1.0, "probability")]
 
@@ -31,6 +30,27 @@ _NOISE_VALUES: Final = 65536
 
 _NOISE_RUN: Final = 1024
 """So many values are read in a row; then the hash chooses another place of the table and a sign."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the camera does to the light, applied to the whole picture after rendering.
+
+    Attributes:
+        exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
+        motion_px: Displacement (x, y) of the image during the exposure, pixels.
+        read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
+        shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
+            it falls with the square root of the signal.
+    """
+
+    exposure_ev: float = 0.0
+    blur_px: float = 0.0
+    motion_px: tuple[float, float] = (0.0, 0.0)
+    read_noise: float = 0.0
+    shot_noise: float = 0.0
+    jpeg_quality: int | None = None
+    noise_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -214,3 +234,40 @@ def _mixed(h: np.uint32) -> np.uint32:
     h = np.uint32(h ^ (h >> np.uint32(15)))
     h = np.uint32(h * np.uint32(0x846CA68B))
     return np.uint32(h ^ (h >> np.uint32(16)))
+
+
+def decode_srgb(code: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the linear light of sRGB values, both 1 for white (IEC 61966-2-1)."""
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def encode_srgb(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the sRGB values of linear light, both 1 for white."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+SRGB_TO_LINEAR: Final[NDArray[np.float32]] = decode_srgb(np.arange(256) / 255).astype(np.float32)
+"""sRGB code 0–255 to linear light in [0, 1]."""
+
+CODE_STEPS: Final = 4096
+"""Steps of the tables that encode light, per unit of light."""
+
+LINEAR_TO_SRGB: Final[NDArray[np.float32]] = (
+    255 * encode_srgb(np.arange(CODE_STEPS + 1) / CODE_STEPS)
+).astype(np.float32)
+"""Linear light in steps of 1/4096 to an sRGB value of 0–255, the inverse of SRGB_TO_LINEAR."""
+
+TONE_LIMIT: Final = 4.0
+"""Radiance at which the tone curve ends, white to 1/1000."""
+
+_SHOULDER: Final = 0.5
+_radiance = np.arange(int(TONE_LIMIT) * CODE_STEPS + 1) / CODE_STEPS
+# Linear up to the shoulder; above, it bends smoothly towards 1, as a camera's curve does, so that
+# bright white parts keep their shading.
+_shown = np.where(
+    _radiance <= _SHOULDER,
+    _radiance,
+    1 - (1 - _SHOULDER) * np.exp((_SHOULDER - _radiance) / (1 - _SHOULDER)),
+)
+TONE_CURVE: Final[NDArray[np.float32]] = (255 * encode_srgb(_shown)).astype(np.float32)
+"""Radiance in steps of 1/4096 to an sRGB value of 0–255."""

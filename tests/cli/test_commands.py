@@ -17,7 +17,7 @@ from dopepp.cli import app
 from dopepp.models.checkpoint import Checkpoint, write_atomic
 from dopepp.models.network import build_network
 from dopepp.parts.catalogue import pivconnector
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 K = ["--K", "100", "100", "31.5", "31.5"]
 RENDER = ["render", "servoholder", "--preset", "quickstart", "--size", "32x24", "--format", "ndds"]

@@ -13,7 +13,7 @@ from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.references import REFERENCES
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 
 def test_a_run_folder_holds_everything(trained, tiny):

@@ -12,8 +12,7 @@ from dopepp.inference.diagnosis import CHECKS, Case, diagnose
 from dopepp.models.checkpoint import load_network
 from dopepp.parts.catalogue import pivconnector
 from dopepp.virtual import PRESETS, Factory
-from dopepp.virtual.scene import Sensor
-from dopepp.virtual.sensor import capture, defocus
+from dopepp.virtual.sensor import Sensor, capture, defocus
 
 PART, PRESET, SEED = pivconnector(), PRESETS["quickstart"], 411
 

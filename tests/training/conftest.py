@@ -23,7 +23,7 @@ from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.loggers import MetricsTable
 from dopepp.training.system import PoseSystem
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 INPUT_SIZE = (128, 128)
 NOISE_SIZE = 32

@@ -8,7 +8,7 @@ from dopepp.geometry.rotation import rotation_vector_to_matrix
 from dopepp.parts.catalogue import servoholder
 from dopepp.virtual.agreement import agreement
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 
 def test_falls_with_the_error_of_the_pose():

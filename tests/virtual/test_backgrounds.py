@@ -16,10 +16,10 @@ from dopepp.virtual import Factory, Preset, preset_of
 from dopepp.virtual.backgrounds import (
     PhotoBackgrounds,
     ProceduralBackgrounds,
-    cluttered,
     find_backgrounds,
+    procedural,
 )
-from dopepp.virtual.backgrounds.cluttered import ClutteredBackgrounds
+from dopepp.virtual.backgrounds.procedural import ClutteredBackgrounds
 
 
 def write_photos(folder: Path, count: int, side: int = 40) -> None:
@@ -276,9 +276,9 @@ def test_clutter_depends_on_the_generator_only_and_leaves_what_is_behind(size):
 
 
 def test_clutter_has_edges_between_the_pixels(monkeypatch):
-    monkeypatch.setattr(cluttered, "_PLAIN_SHARE", 1.0)
+    monkeypatch.setattr(procedural, "_PLAIN_SHARE", 1.0)
     monkeypatch.setattr(
-        cluttered, "_plain", lambda rng, width, height: np.full((height, width, 3), 255, np.uint8)
+        procedural, "_plain", lambda rng, width, height: np.full((height, width, 3), 255, np.uint8)
     )
     clutter = ClutteredBackgrounds(Grey(), (5, 5))
     for seed in range(10):
@@ -293,7 +293,7 @@ def test_clutter_has_edges_between_the_pixels(monkeypatch):
 def test_printed_pieces_have_cells_of_a_dark_and_a_light_colour():
     spreads, upright = [], 0
     for seed in range(60):
-        image = cluttered._printed(np.random.default_rng(seed), 64, 48)[..., 0].astype(int)
+        image = procedural._printed(np.random.default_rng(seed), 64, 48)[..., 0].astype(int)
         low, high = image.min(), image.max()
         spreads.append(high - low)
         # All but the pixels between two cells, of at most 8 by 8.

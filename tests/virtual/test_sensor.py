@@ -11,8 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dopepp.virtual.scene import Sensor
-from dopepp.virtual.sensor import Sensors, add_noise, capture, compress, defocus, motion_blur
+from dopepp.virtual.sensor import (
+    Sensor,
+    Sensors,
+    add_noise,
+    capture,
+    compress,
+    defocus,
+    motion_blur,
+)
 
 
 @pytest.fixture(scope="module")

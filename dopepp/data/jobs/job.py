@@ -32,7 +32,7 @@ from dopepp.parts.mesh.read import ASSUMED_UNIT
 from dopepp.parts.part import Part, check_name
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import Preset, preset_of
+from dopepp.virtual.presets import Preset, preset_of
 from dopepp.virtual.presets.view import View, read_lens
 
 _log = logging.getLogger(__name__)

@@ -36,7 +36,7 @@ from dopepp.data.formats import RECORD_FILE, Writer
 from dopepp.data.jobs.job import Job, begin, is_begun
 from dopepp.data.sources.rendered import MAX_ITEMS, rendered_sample
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.renderers.photoreal.variant import THREADS_SETTING
+from dopepp.virtual.renderers.photoreal import THREADS_SETTING
 
 _log = logging.getLogger(__name__)
 

@@ -40,7 +40,7 @@ class RenderedSource:
     Args:
         split: Which of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
         scale: How many times as large the parts appear: the camera of the same scenes, moved (see
-            :mod:`dopepp.virtual.arrange.random_scene`).
+            :mod:`dopepp.virtual.factory`).
     """
 
     def __init__(

@@ -18,7 +18,7 @@ from dopepp.parts.catalogue import with_meshes
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets.preset import Preset, preset_of
+from dopepp.virtual.presets import Preset, preset_of
 
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:

@@ -13,8 +13,7 @@ from dopepp.geometry.camera import Transform, make_transform
 from dopepp.parts.part import Part
 from dopepp.robot.grasping.cell import TRAY, Thing
 from dopepp.robot.grasping.solid import convex_pieces
-from dopepp.virtual.body import Body, make_body
-from dopepp.virtual.presets.distractors import distractor_shapes
+from dopepp.virtual.body import Body, distractor_shapes, make_body
 
 SPREAD: Final = 0.025
 """Radius of the circle in which a part's middle lies, metres."""

@@ -19,7 +19,7 @@ from dopepp.robot.grasping.cell import CAMERA, JOINTS, Cell, Thing
 from dopepp.robot.grasping.rehearsal import SIZE, TRUE_K
 from dopepp.virtual.backgrounds import ProceduralBackgrounds
 from dopepp.virtual.body import Body
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.presets.table import Table, plane_of
 from dopepp.virtual.renderers import find_renderer
 from dopepp.virtual.scene import Scene, SceneObject

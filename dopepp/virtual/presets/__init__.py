@@ -1,1 +1,216 @@
-"""Typed descriptions of random scenes; every range is checked."""
+"""Named, typed descriptions of random scenes; every range has its unit in its name or docstring.
+
+A preset is a YAML file of ``conf/virtual/preset``, or of the user's own. :func:`preset_of` changes
+fields of one by plain values, as a config gives them; in code, use :func:`dataclasses.replace`
+(:meth:`Preset.resized` and :meth:`Preset.reframed` for the size). To add one, add a file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+from numpy.random import Generator
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import CONF
+from dopepp.core.validation import Checked, Pair, Range, Span, parse, shown
+from dopepp.core.yaml import read_yaml
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import (
+    CameraMatrix,
+    camera_matrix,
+    check_camera,
+    crop_camera,
+    resize_camera,
+)
+from dopepp.virtual.body import Distractors
+from dopepp.virtual.presets.looks import Lighting, Materials
+from dopepp.virtual.presets.placement import FreeTurning, OffsetPlacement, Placement, Turning
+from dopepp.virtual.presets.table import Table
+from dopepp.virtual.sensor import Sensors
+
+Side = Annotated[int, Range(8, 16384, "pixels")]
+Intrinsics = Annotated[tuple[float, float, float, float], Range(-1e6, 1e6, "pixels")]
+
+_FOLDER: Final = CONF / "virtual" / "preset"
+_NAMES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+@dataclass(frozen=True)
+class Preset(Checked):
+    """A distribution of scenes.
+
+    Attributes:
+        horizontal_fov_deg: Horizontal field of view, degrees, of a camera with square pixels that
+            looks through the image's middle; ignored where ``intrinsics_px`` is given.
+        intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
+        turning: Distribution of the targets' orientation; of no use on a table.
+        table: The plane that everything lies on; None for objects in mid-air.
+        targets_per_image: Smallest and largest number of targets, each a random part; one after
+            the first that finds no place is left out. Images without any are for learning and
+            testing silence.
+        min_visible_fraction: Smallest visible fraction of every target; scenes are drawn again,
+            a bounded number of times, to keep it.
+        centroid_inside: Whether the image of every target's cuboid centre must lie inside the
+            frame.
+        materials: Distribution of what targets and distractors are made of.
+        window: Width and height of the part of the picture that is rendered, around a random point
+            of it, pixels; None renders all of it.
+        depths: Smallest and largest depth of the targets' cuboids' centres, metres; None for any.
+        clutter: Smallest and largest number of flat pieces of other pictures that the background
+            is littered with.
+        background_contrast: Smallest and largest factor on the background's contrast.
+    """
+
+    name: str
+    width: Side
+    height: Side
+    horizontal_fov_deg: Annotated[float, Range(5.0, 150.0, "degrees")] = 60.0
+    intrinsics_px: Intrinsics | None = None
+    turning: Turning = field(default_factory=FreeTurning)
+    placement: Placement = field(default_factory=OffsetPlacement)
+    table: Table | None = None
+    targets_per_image: Annotated[tuple[int, int], Span(0, 100, "a count")] = (1, 1)
+    min_visible_fraction: Annotated[float, Range(0.0, 0.95, "share")] = 0.5
+    centroid_inside: bool = True
+    lighting: Lighting = field(default_factory=Lighting)
+    materials: Materials = field(default_factory=Materials)
+    distractors: Distractors = field(default_factory=Distractors)
+    sensors: Sensors = field(default_factory=Sensors)
+    window: tuple[Side, Side] | None = None
+    depths: Annotated[Pair, Span(0.0, 1000.0, "metres")] | None = None
+    clutter: Annotated[tuple[int, int], Span(0, 1000, "a count")] = (0, 0)
+    background_contrast: Annotated[Pair, Span(0.0, 10.0, "factor")] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_camera(self.K, (self.width, self.height), f"preset {self.name}")
+
+    @property
+    def K(self) -> CameraMatrix:  # noqa: N802 (the field's name of the matrix)
+        """Camera matrix, pixels."""
+        if self.intrinsics_px is not None:
+            return camera_matrix(*self.intrinsics_px)
+        focal = self.width / 2 / math.tan(math.radians(self.horizontal_fov_deg) / 2)
+        # Pixel centres are integers, so the image's middle is at (width − 1)/2.
+        return camera_matrix(focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+
+    def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
+        """Return K and (width, height) of what is rendered: all of the picture, or a window of it.
+
+        A window lies around a point that is uniform over the picture, moved into it; where it is
+        larger than the picture, it is in its middle. Its principal point may be outside of it.
+        """
+        K, size = self.K, (self.width, self.height)
+        if self.window is None:
+            return K, size
+        spare = np.array(size) - self.window
+        corner = rng.uniform(0, 1, 2) * size - np.array(self.window) / 2
+        corner = np.floor(np.where(spare > 0, np.clip(corner, 0, spare), spare / 2))
+        return crop_camera(K, *corner), self.window
+
+    def resized(self, width: int, height: int) -> Preset:
+        """Return the same scenes in another image size: the camera follows the resize rule.
+
+        A changed aspect ratio stretches the image, so fx and fy differ, as they do when a picture
+        is resized.
+        """
+        K = resize_camera(self.K, width / self.width, height / self.height)
+        return self._seen_by(K, width, height, width / self.width)
+
+    def reframed(self, width: int, height: int) -> Preset:
+        """Return the same scenes in a picture of another size and shape, with pixels as square.
+
+        The field of view along the shorter side stays; along the longer one the picture is cut or
+        shows more, alike at both ends. Of the same shape, it is :meth:`resized`.
+        """
+        side, new_side = min(self.width, self.height), min(width, height)
+        scale = new_side / side
+        K = resize_camera(self.K, scale, scale)
+        K[0, 2] += (width * side - new_side * self.width) / (2 * side)
+        K[1, 2] += (height * side - new_side * self.height) / (2 * side)
+        return self._seen_by(K, width, height, scale)
+
+    def _seen_by(self, K: CameraMatrix, width: int, height: int, scale: float) -> Preset:
+        """Return the same scenes in another camera, with pixels ``scale`` times as fine."""
+        return replace(
+            self, width=width, height=height, sensors=self.sensors.resized(scale),
+            intrinsics_px=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])),
+        )  # fmt: skip
+
+
+class _Presets(Mapping[str, Preset]):
+    """The shipped presets, each read when it is asked for."""
+
+    def __getitem__(self, name: str) -> Preset:
+        return preset_of(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in _NAMES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_NAMES)
+
+    def __len__(self) -> int:
+        return len(_NAMES)
+
+
+PRESETS: Final[Mapping[str, Preset]] = _Presets()
+"""The scenes to choose from, by name."""
+
+
+def preset_of(name: str, changes: object = None, where: str = "") -> Preset:
+    """Return a preset with some fields changed.
+
+    Args:
+        name: Name of a shipped preset, or a YAML file of the user's own.
+        changes: Values by field. A group of fields is a mapping, of which the other fields stay as
+            they are, e.g. ``{"horizontal_fov_deg": 70, "materials": {"metal_share": 0.2}}``. A
+            group that the preset lacks (``table`` of ``paper``) starts from its defaults, as does
+            one of another ``kind``; None takes a group away.
+        where: Option that holds the changes, for messages.
+
+    Raises:
+        UserError: The preset or a field is unknown, or a value is of the wrong type or outside of
+            the field's range.
+    """
+    values = _merged({"name": Path(name).stem, **preset_fields(name)}, changes or {})
+    return parse(Preset, values, where)
+
+
+def preset_fields(name: str) -> dict[str, Any]:
+    """Return the fields of a preset's file, over those of the preset that it names as ``base``.
+
+    Raises:
+        UserError: There is no such preset, or its file holds no mapping.
+    """
+    path = Path(name)
+    if path.suffix != ".yaml":
+        if name not in _NAMES:
+            allowed = f"{', '.join(_NAMES)}, or a FILE.yaml"
+            raise UserError(f"preset {name!r}", allowed, "choose one of them")
+        path = _FOLDER / f"{name}.yaml"
+    values = read_yaml(path)
+    if not isinstance(values, dict):
+        raise UserError(f"preset {path}, {shown(values)}", "fields and their values", "correct it")
+    base = values.pop("base", None)
+    if base is None:
+        return values
+    if base not in _NAMES or base == name:
+        raise UserError(f"base={shown(base)} of {path}", ", ".join(_NAMES), "choose one of them")
+    return dict(_merged(preset_fields(base), values))
+
+
+def _merged(values: Any, changes: Any) -> Any:
+    """Change fields of nested mappings; a group of another kind replaces the former."""
+    if not isinstance(values, dict) or not isinstance(changes, dict):
+        return changes
+    if changes.get("kind", values.get("kind")) != values.get("kind"):
+        return changes
+    changed = {key: _merged(values.get(key), value) for key, value in changes.items()}
+    return {**values, **changed}

@@ -18,8 +18,8 @@ from dopepp.drawing.pictures import Size
 from dopepp.geometry.camera import CameraMatrix, check_camera, focal_length, resize_camera
 from dopepp.geometry.camera_file import read_camera
 from dopepp.parts.part import Part
+from dopepp.virtual.presets import Preset
 from dopepp.virtual.presets.placement import WorkingPlacement
-from dopepp.virtual.presets.preset import Preset
 from dopepp.virtual.sensor import Sensors
 
 _log = logging.getLogger(__name__)

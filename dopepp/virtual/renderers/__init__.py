@@ -16,7 +16,7 @@ Renderer = Callable[[Scene], Rendered]
 """Draws a scene as an ideal camera sees it; the factory applies the scene's sensor."""
 
 RENDERERS: Final = {
-    "raster": "dopepp.virtual.renderers.raster.rasteriser",
+    "raster": "dopepp.virtual.renderers.raster",
     "photoreal": "dopepp.virtual.renderers.photoreal.renderer",
 }
 """Module of each renderer."""

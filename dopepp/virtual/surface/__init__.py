@@ -16,9 +16,9 @@ from dopepp.core.errors import UserError
 from dopepp.geometry.rotation import Vector
 from dopepp.parts.mesh import Faces, Points, Vertices
 from dopepp.parts.part import Mesh
+from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture
-from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""

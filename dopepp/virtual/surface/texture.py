@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from dopepp.core.compiled import Array, compiled
 from dopepp.drawing.pictures import Picture, Shape
 from dopepp.parts.mesh import Faces
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
 _MOST_PROBES: Final = 16

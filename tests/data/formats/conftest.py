@@ -15,7 +15,7 @@ from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Part
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ import pytest
 from dopepp.data.sources.rendered import FIRST_INDEX, MAX_ITEMS, RenderedSource
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS, preset_of
+from dopepp.virtual.presets import PRESETS, preset_of
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from dopepp.geometry.camera import make_transform
 from dopepp.geometry.rotation import random_rotation
 from dopepp.parts.catalogue import load_part
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 from dopepp.virtual.renderers import find_renderer
 
 STILL = CameraJitter(roll_deg=0, zoom=(1, 1), shift=0)

@@ -23,7 +23,7 @@ from dopepp.experiment.run.evaluate import evaluate
 from dopepp.metrics.row import PoseRow
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
-from dopepp.virtual.presets.preset import PRESETS
+from dopepp.virtual.presets import PRESETS
 
 NUM_IMAGES = 4
 SPLITS = "data.image_sets={train: none, val: none, test: train_pbr}"

@@ -25,7 +25,7 @@ from dopepp.inference.refinement.surface import (
 from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.body import make_body
-from dopepp.virtual.renderers.raster.rasteriser import render
+from dopepp.virtual.renderers.raster import render
 from dopepp.virtual.scene import Plane, Scene, SceneObject
 
 K = camera_matrix(600, 600, 319.5, 239.5)

@@ -13,6 +13,7 @@ from dopepp.geometry.camera import project, resize_camera, transform
 from dopepp.geometry.rotation import is_rotation, random_rotation
 from dopepp.parts.part import Part
 from dopepp.virtual import PRESETS, Distractors, Factory, Preset, Scene, Table, visible_fractions
+from dopepp.virtual.presets import preset_of
 from dopepp.virtual.presets.placement import (
     DistancePlacement,
     FacingTurning,
@@ -21,7 +22,6 @@ from dopepp.virtual.presets.placement import (
     UprightTurning,
     WorkingPlacement,
 )
-from dopepp.virtual.presets.preset import preset_of
 
 
 def scenes(preset: Preset, parts: list[Part], count: int = 200) -> list[Scene]:

@@ -33,7 +33,7 @@ from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import Mask
 from dopepp.geometry.camera import Transform
 from dopepp.parts.part import Part
-from dopepp.virtual.renderers.raster.rasteriser import Silhouette, silhouette
+from dopepp.virtual.renderers.raster import Silhouette, silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 

@@ -28,6 +28,7 @@ from jaxtyping import Float32
 
 from dopepp.core.errors import require
 from dopepp.drawing.pictures import Picture
+from dopepp.virtual.renderers.photoreal import mitsuba, num_threads
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, make_shapes, make_surroundings
 from dopepp.virtual.renderers.photoreal.table import (
     Area,
@@ -39,11 +40,10 @@ from dopepp.virtual.renderers.photoreal.table import (
     shadowed,
     split_light,
 )
-from dopepp.virtual.renderers.photoreal.variant import mitsuba, num_threads
-from dopepp.virtual.renderers.raster.rasteriser import visible_fractions
+from dopepp.virtual.renderers.raster import visible_fractions
 from dopepp.virtual.renderers.raster.visibility import Box, backdrop, box_around, project_object
 from dopepp.virtual.scene import Rendered, Scene
-from dopepp.virtual.tone import CODE_STEPS, TONE_CURVE
+from dopepp.virtual.sensor import CODE_STEPS, TONE_CURVE
 
 require("mitsuba", "renderer 'photoreal'", "photoreal")
 require("pyoidn", "renderer 'photoreal'", "photoreal")

@@ -21,9 +21,9 @@ from dopepp.geometry.camera import CameraMatrix, Transform, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.parts.mesh import face_areas
 from dopepp.virtual.scene import NOISE_LIMITS, Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface import Surface
 from dopepp.virtual.surface.texture import Texture
-from dopepp.virtual.tone import SRGB_TO_LINEAR
 
 Sphere = tuple[Vector, float]
 """Centre and radius, camera frame, metres."""

@@ -24,7 +24,7 @@ from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, rgb
 from dopepp.virtual.renderers.raster.visibility import Box
 from dopepp.virtual.scene import NEAR, Scene
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 
 Area = tuple[slice, slice]
 

@@ -1,1 +1,209 @@
-"""The rasteriser: visibility, shadows, fragments, light and their sum, the picture."""
+"""The rasteriser: a scene becomes an image, its depth, its instances and visible fractions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int16
+
+from dopepp.core.compiled import Array, compiled
+from dopepp.drawing.pictures import Mask, Size
+from dopepp.geometry.camera import resize_camera
+from dopepp.virtual.renderers.raster.plane import darken_plane
+from dopepp.virtual.renderers.raster.shading import shade_object
+from dopepp.virtual.renderers.raster.visibility import (
+    Box,
+    Projected,
+    backdrop,
+    box_around,
+    centres_within,
+    draw_alone,
+    draw_samples,
+    first_ids,
+    project_object,
+    shadow_maps,
+)
+from dopepp.virtual.scene import NEAR, Plane, Rendered, Scene, SceneObject
+from dopepp.virtual.triangles import (
+    CENTRE_SAMPLE,
+    NUM_COLOUR_SAMPLES,
+    PIXEL_SAMPLES,
+    bounds,
+    scratch,
+)
+
+_MOST_PX: Final = 1_000_000
+"""A full silhouette whose box is larger than this is counted at a reduced scale."""
+
+
+def render(scene: Scene) -> Rendered:
+    """Render a scene with 2×2 anti-aliasing; one without objects is its background."""
+    image, depth, instances = backdrop(scene)
+    projected = [project_object(item, scene.K) for item in scene.objects]
+    window = box_around(seen.box(scene.size) for seen in projected) or (0, 0, 0, 0)
+    lights = shadow_maps(scene, projected) if scene.objects else []
+    samples = draw_samples(scene, projected, window, PIXEL_SAMPLES)
+    if scene.plane is not None:
+        darken_plane(scene, scene.plane, lights, samples, image)
+    colour = scratch("colour", (*samples.ids.shape[:2], 3), np.float32)
+    colour.fill(0.0)
+    firsts = first_ids(scene)
+    for item, seen, first in zip(scene.objects, projected, firsts, strict=True):
+        shade_object(item, seen, scene, lights, samples, int(first), colour)
+    _composite(
+        samples.origin, samples.ids, samples.inverse_depth, colour, firsts, image, depth, instances
+    )
+    return Rendered(image, depth, instances, _fractions(scene, projected, instances), scene)
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """What an object would cover if nothing stood before it.
+
+    Attributes:
+        mask: Its pixels within the image.
+        num_px: Its pixels on a canvas without borders; infinite around the camera.
+        box: (left, top, right, bottom) of those pixels' bounds, pixels, right and bottom excluded;
+            it may reach beyond the image. None behind the camera.
+    """
+
+    mask: Mask
+    num_px: float
+    box: Box | None
+
+
+def silhouette(item: SceneObject, K: Array, size: Size) -> Silhouette:
+    """Return an object's whole silhouette, for formats that store it (BOP's ``mask``)."""
+    seen = project_object(item, K)
+    mask = draw_alone(item, seen.hom, (0, 0, *size))[0] > 0
+    left, _, right, _ = seen.extent
+    if left > right:
+        return Silhouette(mask, 0.0, None)
+    if not math.isfinite(left):
+        return Silhouette(mask, math.inf, (0, 0, *size))
+    whole = float(mask.sum()) if seen.inside(size) else _whole_px(item, seen, K)
+    return Silhouette(mask, whole, centres_within(seen.extent))
+
+
+def visible_fractions(scene: Scene) -> Float[np.ndarray, "objects"]:
+    """Return the visible fractions that a renderer reports, without shading anything."""
+    projected = [project_object(item, scene.K) for item in scene.objects]
+    samples = draw_samples(scene, projected, (0, 0, *scene.size), CENTRE_SAMPLE)
+    owners = np.searchsorted(first_ids(scene), samples.ids[..., 0], side="right") - 1
+    return _fractions(scene, projected, owners.astype(np.int16))
+
+
+def _fractions(
+    scene: Scene, projected: Sequence[Projected], instances: Int16[np.ndarray, "height width"]
+) -> Float[np.ndarray, "objects"]:
+    """Divide every object's visible pixels by those of its whole silhouette."""
+    visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projected) + 1)[1:]
+    fractions = np.zeros(len(projected))
+    for index, (item, seen) in enumerate(zip(scene.objects, projected, strict=True)):
+        if not visible[index]:
+            continue
+        if seen.inside(scene.size):
+            # Only where something else may be before it can a pixel of it be missing.
+            box = _rivals(scene, projected, index)
+            hidden = 0
+            if box is not None:
+                left, top, right, bottom = box
+                covered = draw_alone(item, seen.hom, box)[0] > 0
+                hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
+            fractions[index] = visible[index] / (visible[index] + hidden)
+        else:
+            whole = _whole_px(item, seen, scene.K)
+            fractions[index] = min(visible[index] / whole, 1.0) if whole else 1.0
+    return fractions
+
+
+def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | None:
+    """Return the part of an object's box in which other objects or the plane may hide it."""
+    own = projected[index].box(scene.size)
+    if own is None:
+        return None
+    if scene.plane is not None and _reaches_below(scene.plane, scene.objects[index]):
+        return own
+    # Nothing that begins behind its end can hide it.
+    farthest = _depths(scene.objects[index])[1]
+    boxes = [
+        seen.box(scene.size)
+        for number, seen in enumerate(projected)
+        if number != index and _depths(scene.objects[number])[0] < farthest
+    ]
+    shared = [
+        (max(own[0], box[0]), max(own[1], box[1]), min(own[2], box[2]), min(own[3], box[3]))
+        for box in boxes
+        if box is not None
+    ]
+    return box_around(box for box in shared if box[0] < box[2] and box[1] < box[3])
+
+
+def _depths(item: SceneObject) -> tuple[float, float]:
+    """Return about the smallest and largest depth of an object, metres; the first too small."""
+    depth = item.surface.hull @ item.T_cam_obj[2, :3] + item.T_cam_obj[2, 3]
+    least, most = float(depth.min()), float(depth.max())
+    # The hull's extreme points miss a little of a round object.
+    slack = 0.02 * (most - least)
+    return least - slack, most + slack
+
+
+def _reaches_below(plane: Plane, item: SceneObject) -> bool:
+    """Tell whether some of an object lies on or below the plane."""
+    normal = np.array(plane.normal) @ item.T_cam_obj[:3, :3]
+    offset = plane.offset - float(np.dot(plane.normal, item.T_cam_obj[:3, 3]))
+    return bool((item.surface.hull @ normal).min() < offset)
+
+
+def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
+    """Count the pixel centres an object covers alone on a canvas as large as it needs."""
+    left, top, right, bottom = seen.extent
+    if not math.isfinite(left):
+        # It surrounds the camera: the whole silhouette is a hemisphere, of no finite size.
+        return math.inf
+    hom, scale, extent = seen.hom, 1.0, seen.extent
+    if (right - left + 2) * (bottom - top + 2) > _MOST_PX:
+        scale = math.sqrt(_MOST_PX / ((right - left + 2) * (bottom - top + 2)))
+        hom = seen.cam @ resize_camera(K, scale, scale).T
+        extent = bounds(hom, NEAR)
+    return float(np.count_nonzero(draw_alone(item, hom, centres_within(extent))[0])) / scale**2
+
+
+@compiled()
+def _composite(
+    origin: tuple[int, int], ids: Array, inverse_depth: Array, colour: Array, first_ids: Array,
+    image: Array, depth: Array, instances: Array,
+) -> None:  # fmt: skip
+    """Put a window of samples over the background and read its centre samples as labels.
+
+    ``origin`` is the image pixel (x, y) of the window's first element; ``ids`` and
+    ``inverse_depth`` (1/m) are per sample, the last of which is the pixel's centre; ``colour`` sums
+    the covered samples' sRGB values; ``first_ids`` ascend by object. Updated in place: ``image``
+    (uint8, the background on entry) and, at pixel centres, ``depth`` (metres, float32) and
+    ``instances`` (object index, int16).
+    """
+    height, width, num_samples = ids.shape
+    centre = num_samples - 1
+    for j in range(height):
+        y = origin[1] + j
+        for i in range(width):
+            x = origin[0] + i
+            empty = 0
+            for s in range(NUM_COLOUR_SAMPLES):
+                if ids[j, i, s] < 0:
+                    empty += 1
+            if empty < NUM_COLOUR_SAMPLES:
+                for c in range(3):
+                    level = (colour[j, i, c] + empty * image[y, x, c]) / NUM_COLOUR_SAMPLES
+                    image[y, x, c] = np.uint8(level + 0.5)
+            triangle = ids[j, i, centre]
+            if triangle >= 0:
+                depth[y, x] = np.float32(1.0 / inverse_depth[j, i, centre])
+                owner = first_ids.shape[0] - 1
+                while first_ids[owner] > triangle:
+                    owner -= 1
+                instances[y, x] = owner

@@ -14,18 +14,27 @@ from typing import Final
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
+from numpy.lib.stride_tricks import sliding_window_view
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
-from dopepp.virtual.renderers.raster.shadow import ShadowMap, ambient_row, hidden_sky
-from dopepp.virtual.renderers.raster.visibility import Box, Samples, inverse_depth_of
-from dopepp.virtual.scene import NEAR, Plane, Scene
-from dopepp.virtual.tone import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
+from dopepp.virtual.renderers.raster.visibility import (
+    Box,
+    Samples,
+    ShadowMap,
+    ambient_row,
+    inverse_depth_of,
+)
+from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
+from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 
 _VISIBLE: Final = np.float32(0.005)
 """Share of hidden light from which on a picture of 256 levels changes."""
+
+_SKY_DIRECTIONS: Final = 32
+"""Directions in which the sky is looked at, one bit each."""
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -143,6 +152,76 @@ def _shadowed_box(
     high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
     box = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
     return box if box[0] < box[2] and box[1] < box[3] else None
+
+
+def hidden_sky(
+    frame: Float[np.ndarray, "3 4"], objects: Sequence[SceneObject]
+) -> tuple[Vector, Float[np.ndarray, "rows columns"]] | None:
+    """Return the share of a plane's sky that objects hide; None if they are all below it.
+
+    ``frame`` maps camera-frame points to (x, y) on the plane and the height above it, metres. First
+    come (x, y) of the grid's first cell and a cell's side, metres.
+    """
+    places = []
+    for item in objects:
+        points = transform(item.T_cam_obj, item.surface.points) @ frame[:, :3].T + frame[:, 3]
+        places.append(points[points[:, 2] > 0])
+    everything = np.concatenate(places) if places else np.zeros((0, 3))
+    if len(everything) == 0:
+        return None
+    # Farther away than twice the objects' height, little sky is hidden.
+    margin = 2 * float(everything[:, 2].max())
+    low, high = everything[:, :2].min(axis=0) - margin, everything[:, :2].max(axis=0) + margin
+    cell = float((high - low).max()) / 80
+    columns, rows = (math.ceil(side) + 1 for side in (high - low) / cell)
+    bits, own = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
+    grid, slopes = np.array([low[0], low[1], cell]), _sky_slopes()
+    for item, points in zip(objects, places, strict=True):
+        own[:] = 0
+        # Half a spot's side, so wide that spots leave no gaps.
+        reach = max(0.8 * item.surface.spacing / cell, 0.5)
+        _splat(points, reach, slopes, grid, own)
+        # Taken from every direction's spot is what its splats stick out.
+        cells = round(reach - 0.5)
+        padded = np.pad(own, cells, constant_values=np.iinfo(np.uint32).max)
+        windows = sliding_window_view(padded, (2 * cells + 1, 2 * cells + 1))
+        bits |= np.bitwise_and.reduce(windows, axis=(2, 3))
+    counts = np.unpackbits(bits.view(np.uint8), axis=1).reshape(rows, columns, -1).sum(axis=-1)
+    hidden = cv2.blur(counts.astype(np.float32) / _SKY_DIRECTIONS, (3, 3))
+    # A little is left at the grid's border; it is faded out over half of the margin.
+    edges = (
+        np.minimum(np.arange(side), np.arange(side)[::-1]) / (0.5 * margin / cell)
+        for side in (rows, columns)
+    )
+    hidden *= np.minimum(np.minimum.outer(*edges), 1.0).astype(np.float32)
+    return grid, np.asarray(hidden)
+
+
+def _sky_slopes() -> Float[np.ndarray, "directions 2"]:
+    """Return directions into the sky as (x, y)/z, spread with the cosine (Malley's method)."""
+    k = np.arange(_SKY_DIRECTIONS) + 0.5
+    radius, angle = np.sqrt(k / _SKY_DIRECTIONS), k * np.pi * (1 + np.sqrt(5))
+    height = np.sqrt(1 - radius**2)
+    slopes = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return np.asarray(slopes / height[:, None])
+
+
+@compiled()
+def _splat(points: Array, reach: float, slopes: Array, grid: Array, bits: Array) -> None:
+    """Set a direction's bit in the cells, up to a reach, from which a point hides it."""
+    rows, columns = bits.shape
+    for p in range(points.shape[0]):
+        for k in range(slopes.shape[0]):
+            x = (points[p, 0] - slopes[k, 0] * points[p, 2] - grid[0]) / grid[2]
+            y = (points[p, 1] - slopes[k, 1] * points[p, 2] - grid[1]) / grid[2]
+            if not (-reach < x < columns - 1 + reach and -reach < y < rows - 1 + reach):
+                continue
+            bit = np.uint32(1 << k)
+            left, right = max(math.ceil(x - reach), 0), min(math.floor(x + reach), columns - 1)
+            top, bottom = max(math.ceil(y - reach), 0), min(math.floor(y + reach), rows - 1)
+            for j in range(top, bottom + 1):
+                for i in range(left, right + 1):
+                    bits[j, i] |= bit
 
 
 @compiled(fastmath=True)

@@ -26,12 +26,17 @@ import numpy as np
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.virtual.renderers.raster.fragments import Fragments, gather_fragments
-from dopepp.virtual.renderers.raster.shadow import ShadowMap, ambient_row, lit_shares
-from dopepp.virtual.renderers.raster.visibility import Projected, Samples
+from dopepp.virtual.renderers.raster.visibility import (
+    Projected,
+    Samples,
+    ShadowMap,
+    ambient_row,
+    lit_shares,
+)
 from dopepp.virtual.scene import NOISE_LIMITS, Grooves, Scene, SceneObject
+from dopepp.virtual.sensor import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.surface.occlusion import look_up_sky
 from dopepp.virtual.surface.texture import sample_texture
-from dopepp.virtual.tone import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.triangles import scratch
 
 # Plain literals would turn the arithmetic into float64.
@@ -58,8 +63,7 @@ def shade_object(
 ) -> None:
     """Add one object's light to the colour of the pixels that show it.
 
-    ``lights`` as of :func:`~dopepp.virtual.renderers.raster.shadow.shadow_maps`; ``colour`` is the
-    sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
+    ``colour`` is the sum of sRGB values per pixel, float32 (height, width, 3), updated in place.
     """
     fragments = gather_fragments(item, seen, scene, samples, first_id)
     if fragments is None:
@@ -292,7 +296,7 @@ def reflect_light(
     """Add one point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
 
     ``lit``, of shape (n,), is the share of the light that reaches each point, ``light`` comes from
-    :func:`~dopepp.virtual.renderers.raster.shadow.light_row`, ``specular`` is the reflectance of
+    :func:`~.visibility.light_row`, ``specular`` is the reflectance of
     the dielectric part at normal incidence, ``metallic`` 1 for a metal, whose reflectance is its
     albedo; ``radiance``, linear RGB of shape (3, n), is updated in place.
     """

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from dopepp.core.errors import UserError
-from dopepp.virtual.renderers.photoreal import variant
+from dopepp.virtual.renderers import photoreal as variant
 
 _RENDER = """
 import logging, os
 from dopepp.core.errors import UserError
-from dopepp.virtual.renderers.photoreal.variant import mitsuba
+from dopepp.virtual.renderers.photoreal import mitsuba
 logging.basicConfig(level=logging.INFO)
 try:
     print("variant", mitsuba().variant(), flush=True)

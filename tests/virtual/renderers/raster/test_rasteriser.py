@@ -19,8 +19,8 @@ from dopepp.parts.catalogue import pivconnector
 from dopepp.parts.part import Mesh
 from dopepp.virtual import Surface, make_surface, render
 from dopepp.virtual.presets.placement import FACING
-from dopepp.virtual.renderers.raster import shadow as shadow_module
-from dopepp.virtual.renderers.raster.shadow import ShadowMap, shadow_map
+from dopepp.virtual.renderers.raster import visibility as shadow_module
+from dopepp.virtual.renderers.raster.visibility import ShadowMap, shadow_map
 from dopepp.virtual.scene import Ambient, Light, Material, Scene, SceneObject
 
 MakeScene = Callable[..., Scene]

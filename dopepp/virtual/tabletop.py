@@ -20,7 +20,7 @@ from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import RotationMatrix, rotation_vector_to_matrix
 from dopepp.parts.mesh import Faces
-from dopepp.virtual.arrange.composition import Composition
+from dopepp.virtual.arrangement import Composition
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets.table import Table, inverse_depth_row, plane_of
 from dopepp.virtual.surface import Surface

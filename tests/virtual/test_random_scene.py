@@ -10,8 +10,8 @@ from dopepp.geometry.camera import transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual import Factory, Scene, SceneObject
-from dopepp.virtual.arrange.random_scene import approach
-from dopepp.virtual.presets.preset import preset_of
+from dopepp.virtual.factory import approach
+from dopepp.virtual.presets import preset_of
 from dopepp.virtual.scene import NEAR
 
 NUM_SCENES = 6

@@ -12,8 +12,8 @@ from dopepp.geometry.camera import transform
 from dopepp.parts.mesh.read import read_mesh, ycb_part
 from dopepp.parts.part import make_part
 from dopepp.virtual import Distractors, Factory, Scene, SceneObject, Table, visible_fractions
-from dopepp.virtual.arrange.tabletop import HeightMap
-from dopepp.virtual.presets.preset import PRESETS, Preset, preset_of
+from dopepp.virtual.presets import PRESETS, Preset, preset_of
+from dopepp.virtual.tabletop import HeightMap
 
 NUM_SCENES = 25
 CONTACT = 1e-4

@@ -1,1 +1,0 @@
-"""From a preset to one scene: which bodies, where, how they lie."""
