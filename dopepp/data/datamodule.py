@@ -37,7 +37,7 @@ from dopepp.data.transforms.augment import Photometric
 from dopepp.data.transforms.jitter import CameraJitter
 from dopepp.data.transforms.masking import RandomMask
 from dopepp.drawing.pictures import Size
-from dopepp.geometry.camera import CameraMatrix, Letterbox, Transform, focal_length, transform
+from dopepp.geometry.camera import Letterbox, focal_length, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
@@ -152,12 +152,12 @@ class PoseDataModule(LightningDataModule):
             for index in range(min(len(source), _SEEN_ITEMS) if missing else 0):
                 sample = source.sample(index)
                 scale = Letterbox.fit(sample.size, self.input_size).scale_x
-                for part in missing:
-                    views[part.name] += [
-                        _view(one.T_cam_obj, part, sample.K, scale)
-                        for one in sample.instances
-                        if one.label == part.name
-                    ]
+                pairs = ((part, one) for part in missing for one in sample.instances)
+                for part, instance in pairs:
+                    if instance.label == part.name:
+                        depth = float(transform(instance.T_cam_obj, part.cuboid[CENTROID])[2])
+                        pixels = scale * focal_length(sample.K) * part.diameter / depth
+                        views[part.name].append(Seen(pixels, pixels, depth, depth))
         return {name: widest(found) for name, found in views.items() if found}
 
     def summary(self) -> list[tuple[str, SourceInfo]]:
@@ -176,13 +176,6 @@ class PoseDataModule(LightningDataModule):
 
     def _splits(self) -> dict[str, DescribedSource]:
         return {"train": self.train_source, "val": self.val_source, "test": self.test_source}
-
-
-def _view(T_cam_obj: Transform, part: Part, K: CameraMatrix, scale: float) -> Seen:
-    """Return one instance's diameter in pixels of an image resized by a factor, and its depth."""
-    depth = float(transform(T_cam_obj, part.cuboid[CENTROID])[2])
-    pixels = scale * focal_length(K) * part.diameter / depth
-    return Seen(pixels, pixels, depth, depth)
 
 
 Item = Callable[[int, int], Sample]

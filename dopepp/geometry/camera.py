@@ -174,7 +174,10 @@ def pinhole_matrix(K: CameraMatrix, source: str) -> CameraMatrix:
         matrix = np.array(K, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not _is_pinhole(matrix):
+    # What must be 0 or 1 is so, within the digits of a calibration file.
+    fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])
+    is_finite = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
+    if not is_finite or np.nanmax(np.abs(matrix - fixed)) > 1e-6:
         raise UserError(
             f"K {K!r:.200} of {source}",
             "a 3×3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
@@ -238,9 +241,3 @@ def _likely_size(K: CameraMatrix, at: Float[np.ndarray, "2"], off_centre: float)
     return (
         f": this one is likely of {size} (--K-size); of an image that was cut out, say so (--crop)"
     )
-
-
-def _is_pinhole(K: CameraMatrix) -> bool:
-    """Tell whether what must be 0 or 1 is so, within the digits of a calibration file."""
-    fixed = np.array([[np.nan, 0, np.nan], [0, np.nan, np.nan], [0, 0, 1]])
-    return bool(np.nanmax(np.abs(K - fixed)) <= 1e-6)

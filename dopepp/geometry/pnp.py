@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform
-from dopepp.geometry.degeneracy import MIN_POINTS, degenerate
 from dopepp.geometry.refine import (
     GATE,
+    MIN_POINTS,
     NO_GATE,
     Correspondences,
+    degenerate,
     normal_equations,
     refine_pose,
     reproject,

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from dopepp.core.compiled import Array, compiled
 from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
-from dopepp.geometry.degeneracy import MIN_POINTS, too_few
 from dopepp.geometry.pnp import PnPResult, solve_pnp
+from dopepp.geometry.refine import MIN_POINTS, too_few
 from dopepp.maps.peaks import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
 
