@@ -218,7 +218,7 @@ class _Session:
     def _searched(self, result: PoseResult, camera: Camera) -> tuple[PoseResult, str]:
         """Look at any distance where nothing was found, or say why nothing is."""
         from dopepp.inference.sources.source import Lens
-        from dopepp.recovery.silence import explained
+        from dopepp.recovery.recover import explained
 
         own, image, K = self._options, result.image, result.K
         depth = own["depth"]

@@ -39,8 +39,7 @@ from dopepp.models.checkpoint import Checkpoint
 from dopepp.parts.part import Part
 from dopepp.recovery.calibration import RecoveryOptions, rescored
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import explain, recover
-from dopepp.recovery.silence import Reason, rejected_refined
+from dopepp.recovery.recover import Reason, explain, recover, rejected_refined
 
 if TYPE_CHECKING:
     from dopepp.geometry.camera_file import Camera

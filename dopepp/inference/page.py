@@ -37,7 +37,7 @@ from dopepp.inference.overlay import make_shape
 from dopepp.inference.picture import letterboxed, letterboxes
 from dopepp.inference.results import PoseResult
 from dopepp.parts.size import part_in_words
-from dopepp.recovery.silence import explained
+from dopepp.recovery.recover import explained
 
 HOST: Final = "127.0.0.1"
 """Nobody but this machine reaches it."""

@@ -2,7 +2,6 @@
 
 from dopepp.recovery.calibration import RecoveryOptions
 from dopepp.recovery.detection import Detection
-from dopepp.recovery.recover import explain, recover, recover_batch
-from dopepp.recovery.silence import Reason
+from dopepp.recovery.recover import Reason, explain, recover, recover_batch
 
 __all__ = ["Detection", "Reason", "RecoveryOptions", "explain", "recover", "recover_batch"]

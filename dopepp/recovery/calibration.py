@@ -19,13 +19,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.compiled import Array, compiled
-from dopepp.core.errors import UserError
+from dopepp.core.validation import STRICT, Range, parse
 from dopepp.geometry.camera import (
     CameraMatrix,
     project,
@@ -54,10 +54,6 @@ COVARIANCE_FACTORS: Final = (0.01, 100.0)
 _TENTH_BEYOND: Final = 10.645
 """Squared Mahalanobis distance in six dimensions that a tenth exceeds (chi-squared)."""
 
-_HEAVIEST: Final = 1000.0
-"""Largest weight of a feature; fitted ones are a hundred times smaller."""
-
-
 _CERTAIN: Final = 1e-3
 """Beliefs nearer to 0 or 1 than this are all the same."""
 
@@ -83,6 +79,11 @@ _NETWORK_SCORE: Final = tuple(float(name == "score") for name in REFINED_FEATURE
 """The weights that leave a refined pose the network's score."""
 
 
+_Belief = Annotated[float, Range(1e-6, 1.0)]
+_Score = Annotated[float, Range(0.0, 1.0)]
+_Weight = Annotated[float, Range(-1000.0, 1000.0)]  # fitted ones are a hundred times smaller
+
+
 @dataclass(frozen=True)
 class RecoveryOptions:
     """Thresholds of the way from maps to poses; stored in the checkpoint.
@@ -95,66 +96,43 @@ class RecoveryOptions:
         max_peaks: Most peaks kept per channel.
         min_score: Detections below this score are dropped.
         distance_factor: On the distance of every pose, as ``evaluate.py tune=true`` measures it.
-        covariance_factor: On the covariance of every pose, idem; the score is not changed by it.
-        score_bias: It and the following are the weights of the score's features, as ``evaluate.py
-            tune=true`` fits them; these defaults leave the mean belief.
+        covariance_factor: On the covariance of every pose, likewise; the score does not change.
+        score_bias: The first weight of the score's features, as ``evaluate.py tune=true`` fits
+            them; these defaults leave the mean belief.
         refined_min_score: Refined detections below this score are dropped.
-        refined_bias: It and the following are the weights of the score of refined poses, as
-            ``evaluate.py tune=true refine=region`` fits them; these defaults leave the network's.
+        refined_bias: The first weight of the score of refined poses, as ``evaluate.py tune=true
+            refine=region`` fits them; these defaults leave the network's score.
     """
 
-    sigma: float = 1.0
-    peak_threshold: float = 0.02
-    centroid_threshold: float = 0.05
-    max_angle_deg: float = 45.0
-    max_peaks: int = 16
-    min_score: float = 0.0
-    distance_factor: float = 1.0
-    covariance_factor: float = 1.0
-    score_bias: float = 0.0
-    score_belief: float = 1.0
-    score_spread: float = 0.0
-    score_misfit: float = 0.0
-    score_found: float = 0.0
-    refined_min_score: float = 0.0
-    refined_bias: float = 0.0
-    refined_score: float = 1.0
-    refined_agreement: float = 0.0
-    refined_support: float = 0.0
+    __pydantic_config__ = STRICT
 
-    def __post_init__(self) -> None:
-        limits = {
-            "sigma": (0.1, 100.0),
-            "peak_threshold": (1e-6, 1.0),
-            "centroid_threshold": (1e-6, 1.0),
-            "max_angle_deg": (1e-3, 180.0),
-            "max_peaks": (1, 1000),
-            "min_score": (0.0, 1.0),
-            "distance_factor": DISTANCE_FACTORS,
-            "covariance_factor": COVARIANCE_FACTORS,
-            **{f"score_{name}": (-_HEAVIEST, _HEAVIEST) for name in FEATURES},
-            "refined_min_score": (0.0, 1.0),
-            **{f"refined_{name}": (-_HEAVIEST, _HEAVIEST) for name in REFINED_FEATURES},
-        }
-        for name, (lowest, highest) in limits.items():
-            value = getattr(self, name)
-            if not lowest <= value <= highest:
-                raise UserError(
-                    f"recovery option {name}={value}", f"{lowest:g} to {highest:g}", "change it"
-                )
+    sigma: Annotated[float, Range(0.1, 100.0, "cells")] = 1.0
+    peak_threshold: _Belief = 0.02
+    centroid_threshold: _Belief = 0.05
+    max_angle_deg: Annotated[float, Range(1e-3, 180.0, "degrees")] = 45.0
+    max_peaks: Annotated[int, Range(1, 1000)] = 16
+    min_score: _Score = 0.0
+    distance_factor: Annotated[float, Range(*DISTANCE_FACTORS)] = 1.0
+    covariance_factor: Annotated[float, Range(*COVARIANCE_FACTORS)] = 1.0
+    score_bias: _Weight = 0.0
+    score_belief: _Weight = 1.0
+    score_spread: _Weight = 0.0
+    score_misfit: _Weight = 0.0
+    score_found: _Weight = 0.0
+    refined_min_score: _Score = 0.0
+    refined_bias: _Weight = 0.0
+    refined_score: _Weight = 1.0
+    refined_agreement: _Weight = 0.0
+    refined_support: _Weight = 0.0
 
     @classmethod
-    def of(cls, stored: Mapping[str, float]) -> RecoveryOptions:
-        """Turn the thresholds of a config or a checkpoint into options.
+    def of(cls, options: Mapping[str, float]) -> RecoveryOptions:
+        """Check the options of a config, a checkpoint or a caller.
 
-        A :class:`UserError`: a name is none of the options', or a value is out of its range.
+        Raises:
+            UserError: A name is unknown, or a value is out of its range.
         """
-        allowed = [entry.name for entry in fields(cls)]
-        unknown = sorted(set(stored) - set(allowed))
-        if unknown:
-            fix = "remove it; a checkpoint must be of this version"
-            raise UserError(f"recovery option {unknown[0]!r}", ", ".join(allowed), fix)
-        return cls(**stored)  # type: ignore[arg-type]
+        return parse(cls, options, "recovery")
 
     @property
     def score_weights(self) -> tuple[float, ...]:
@@ -168,8 +146,8 @@ class RecoveryOptions:
 
     def unrefined(self) -> RecoveryOptions:
         """Return the options with nothing learned about refined poses."""
-        own = {one.name: one.default for one in fields(self) if one.name.startswith("refined_")}
-        return replace(self, **own)  # type: ignore[arg-type]
+        defaults = {field.name: field.default for field in fields(self)}
+        return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
     def of_candidates(self) -> RecoveryOptions:
         """Return the options that let all through which refinement is to judge."""
@@ -183,7 +161,7 @@ def calibrated(
 ) -> Detection:
     """Return a detection at its corrected distance, with its score and corrected covariance.
 
-    The part moves along the ray through its origin. With nobody's weights the score is the mean
+    The part moves along the ray through its origin. With the default weights the score is the mean
     belief.
     """
     if options.distance_factor != 1.0:
@@ -191,20 +169,20 @@ def calibrated(
         T[:3, 3] *= options.distance_factor
         keypoints = project_keypoints(cuboid, T, K)
         detection = replace(detection, T_cam_obj=T, keypoints=keypoints)
-    said = detection.belief
+    probability = detection.belief
     if options.score_weights != _MEAN_BELIEF:
         features = detection_features(detection, cuboid, K)
-        said = float(score(features, np.array(options.score_weights)))
+        probability = float(score(features, np.array(options.score_weights)))
     covariance = options.covariance_factor * detection.covariance
-    return replace(detection, score=said, covariance=covariance)
+    return replace(detection, score=probability, covariance=covariance)
 
 
 def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Detection]:
     """Return the detections that refinement has judged, with their scores, the best first."""
     if options.refined_weights != _NETWORK_SCORE:
         weights = np.array(options.refined_weights)
-        refined = [replace(one, score=float(score(refined_features(one), weights)))
-                   for one in refined]  # fmt: skip
+        scores = [float(score(refined_features(detection), weights)) for detection in refined]
+        refined = [replace(old, score=new) for old, new in zip(refined, scores, strict=True)]
     passed = [one for one in refined if one.score >= options.refined_min_score]
     return sorted(passed, key=lambda one: -one.score)
 

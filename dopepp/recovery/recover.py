@@ -1,10 +1,18 @@
-"""The one way from maps to poses; callbacks, estimators and exported runtimes all call it."""
+"""The one way from maps to poses; callbacks, estimators and exported runtimes all call it.
+
+A :class:`Reason` says why an object, or one candidate of it, is no detection. To add a reason, name
+its kind in :data:`KINDS`, at its place on the way from maps to poses.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,14 +23,46 @@ from dopepp.maps.peaks import find_peaks
 from dopepp.recovery.association import ObjectPeaks
 from dopepp.recovery.calibration import RecoveryOptions, calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances
-from dopepp.recovery.silence import Reason, low_score, no_centroid, no_pose
 
 Cuboids = Float[np.ndarray, "objects 9 3"]
 Cameras = Float[np.ndarray, "batch 3 3"]
 Belief = Float[Tensor, "beliefs height width"]
 Field = Float[Tensor, "fields height width"]
 
-__all__ = ["RecoveryOptions", "explain", "recover", "recover_batch"]
+Kind = Literal["empty", "centroid", "small", "pose", "score", "refined"]
+
+KINDS: Final[dict[Kind, str]] = {
+    "empty": "with empty maps (best belief {best:.2g})",
+    "centroid": "without a centroid (best belief {best:.2g})",
+    "small": "with too small a part (best belief {best:.2g})",
+    "pose": "without a pose that fits (best belief {best:.2g})",
+    "score": "below the threshold (best score {best:.3g})",
+    "refined": "below the threshold once refined (best score {best:.3g})",
+}
+"""What ends the way from maps to poses, in its order, as a summary says it."""
+
+LEAST_CELLS: Final = 3.0
+"""Extent of an object's keypoints below which its maps are one blot, cells."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why an object, or one candidate of it, is no detection.
+
+    Attributes:
+        object: The part's name.
+        kind: What ended it.
+        best: The belief or the score that it reached.
+        text: In words, with the threshold.
+    """
+
+    object: str
+    kind: Kind
+    best: float
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.object}: {self.text}"
 
 
 def recover(
@@ -63,7 +103,7 @@ def recover_batch(
     the number of cuboids, maps differ in size or have no cells, or there are not as many cameras as
     images or names as objects. A :class:`UserError`: an option is out of range.
     """
-    chosen = RecoveryOptions(**options)  # type: ignore[arg-type]
+    chosen = RecoveryOptions.of(options)
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)
     _check_shapes(belief, field, len(cuboids), K)
     labels = [str(c) for c in range(len(cuboids))] if names is None else list(names)
@@ -72,7 +112,7 @@ def recover_batch(
     if not labels:
         return [[] for _ in K]
     geometry = MapGeometry(stride, chosen.sigma)
-    peaks = find_peaks(belief, geometry, chosen.peak_threshold, int(chosen.max_peaks), field)
+    peaks = find_peaks(belief, geometry, chosen.peak_threshold, chosen.max_peaks, field)
     cells = (belief.shape[-1], belief.shape[-2])
     size = f"{stride * cells[0]}×{stride * cells[1]}"  # of the network's input
     batch = []
@@ -83,7 +123,7 @@ def recover_batch(
             detections += _recover_object(own, cuboid, camera, name, chosen, stride, size, reasons)
             if reasons is not None and not len(own.centroid):
                 beliefs = belief[image, c * NUM_KEYPOINTS : (c + 1) * NUM_KEYPOINTS]
-                reasons.append(no_centroid(beliefs, name, chosen))
+                reasons.append(_no_centroid(beliefs, name, chosen))
         batch.append(sorted(detections, key=lambda one: -one.score))
     return batch
 
@@ -127,9 +167,13 @@ def _recover_object(
         x, y = group.position[CENTROID]
         where = f"at pixel ({x:.0f}, {y:.0f}) of {size}"
         if detection is None:
-            reasons.append(no_pose(group, result.reason, name, where, stride))
+            best = float(np.nan_to_num(group.score[CENTROID]))
+            reason = Reason(name, "pose", best, f"{where}: {result.reason}")
+            reasons.append(_or_too_small(reason, group.position, stride))
         else:
-            reasons.append(low_score(detection, options.min_score, where, stride))
+            text = f"{where}: score {detection.score:.3f} below {options.min_score:g}"
+            reason = Reason(name, "score", detection.score, text)
+            reasons.append(_or_too_small(reason, detection.keypoints, stride))
 
 
 def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) -> None:
@@ -147,3 +191,62 @@ def _check_shapes(belief: Beliefs, field: Fields, num_objects: int, K: Cameras) 
         )
     if K.shape != (len(belief), 3, 3):
         raise ValueError(f"{len(belief)} images need as many camera matrices, got {K.shape}")
+
+
+def _no_centroid(
+    beliefs: Float[Tensor, "9 height width"], name: str, options: RecoveryOptions
+) -> Reason:
+    """Return how close an object without any centroid came to one."""
+    best = torch.nan_to_num(beliefs.detach().float()).flatten(1).amax(1)
+    if float(best.max()) <= options.peak_threshold:
+        text = f"its maps are empty, no belief above {float(best.max()):.2g}"
+        return Reason(name, "empty", float(best.max()), text)
+    centroid, least = float(best[CENTROID]), options.centroid_threshold
+    text = f"best belief of a centroid {centroid:.2g}, {least:g} is the least"
+    return Reason(name, "centroid", centroid, text)
+
+
+def _or_too_small(reason: Reason, points: Float[np.ndarray, "9 2"], stride: int) -> Reason:
+    """Return the reason, or that the part is too small for the maps."""
+    points = points[np.isfinite(points).all(1)]
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if len(points) < 2 or extent >= LEAST_CELLS * stride:
+        return reason
+    cell = f"{extent:.0f} px across, where a cell of the maps has {stride}"
+    return replace(reason, kind="small", text=f"{reason.text} (too small: {cell})")
+
+
+def rejected_refined(one: Detection, least: float) -> Reason:
+    """Say why a refined detection was dropped."""
+    text = f"once refined, score {one.score:.3f} below {least:g}"
+    return Reason(one.object, "refined", one.score, f"{text} ({one.kept})" if one.kept else text)
+
+
+def furthest(reasons: Sequence[Reason]) -> list[Reason]:
+    """Return of every object the reason that ended its best candidate, the best one last."""
+    order = list(KINDS)
+    best: dict[str, Reason] = {}
+    for one in sorted(reasons, key=lambda one: (order.index(one.kind), one.best)):
+        best.pop(one.object, None)
+        best[one.object] = one
+    return list(best.values())
+
+
+def explained(reasons: Sequence[Reason]) -> str:
+    """Return one line on a picture where nothing was found."""
+    number = Counter(one.object for one in reasons)
+    lines = []
+    for one in reversed(furthest(reasons)):
+        several = number[one.object] > 1
+        lines.append(f"{one}" + f" (the best of {number[one.object]})" * several)
+    return "; ".join(lines)
+
+
+def summary(silent: Sequence[Reason], num_images: int) -> str:
+    """Return one line on the pictures of many where nothing was found: a reason of each."""
+    groups = []
+    for kind, words in KINDS.items():
+        own = [one.best for one in silent if one.kind == kind]
+        if own:
+            groups.append(f"{len(own)} {words.format(best=max(own))}")
+    return f"{len(silent)} of {num_images} images silent: {', '.join(groups)}"

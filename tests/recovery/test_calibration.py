@@ -10,7 +10,6 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from scipy.stats import chi2
 
-from dopepp.core.errors import UserError
 from dopepp.geometry.camera import camera_matrix, make_transform, project, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -177,10 +176,3 @@ def test_the_fit_is_the_maximum_of_the_likelihood():
 def test_right_and_wrong_ones_are_needed(correct):
     with pytest.raises(ValueError, match="right and wrong"):
         fit_weights(np.ones((len(correct), 2)), correct)
-
-
-def test_a_recovery_option_of_another_program():
-    with pytest.raises(UserError, match="recovery option 'nms_radius'"):
-        RecoveryOptions.of({"nms_radius": 3.0})
-    with pytest.raises(UserError, match="recovery option max_peaks=0"):
-        RecoveryOptions.of({"max_peaks": 0})

@@ -1,16 +1,19 @@
+import re
+
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dopepp.core.errors import UserError
-from dopepp.geometry.camera import camera_matrix, project_keypoints, transform
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints, transform
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.pnp import solve_pnp
 from dopepp.maps import MapGeometry, encode
 from dopepp.maps.peaks import Peaks
-from dopepp.recovery import RecoveryOptions, explain, recover, recover_batch
+from dopepp.recovery import Reason, explain, recover, recover_batch
 from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
+from dopepp.recovery.recover import explained, furthest, summary
 
 PLACES = [(-0.09, -0.09), (0.09, -0.09), (-0.09, 0.09), (0.09, 0.09)]
 
@@ -174,27 +177,72 @@ def test_maps_and_names_must_fit_the_objects(belief, field, names, message, box,
     [
         *(("sigma", 0.0), ("peak_threshold", 0.0), ("centroid_threshold", 2.0)),
         *(("max_angle_deg", bad) for bad in (-1.0, float("nan"))),
-        *(("max_peaks", 0), ("min_score", 1.5)),
+        *(("max_peaks", 0), ("min_score", 1.5), ("nms_radius", 3.0)),
     ],
 )
-def test_bad_option(option, value):
-    with pytest.raises(UserError, match=f"recovery option {option}={value}"):
-        RecoveryOptions(**{option: value})
+def test_bad_option(option, value, make_scene, box):
+    scene = make_scene(box)
+    with pytest.raises(UserError, match=f"recovery.{option}={value}"):
+        recover(
+            torch.zeros(9, 8, 8), torch.zeros(16, 8, 8), scene.cuboids, scene.K, **{option: value}
+        )
 
 
-def test_the_reason_for_no_detection(make_scene, box, pose):
+@pytest.mark.parametrize(
+    ("factor", "options", "kind", "text"),
+    [
+        (0.0, {}, "empty", "box: its maps are empty, no belief above 0"),
+        (0.01, {}, "empty", "no belief above 0.0"),
+        (0.04, {}, "centroid", "best belief of a centroid 0.0"),
+        (float("nan"), {}, "empty", "no belief above 0"),
+        (1.0, {"min_score": 1.0}, "score", r"box: at pixel \(.* below 1"),
+    ],
+)
+def test_what_ends_the_way_is_told_with_how_far_it_got(
+    factor, options, kind, text, make_scene, box, pose
+):
     scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
     belief, field = scene.maps()
     assert explain(belief, field, scene.cuboids, scene.K) == []
-    (reason,) = explain(belief, field, scene.cuboids, scene.K, names=["bracket"], min_score=1.0)
-    assert str(reason).startswith("bracket: at pixel")
-    assert "below 1" in reason.text
+    (one,) = explain(factor * belief, field, scene.cuboids, scene.K, names=["box"], **options)
+    assert (one.object, one.kind) == ("box", kind)
+    assert re.search(text, str(one))
+    if factor == factor:
+        assert one.best == pytest.approx(factor, rel=0.25)
+
+
+def test_too_few_corners_and_a_part_of_two_cells_are_reasons(make_scene, box, pose):
+    scene = make_scene(box).place(0, pose(np.random.default_rng(10)))
+    belief, field = scene.maps()
     belief[:6] = 0
     assert recover(belief, field, scene.cuboids, scene.K) == []
-    (reason,) = explain(belief, field, scene.cuboids, scene.K)
-    assert "only 3 usable points, 4 are needed" in reason.text
-    (reason,) = explain(0 * belief, field, scene.cuboids, scene.K)
-    assert str(reason) == "0: its maps are empty, no belief above 0"
+    (few,) = explain(belief, field, scene.cuboids, scene.K)
+    assert "only 3 usable points, 4 are needed" in few.text
+    scene = make_scene(box).place(0, make_transform(np.eye(3), np.array([0.0, 0.0, 15.0])))
+    (small,) = explain(*scene.maps(), scene.cuboids, scene.K, min_score=1.0)
+    assert small.kind == "small"
+    assert "px across, where a cell of the maps has 8" in small.text
+
+
+def reason(kind, best, name="plate"):
+    return Reason(name, kind, best, f"{kind} {best}")
+
+
+def test_the_best_candidate_of_each_object_and_many_images_in_a_line():
+    reasons = [
+        reason("pose", 0.9), reason("score", 0.1), reason("score", 0.2), reason("centroid", 0.99),
+        reason("refined", 0.1, "box"), reason("empty", 0.0, "disc"),
+    ]  # fmt: skip
+    line = "box: refined 0.1; plate: score 0.2 (the best of 4); disc: empty 0.0"
+    assert [str(one) for one in reversed(furthest(reasons))] == line.replace(
+        " (the best of 4)", ""
+    ).split("; ")
+    assert explained(reasons) == line
+    assert explained([]) == ""
+    assert summary([*reasons[1:3], reasons[-1]], 300) == (
+        "3 of 300 images silent: 1 with empty maps (best belief 0), "
+        "2 below the threshold (best score 0.2)"
+    )
 
 
 @pytest.mark.parametrize(("name", "sigma"), [("box", 2.0), ("plate", 2.0), ("box", 0.5)])

@@ -30,7 +30,7 @@ from dopepp.inference.runtimes.runtime import ExportedNetwork
 from dopepp.metrics.pose import PredictedPose
 from dopepp.models.network import build_network, network_cost
 from dopepp.parts.part import Parts
-from dopepp.recovery.silence import Reason, furthest
+from dopepp.recovery.recover import Reason, furthest
 
 _log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from dopepp.experiment.results.tables import reported_rates
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.refinement.refiner import Refine
 from dopepp.parts.part import Parts
-from dopepp.recovery.silence import summary
+from dopepp.recovery.recover import summary
 
 
 def measure_and_record(

@@ -58,7 +58,7 @@ def test_counts_are_the_papers_and_times_are_written(parsed, tmp_path, capsys):
     [
         ("job=mow", "job='mow'; allowed: train, cost"),
         ("cost.batch_size=0.5", "cost.batch_size=0.5"),
-        ("recovery.max_peaks=0", "recovery option max_peaks=0"),
+        ("recovery.max_peaks=0", "recovery.max_peaks=0"),
     ],
 )
 def test_impossible_jobs(composed, tmp_path, override, message):
