@@ -17,7 +17,7 @@ import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, Final
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from dopepp.core.errors import UserError
@@ -31,7 +31,7 @@ TIMEOUT_S: Final = 30.0
 _CHUNK_BYTES: Final = 1 << 20
 
 Progress = Callable[[int, int], None]
-"""Is told the bytes that are there and the bytes in all."""
+"""Receives the number of bytes so far, and of the whole file."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,6 @@ class DownloadSource:
     photos: PurePosixPath
     licence: str
 
-    @property
-    def filename(self) -> str:
-        """The last part of the address."""
-        return PurePosixPath(urlsplit(self.url).path).name
-
 
 SOURCES: Final = {
     "voc2007": DownloadSource(
@@ -70,10 +65,11 @@ SOURCES: Final = {
 
 
 def download(name: str, folder: Path | str, progress: Progress | None = None) -> Path:
-    """Download and unpack a data set into ``folder/NAME``, if it is not there; return its photos.
+    """Download and unpack a data set into ``folder/NAME``, unless present; return its photos.
 
-    A :class:`UserError`: the name is unknown, the network or the disk fails, or the file is not the
-    one that is meant. What was received before a failure stays, and the next call goes on.
+    Raises:
+        UserError: The name is unknown, the network or the disk fails, or the file is another one
+            than expected. What was received before a failure stays, and the next call continues.
     """
     source = SOURCES.get(name)
     if source is None:
@@ -84,7 +80,7 @@ def download(name: str, folder: Path | str, progress: Progress | None = None) ->
         logger.info("%s is there already", photos)
         return photos
     logger.info("%s: %.0f MB from %s; %s", name, source.num_bytes / 1e6, source.url, source.licence)
-    archive = Path(folder) / source.filename
+    archive = Path(folder) / PurePosixPath(urlsplit(source.url).path).name
     fetch(source.url, archive, source.num_bytes, source.sha256, progress)
     safe_extract(archive, target)
     archive.unlink()
@@ -98,10 +94,10 @@ def fetch(
 
     Args:
         url: An http or https address; redirections to others are refused, and from https to http.
-        path: Where to; a complete file that is there is kept.
+        path: Target; a complete file there is kept.
         num_bytes: The file's exact size; not a byte more is received.
         sha256: Its checksum, hex.
-        progress: Told after every piece.
+        progress: Called after every piece.
     """
     partial = path.with_name(f"{path.name}.partial")
     try:
@@ -110,9 +106,8 @@ def fetch(
             _verify(partial, url, sha256)
             partial.replace(path)
         elif path.stat().st_size != num_bytes:
-            raise UserError(
-                f"{path} of {path.stat().st_size} bytes", f"{num_bytes} bytes", "delete it"
-            )
+            got = f"{path} of {path.stat().st_size} bytes"
+            raise UserError(got, f"{num_bytes} bytes", "delete it")
         else:
             _verify(path, url, sha256)
     except urllib.error.HTTPError as error:
@@ -130,79 +125,60 @@ def fetch(
 
 
 def _receive(url: str, partial: Path, num_bytes: int, progress: Progress | None) -> None:
-    """Append what is missing to a partial file."""
-    there = partial.stat().st_size if partial.exists() else 0
-    if there > num_bytes:
+    """Append the missing bytes to a partial file."""
+    size = partial.stat().st_size if partial.exists() else 0
+    if size > num_bytes:
         partial.unlink()
-        there = 0
-    if there == num_bytes:
+        size = 0
+    if size == num_bytes:
         return
+    if urlsplit(url).scheme not in ("http", "https"):
+        raise _failed(url, f"unknown url type: {urlsplit(url).scheme}")
     request = urllib.request.Request(url, headers={"User-Agent": "dopepp"})
-    if there:
-        request.add_header("Range", f"bytes={there}-")
-    with _opener().open(request, timeout=TIMEOUT_S) as response:
+    if size:
+        request.add_header("Range", f"bytes={size}-")
+    opener = urllib.request.build_opener(_Redirects)  # takes proxies from the environment
+    with opener.open(request, timeout=TIMEOUT_S) as response:
         resumed = response.status == http.client.PARTIAL_CONTENT
-        place = response.headers.get("Content-Range", "")
-        if resumed and not place.startswith(f"bytes {there}-"):
-            raise _failed(url, f"the server goes on at {place!r} instead of byte {there}")
-        there = there if resumed else 0
-        # None where the server does not tell.
-        if response.length is not None and there + response.length != num_bytes:
-            raise _other_file(url, f"{there + response.length} bytes", f"{num_bytes} bytes")
+        start = response.headers.get("Content-Range", "")
+        if resumed and not start.startswith(f"bytes {size}-"):
+            raise _failed(url, f"the server goes on at {start!r} instead of byte {size}")
+        size = size if resumed else 0
+        # The length is None where the server does not state it.
+        if response.length is not None and size + response.length != num_bytes:
+            raise _other_file(url, f"{size + response.length} bytes", f"{num_bytes} bytes")
         partial.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("ab" if resumed else "wb") as file:
             while chunk := response.read(_CHUNK_BYTES):
-                there += len(chunk)
-                if there > num_bytes:
+                size += len(chunk)
+                if size > num_bytes:
                     break
                 file.write(chunk)
                 if progress is not None:
-                    progress(there, num_bytes)
-    if there > num_bytes:
+                    progress(size, num_bytes)
+    if size > num_bytes:
         partial.unlink()
         raise _other_file(url, f"more than {num_bytes} bytes", f"{num_bytes} bytes")
-    if there < num_bytes:
-        raise _failed(url, f"the connection broke after {there} of {num_bytes} bytes")
+    if size < num_bytes:
+        raise _failed(url, f"the connection broke after {size} of {num_bytes} bytes")
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follow redirections, but never from https to what anybody on the way can read and change."""
+    """Follow redirections to the web only, and from https to nothing that others can change."""
 
     def redirect_request(
-        self,
-        req: urllib.request.Request,
-        fp: IO[bytes],
-        code: int,
-        msg: str,
-        headers: http.client.HTTPMessage,
-        newurl: str,
+        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
-        if req.type == "https" and not newurl.lower().startswith("https:"):
+        scheme = urlsplit(newurl).scheme.lower()
+        if req.type == "https" and scheme != "https":
             raise _failed(req.full_url, f"redirected to {newurl}, which is not https")
+        if scheme not in ("http", "https"):
+            raise _failed(req.full_url, f"redirected to {newurl}, an unknown url type: {scheme}")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _opener() -> urllib.request.OpenerDirector:
-    """Return an opener that knows http and https only: no address leads to a file of this machine.
-
-    Proxies are taken from the environment.
-    """
-    opener = urllib.request.OpenerDirector()
-    for handler in (
-        urllib.request.ProxyHandler(),
-        urllib.request.HTTPHandler(),
-        urllib.request.HTTPSHandler(),
-        _Redirects(),
-        urllib.request.HTTPErrorProcessor(),
-        urllib.request.HTTPDefaultErrorHandler(),
-        urllib.request.UnknownHandler(),
-    ):
-        opener.add_handler(handler)
-    return opener
-
-
 def _verify(path: Path, url: str, sha256: str) -> None:
-    """Compare a file's checksum; another file is deleted, so that it is not resumed or kept."""
+    """Compare a file's checksum; delete another file, so that it is neither resumed nor kept."""
     with path.open("rb") as file:
         actual = hashlib.file_digest(file, "sha256").hexdigest()
     if actual != sha256:
@@ -219,6 +195,5 @@ def _failed(url: str, reason: str) -> UserError:
 
 
 def _other_file(url: str, got: str, expected: str) -> UserError:
-    return UserError(
-        f"{url}: {got}", expected, "try again; if it stays so, the file on the server has changed"
-    )
+    fix = "try again; if it stays so, the file on the server has changed"
+    return UserError(f"{url}: {got}", expected, fix)

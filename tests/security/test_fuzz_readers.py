@@ -39,7 +39,7 @@ from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
-from dopepp.data.formats.ycb_video.frame import read_meta
+from dopepp.data.formats.ycb_video import read_meta
 from dopepp.data.sample import Instance, Sample
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.geometry.camera import camera_matrix, project_keypoints

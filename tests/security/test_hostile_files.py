@@ -26,7 +26,7 @@ from dopepp.data.formats.bop.models import read_models
 from dopepp.data.formats.bop.results import read_results
 from dopepp.data.formats.images import decode_depth, decode_mask, decode_rgb
 from dopepp.data.formats.webdataset import index_shard
-from dopepp.data.formats.ycb_video.frame import read_meta
+from dopepp.data.formats.ycb_video import read_meta
 from dopepp.drawing.pictures import read_image, read_picture, read_rgb
 from dopepp.parts import read_mesh
 from dopepp.parts.mesh.read import ycb_part

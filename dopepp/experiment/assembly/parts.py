@@ -9,7 +9,7 @@ from typing import Final
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.formats.ycb_video import read_classes
 from dopepp.data.part_symmetries import choose_symmetries
 from dopepp.experiment.config.data import DataConfig
 from dopepp.parts.catalogue import load_part

@@ -17,7 +17,7 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.webdataset.reader import WebdatasetReader
-from dopepp.data.formats.ycb_video.frame import read_image_set
+from dopepp.data.formats.ycb_video import read_image_set
 from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource, WindowedSource

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop.models import parts_by_id, read_models
 from dopepp.data.formats.bop.results import PoseResult, read_results
-from dopepp.data.formats.ycb_video.frame import read_classes
+from dopepp.data.formats.ycb_video import read_classes
 from dopepp.data.sample import Sample
 from dopepp.experiment.config.data import DataConfig
 from dopepp.geometry.camera import Transform, project_keypoints

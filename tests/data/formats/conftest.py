@@ -1,21 +1,26 @@
 """What the tests of every layout share: rendered samples, and what is asked of a set of files."""
 
 import io
-import json
 import tarfile
 
-import cv2
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
-from dopepp.core.errors import UserError
-from dopepp.data.check import check_dataset
+from dopepp.data.sample import Instance, Sample
 from dopepp.data.sources.rendered import rendered_sample
+from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoints
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.parts.catalogue import pivconnector, servoholder
-from dopepp.parts.part import Part
+from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
+from dopepp.virtual.renderers.raster.rasteriser import silhouette
+from dopepp.virtual.scene import SceneObject
+from dopepp.virtual.surface import make_surface
+
+BOX = trimesh.creation.box((60.0, 40.0, 24.0))  # mm
 
 
 @pytest.fixture(scope="session")
@@ -65,60 +70,34 @@ def assert_read_back():
 
 
 @pytest.fixture(scope="session")
-def assert_found():
-    def compare(root, *expected):
-        """Check a damaged set: each damage is among the defects, with its file and field."""
-        report = check_dataset(root)
-        lines = [str(defect) for defect in report.defects]
-        for one in expected:
-            assert any(one in line for line in lines), (one, lines)
-        assert not report.ok
-
-    return compare
-
-
-@pytest.fixture(scope="session")
-def spoilt():
-    def change(content, keys, value):
-        """Return a file with another content, or with another value in its JSON.
-
-        ``keys`` lead to the value (``"0.1.obj_id"``). None takes it away, a function changes it.
-        """
-        if not keys:
-            new = value(content) if callable(value) else value
-            return cv2.imencode(".png", new)[1].tobytes() if isinstance(new, np.ndarray) else new
-        tree = node = json.loads(content)
-        *path, last = keys.split(".")
-        for name in path:
-            node = node[int(name) if isinstance(node, list) else name]
-        key = int(last) if isinstance(node, list) else last
-        if value is None:
-            del node[key]
-        else:
-            node[key] = value(node[key]) if callable(value) else value
-        return json.dumps(tree).encode()
-
-    return change
+def boxes():
+    """Two boxes of 60 × 40 × 24 mm, and three images of both, the second in front of the first."""
+    mesh = Mesh(np.asarray(BOX.vertices) / 1000, np.asarray(BOX.faces, np.int32))
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])[None]
+    axis = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    parts = [
+        make_part("obj_000001", mesh, symmetries_discrete=half_turn),
+        make_part("obj_000002", mesh, symmetries_continuous=(axis,)),
+    ]
+    return parts, [_boxes_at(parts, image) for image in range(3)]
 
 
-@pytest.fixture(scope="session")
-def assert_refused():
-    def compare(make_source, expected):
-        """Read a damaged set: a source says in one line what a check finds, with file and field."""
-
-        def read():
-            source = make_source()
-            for index in range(len(source)):
-                source.sample(index)
-
-        with pytest.raises(UserError) as caught:
-            read()
-        line = str(caught.value)
-        assert all(part in line for part in expected.split(": ")[:2])
-        assert "\n" not in line
-        assert len(line) < 800
-
-    return compare
+def _boxes_at(parts, image):
+    rng, K, size = np.random.default_rng(image), camera_matrix(150.0, 150.0, 64.0, 63.0), (128, 128)
+    poses, wholes = [], []
+    for number, part in enumerate(parts):
+        rotation = Rotation.random(rng=rng).as_matrix()
+        place = np.array([0.05 * number - 0.03, 0.005 * image, 0.4 - 0.06 * number])
+        poses.append(make_transform(rotation, place))
+        shown = SceneObject(make_surface(part.mesh), poses[-1], part=part)
+        wholes.append(silhouette(shown, K, size).mask)
+    seen = [wholes[0] & ~wholes[1], wholes[1]]
+    instances = [
+        Instance(part.name, T, project_keypoints(part.cuboid, T, K), mask.sum() / all_.sum(), mask)
+        for part, T, mask, all_ in zip(parts, poses, seen, wholes, strict=True)
+    ]
+    picture = rng.integers(0, 256, (128, 128, 3), np.uint8)
+    return Sample(picture, K, instances, np.full((128, 128), 0.4, np.float32))
 
 
 @pytest.fixture(scope="session")

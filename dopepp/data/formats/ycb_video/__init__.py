@@ -1,1 +1,217 @@
-"""YCB-Video's own layout."""
+"""The files of YCB-Video: lists of classes and frames, and a frame's images and ``meta.mat``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import scipy.io
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+
+from dopepp.core.errors import UserError
+from dopepp.data.formats.images import read_map, stated_shape
+from dopepp.data.formats.invariants import rotation_problem
+from dopepp.data.formats.problems import STRICT, Place, Problems
+from dopepp.drawing.pictures import Shape, read_image
+from dopepp.geometry.camera import CameraMatrix, Transform, make_transform
+
+Subset = Literal["real", "synthetic"]
+FOLDERS: Final[dict[Subset, str]] = {"real": "data", "synthetic": "data_syn"}
+"""Where each subset's frames are."""
+
+
+def read_classes(root: Path) -> list[str]:
+    """Return the object names of ``image_sets/classes.txt``; a class index is the line from 1."""
+    path = root / "image_sets" / "classes.txt"
+    for is_there, lack in (
+        (root.is_dir(), "is no folder"),
+        ((root / "data").is_dir(), "has no data/"),
+        (path.is_file(), "has no image_sets/classes.txt"),
+    ):
+        if not is_there:
+            raise UserError(
+                f"data.root={root}, which {lack}",
+                "a YCB-Video folder with data/, image_sets/classes.txt and models/",
+                "set data.root to the unpacked YCB-Video data set",
+            )
+    return path.read_text().split()
+
+
+def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
+    """Return a subset's frames in ``image_sets/NAME.txt``, e.g. ``0050/000003`` or ``000000``."""
+    path = root / "image_sets" / f"{image_set}.txt"
+    if not path.is_file():
+        lists = sorted(p.stem for p in path.parent.glob("*.txt") if p.stem != "classes")
+        raise UserError(f"image set {image_set!r}", f"one of {lists}", f"correct it or add {path}")
+    frames = []
+    for line in path.read_text().split():
+        scene, _, number = line.partition("/")
+        if not number.isdigit() or not (scene.isdigit() or scene == "data_syn"):
+            raise UserError(
+                f"{path}: line {line!r}", "SSSS/NNNNNN or data_syn/NNNNNN", "correct it"
+            )
+        if (scene == "data_syn") == (subset == "synthetic"):
+            frames.append(number if subset == "synthetic" else line)
+    return frames
+
+
+_HEADER_BYTES: Final = 128
+_MAX_META_BYTES: Final = 256_000_000
+_FIELDS: Final = ("cls_indexes", "poses", "intrinsic_matrix", "factor_depth")
+_ALLOWED: Final = (
+    "a complete MAT-5 file with cls_indexes (N), poses (3, 4, N) before the camera and factor_depth"
+)
+
+
+@dataclass(frozen=True)
+class FrameMeta:
+    """Ground truth of a frame.
+
+    Attributes:
+        poses: T_cam_obj of every object, by class index (from 1), metres; with NaN where damaged.
+        columns: Index of each object in the file's ``poses``.
+        K: Camera matrix in pixels; None where the file has none.
+    """
+
+    poses: Mapping[int, Transform]
+    columns: Mapping[int, int]
+    K: CameraMatrix | None
+    factor_depth: float
+
+
+def read_meta(path: Path, problems: Problems = STRICT) -> FrameMeta:
+    """Read a ``meta.mat``.
+
+    Reported are a file that is missing, cut short or lacks a field, and a pose that is not finite,
+    no rotation, or behind the camera.
+    """
+    place = Place(problems, path)
+    fields = _load(path, place["file"])
+    if fields is None:
+        return FrameMeta({}, {}, None, np.nan)
+    for name in ("cls_indexes", "poses", "factor_depth"):
+        if name not in fields:
+            place[name].report("missing", _ALLOWED)
+    factor_depth = np.nan
+    if "factor_depth" in fields:
+        factor_depth = place["factor_depth"].scalar(fields["factor_depth"])
+    if factor_depth <= 0:
+        place["factor_depth"].report(f"{factor_depth:g}", "above 0")
+    poses: dict[int, Transform] = {}
+    columns: dict[int, int] = {}
+    for column, (index, pose) in enumerate(_columns(place, fields)):
+        if index in poses:
+            place["cls_indexes"][column].report(f"class {index} twice", "each once")
+            continue
+        poses[index] = _pose(pose, place["poses"][column])
+        columns[index] = column
+    K = fields.get("intrinsic_matrix")
+    K = None if K is None else place["intrinsic_matrix"].numbers(K, 3, 3)
+    return FrameMeta(poses, columns, K, factor_depth)
+
+
+def _load(path: Path, place: Place) -> dict[str, NDArray[Any]] | None:
+    try:
+        size = path.stat().st_size
+        content = path.read_bytes() if size <= _MAX_META_BYTES else None
+    except OSError as error:
+        place.report(str(error.strerror), _ALLOWED)
+        return None
+    if content is None:
+        place.report(f"{size:,} bytes", f"at most {_MAX_META_BYTES:,}")
+        return None
+    if not _is_complete(content):
+        place.report(f"cut short after {size} bytes", _ALLOWED)
+    try:
+        # vertmap and the like are megabytes that nobody needs.
+        return dict(scipy.io.loadmat(path, variable_names=_FIELDS))
+    except Exception as error:  # SciPy lets through whatever a damaged byte happens to cause
+        place.report(f"damaged ({error})", _ALLOWED)
+        return None
+
+
+def _is_complete(content: bytes) -> bool:
+    """Tell whether the last MAT-5 element (type, length, data) ends where the file ends."""
+    # SciPy reads a file that was cut off between or inside variables it is not asked for.
+    start = _HEADER_BYTES
+    order = "<" if content[126:128] == b"IM" else ">"
+    while start + 8 <= len(content):
+        start += 8 + int(np.frombuffer(content, f"{order}u4", 1, start + 4)[0])
+    return start == len(content) > _HEADER_BYTES
+
+
+def _columns(place: Place, fields: Mapping[str, NDArray[Any]]) -> list[tuple[int, NDArray[Any]]]:
+    """Return each object's class index and 3×4 pose; none where the two fields do not match."""
+    if "cls_indexes" not in fields or "poses" not in fields:
+        return []
+    stored = np.asarray(fields["cls_indexes"])
+    indices = place["cls_indexes"].numbers(stored, stored.size)
+    odd = indices[indices % 1 != 0]
+    if np.isfinite(odd).any():
+        place["cls_indexes"].report(f"{odd.tolist()!r:.60}", "whole numbers")
+    stack = np.asarray(fields["poses"])
+    stack = stack[..., None] if stack.shape == (3, 4) else stack  # MATLAB drops a last axis of 1
+    if stack.shape != (3, 4, len(indices)):
+        place["poses"].report(f"shape {stack.shape} for {len(indices)} classes", "(3, 4, N)")
+    elif not len(odd):
+        return [(int(index), stack[..., n]) for n, index in enumerate(indices)]
+    return []
+
+
+def _pose(value: NDArray[Any], place: Place) -> Transform:
+    pose = place.numbers(value, 3, 4)
+    if problem := rotation_problem(pose[:, :3]):
+        place["R"].report(problem, "a rigid transform")
+        pose[:, :3] = np.nan
+    if pose[2, 3] <= 0:
+        place["z"].report(f"behind the camera (z = {pose[2, 3]:.3g} m)", "above 0")
+        pose[:, 3] = np.nan
+    return make_transform(pose[:, :3], pose[:, 3])
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The files of a frame; None where one cannot be read.
+
+    Attributes:
+        image: RGB, with alpha in a synthetic frame.
+        shape: (height, width), also of a damaged image that states its size.
+        depth: Units of ``1 / factor_depth`` metres.
+        labels: Class index of every pixel, 0 elsewhere.
+    """
+
+    image: UInt8[np.ndarray, "height width channels"] | None
+    shape: Shape | None
+    meta: FrameMeta
+    depth: NDArray[Any] | None
+    labels: NDArray[Any] | None
+
+
+def read_frame(
+    start: str, subset: Subset, problems: Problems = STRICT, read_depth: bool = True
+) -> Frame:
+    """Read the frame whose paths begin with ``start``, e.g. ``data/0000/000001``."""
+    colour, depth, label = (
+        Place(problems, Path(f"{start}-{name}.png")) for name in ("color", "depth", "label")
+    )
+    path = Path(colour.path)
+    image = colour["image"].attempt(lambda: _read_colour(path, alpha=subset == "synthetic"))
+    shape: Shape | None = stated_shape(path) if image is None else image.shape[:2]
+    meta = read_meta(Path(f"{start}-meta.mat"), problems)
+    units = read_map(depth, shape) if read_depth else None
+    return Frame(image, shape, meta, units, read_map(label, shape))
+
+
+def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
+    image = read_image(path)
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
+        raise UserError(
+            f"image {path} of shape {image.shape}, {image.dtype}",
+            f"8 bits and {3 + alpha} channels",
+            "copy or download the file again",
+        )
+    return image

@@ -16,7 +16,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.data.formats.invariants import Box, box_problem, camera_problem, translation_problem
 from dopepp.data.formats.problems import CheckReport, Place
-from dopepp.data.formats.ycb_video.frame import (
+from dopepp.data.formats.ycb_video import (
     FOLDERS,
     FrameMeta,
     Subset,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dopepp.core.errors import UserError
 from dopepp.data.formats.bop import make_instance
-from dopepp.data.formats.ycb_video.frame import (
+from dopepp.data.formats.ycb_video import (
     FOLDERS,
     FrameMeta,
     Subset,
