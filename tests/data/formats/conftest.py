@@ -16,7 +16,7 @@ from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
-from dopepp.virtual.renderers.raster.rasteriser import silhouette
+from dopepp.virtual.renderers.raster import silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import make_surface
 
