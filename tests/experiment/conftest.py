@@ -43,7 +43,7 @@ from pathlib import Path
 from types import SimpleNamespace
 import hydra, torch
 from dopepp.experiment.results.folder import METRICS_FILE, write_json
-from dopepp.experiment.command_line import entry, run_job
+from dopepp.experiment.entries import entry, run_job
 from dopepp.experiment.assembly.registries import CALLBACKS
 from dopepp.training.callbacks.trial import raise_if_pruned
 

@@ -11,6 +11,7 @@ import torch
 from rich.table import Table
 
 from dopepp.core.errors import UserError
+from dopepp.experiment import program
 from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import share_in_words
 from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
@@ -82,6 +83,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     That is a checkpoint, a file of another method's poses, or both; the test set is the
     checkpoint's own one or another one. A :class:`UserError` tells what of it is wrong.
     """
+    program.quiet_lightning()
     asked = EvaluationConfig.of(config)
     if asked.ckpt_path is None and asked.results is None:
         allowed = "ckpt_path=… or results=… on the command line"

@@ -73,6 +73,7 @@ def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
 
     A :class:`UserError` tells which option is wrong.
     """
+    program.quiet_lightning()
     parsed = RunConfig.of(config)
     if parsed.table is not None:
         PaperTable.of(parsed.table)  # a mistake in it shows before the work, not after

@@ -60,27 +60,30 @@ class Jobs:
         """The folder of the multirun; a job's is its number in it."""
         return Path(str(self.config.hydra.sweep.dir))
 
-    def run(self, number: int, overrides: list[str]) -> JobReturn:
-        """Run one job in this process."""
+    def __call__(self, job: tuple[int, list[str]]) -> JobReturn:
+        """Run one job, a number and its overrides, in this process."""
+        number, overrides = job
         setup_globals()
         Singleton.set_state(self.state)
         config = self.context.config_loader.load_sweep_config(self.config, overrides)
         with open_dict(config):
             config.hydra.job.id = config.hydra.job.num = number
-        return run_job(
+        result = run_job(
             task_function=self.task,
             config=config,
             job_dir_key="hydra.sweep.dir",
             job_subdir_key="hydra.sweep.subdir",
             hydra_context=self.context,
         )
-
-    def __call__(self, job: tuple[int, list[str]]) -> JobReturn:
-        """Run one job, as a pool's item of number and overrides."""
-        result = self.run(*job)
         # Configs hold classes that Hydra imports twice, so that they cannot be sent back.
         result.cfg = result.hydra_cfg = None
         return result
+
+    def checkpoint(self, job: tuple[int, list[str]]) -> Any:
+        """Near SLURM's time limit: submit the same job once more, which goes on in its folder."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, job)
 
 
 Ended = Iterator[tuple[int, JobReturn | Exception]]
@@ -166,22 +169,6 @@ def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
             yield outcome.item[0], lost or outcome.result()
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A job that submitit can queue again."""
-
-    jobs: Jobs
-
-    def __call__(self, number: int, overrides: list[str]) -> JobReturn:
-        return self.jobs.run(number, overrides)
-
-    def checkpoint(self, number: int, overrides: list[str]) -> Any:
-        """Near the time limit: the same job once more, which goes on in its folder."""
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(self, number, overrides)
-
-
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:
     """Return a runner that submits an array and waits for it.
 
@@ -201,7 +188,7 @@ def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[st
             slurm = {"cluster": cluster, "slurm_max_num_timeout": max_num_timeout}
             executor = submitit.AutoExecutor(folder, **slurm)
             executor.update_parameters(**named)
-            handles = executor.map_array(_Task(jobs), *zip(*overrides.items(), strict=True))
+            handles = executor.map_array(jobs, overrides.items())
         except (RuntimeError, ValueError, NameError, TypeError, OSError) as error:
             raise UserError(
                 f"hydra/launcher=submitit_slurm, which this machine or SLURM refuses: {error}",

@@ -1,16 +1,41 @@
-"""Multirun: every job is a row, failed ones too; it ends with a comparison and its table."""
+"""Multirun: every job is a row, failed ones too; it ends with a comparison and its table.
+
+A launcher of Hydra's own (``basic``) runs jobs one after another in this process and terminal; any
+other one has several at work at a time, so each writes into a file of its own folder.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from dopepp.core.yaml import read_yaml
 from dopepp.experiment import program
 
 # Hydra makes its hooks before any job, of a single run, too: what they need is imported late.
+
+
+LOG_FILE: Final = "job.log"
+_OWN_PROCESS: Final = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+_STANDARD_OUT_AND_ERROR: Final = (1, 2)
+
+
+class AnnounceJobs(Callback):
+    """Hydra's hook at the start of a multirun: says where to look."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Name the folder, and the file that each job of another process prints to."""
+        folder = config.hydra.sweep.dir
+        program.say(f"begins in {folder}")
+        if is_remote(config.hydra):
+            program.say(f"each job prints to {folder}/JOB/{LOG_FILE}")
 
 
 class CompareJobs(Callback):
@@ -71,3 +96,47 @@ def _state(job: Path) -> str:
             return f"{word}: {read_json(job / name).get('reason', '')}"
     done = any((job / name).is_file() for name in (METRICS_FILE, COST_FILE))
     return "finished" if done else "unfinished"
+
+
+def is_remote(hydra: Any) -> bool:
+    """Return whether the launcher of Hydra's own config runs jobs in other processes."""
+    return str(hydra.launcher._target_) != _OWN_PROCESS
+
+
+@contextmanager
+def own_output(path: Path) -> Iterator[None]:
+    """Send all that this process and its children print to the end of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    before = [os.dup(number) for number in _STANDARD_OUT_AND_ERROR]
+    try:
+        with path.open("ab") as stream:
+            _redirect([stream.fileno()] * 2)
+        yield
+    finally:
+        _redirect(before)
+        for number in before:
+            os.close(number)
+
+
+def _redirect(targets: list[int]) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    for target, number in zip(targets, _STANDARD_OUT_AND_ERROR, strict=True):
+        os.dup2(target, number)
+
+
+def goes_on(config: Mapping[str, Any], run_dir: Path) -> bool:
+    """Tell whether a job was interrupted in this very folder, with this very config.
+
+    So does a SLURM job that was queued again, and a search that was started again.
+    """
+    from dopepp.experiment.results.folder import CONFIG_FILE, LAST_CHECKPOINT
+    from dopepp.experiment.run.resume import config_differences
+
+    stored = run_dir / CONFIG_FILE
+    if config.get("resume") is not None or not stored.is_file():
+        return False
+    if not (run_dir / LAST_CHECKPOINT).is_file():
+        return False
+    before = read_yaml(stored)
+    return isinstance(before, dict) and not config_differences(before, config)

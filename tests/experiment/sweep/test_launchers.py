@@ -10,7 +10,7 @@ import yaml
 
 from dopepp.core.errors import UserError
 from dopepp.experiment.results.folder import LAST_CHECKPOINT, write_config
-from dopepp.experiment.sweep import remote
+from dopepp.experiment.sweep import multirun, slurm
 from dopepp.experiment.sweep.jobs import on_joblib, on_slurm
 
 RATES = ("1e-4", "1e-3", "1e-2")
@@ -153,18 +153,18 @@ def test_joblib_wants_a_number_of_processes():
 
 def test_a_job_goes_on_in_its_folder_only_with_its_own_config(tmp_path):
     config = {"seed": 1, "model": {"width": 0.5}, "resume": None}
-    assert not remote.goes_on(config, tmp_path)
+    assert not multirun.goes_on(config, tmp_path)
     write_config(tmp_path, {**config, "resume": "outputs/x"})
-    assert not remote.goes_on(config, tmp_path)  # it saved nothing
+    assert not multirun.goes_on(config, tmp_path)  # it saved nothing
     (tmp_path / LAST_CHECKPOINT).parent.mkdir()
     (tmp_path / LAST_CHECKPOINT).touch()
-    assert remote.goes_on(config, tmp_path)
-    assert not remote.goes_on({**config, "seed": 2}, tmp_path)
-    assert not remote.goes_on({**config, "resume": "outputs/y"}, tmp_path)
+    assert multirun.goes_on(config, tmp_path)
+    assert not multirun.goes_on({**config, "seed": 2}, tmp_path)
+    assert not multirun.goes_on({**config, "resume": "outputs/y"}, tmp_path)
 
 
 def test_what_children_print_is_in_the_file_too(tmp_path, capfd):
-    with remote.own_output(tmp_path / "job" / "job.log"):
+    with multirun.own_output(tmp_path / "job" / "job.log"):
         os.write(1, b"by this process\n")
         subprocess.run(["bash", "-c", "echo by a child; echo as an error >&2"], check=True)
     os.write(1, b"after it\n")
@@ -180,15 +180,15 @@ def slurm_job(tmp_path, monkeypatch):
 
 
 def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_path, monkeypatch):
-    remote.remember_run(["seed=1"], tmp_path / "a")
-    remote.remember_run(["seed=2"], tmp_path / "b")
-    assert remote.begun_run(["seed=1"]) is None  # the first time: no restart
+    slurm.remember_run(["seed=1"], tmp_path / "a")
+    slurm.remember_run(["seed=2"], tmp_path / "b")
+    assert slurm.begun_run(["seed=1"]) is None  # the first time: no restart
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert remote.begun_run(["seed=1"]) == tmp_path / "a"
-    assert remote.begun_run(["seed=2"]) == tmp_path / "b"
-    assert remote.begun_run(["seed=3"]) is None
+    assert slurm.begun_run(["seed=1"]) == tmp_path / "a"
+    assert slurm.begun_run(["seed=2"]) == tmp_path / "b"
+    assert slurm.begun_run(["seed=3"]) is None
     monkeypatch.setenv("SLURM_JOB_ID", "13")
-    assert remote.begun_run(["seed=1"]) is None
+    assert slurm.begun_run(["seed=1"]) is None
 
 
 @pytest.mark.parametrize(
@@ -204,14 +204,14 @@ def test_only_a_requeued_job_goes_on_and_with_its_own_command(slurm_job, tmp_pat
 def test_a_job_is_named(variables, named, slurm_job, monkeypatch):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert remote.job_id() == named
+    assert slurm.job_id() == named
 
 
 def test_a_refused_or_missing_scontrol_is_told(slurm_job, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert remote.requeue().startswith("SLURM did not requeue job 12: ")
+    assert slurm.requeue().startswith("SLURM did not requeue job 12: ")
     script = tmp_path / "scontrol"
     script.write_text("#!/bin/sh\necho Access denied >&2\nexit 1\n")
     script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.defpath}")
-    assert remote.requeue() == "SLURM did not requeue job 12: Access denied"
+    assert slurm.requeue() == "SLURM did not requeue job 12: Access denied"
