@@ -22,7 +22,6 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -40,12 +39,16 @@ def write_png(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> N
     """Write an RGB image; a ValueError, where it is not uint8 (H, W, 3), or empty."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
+    import cv2  # a tenth of a second, which a command that answers at once does not need
+
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     write_whole(path, encoded.tobytes())
 
 
 def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB image as its suffix says, one of :data:`PICTURES`."""
+    import cv2
+
     encoded = cv2.imencode(path.suffix.lower(), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     write_whole(path, encoded.tobytes())
 

@@ -17,7 +17,7 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.data.sample import DescribedSource, Sample
 from dopepp.experiment.assembly.sources import held_out_source
-from dopepp.experiment.config.data import DataConfig, trained_on
+from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import flat
 from dopepp.geometry.camera import Letterbox
 from dopepp.models.checkpoint import Checkpoint
@@ -106,7 +106,7 @@ def warn_of_other_images(checkpoint: Checkpoint, data: DataConfig, parts: Parts)
     if not isinstance(stored, dict) or config is None:
         return  # a checkpoint that train.py has not written
     try:
-        own = DataConfig.of(config, config.get("virtual"))
+        own = chosen_data(None, None, config, "the checkpoint")
     except UserError:
         return  # nor does one whose data nobody can read
     if _test_set(own) != _test_set(data):
