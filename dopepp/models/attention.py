@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.models.layers import Features, initialise
 
 
@@ -38,8 +38,7 @@ class Identity(Attention):
 class SE(Attention):
     """Squeeze-and-excitation (Hu et al. 2018): features · σ(MLP(mean over the map)).
 
-    The MLP's hidden layer is narrower by the factor ``reduction``; one that is out of range is a
-    :class:`UserError`.
+    The MLP's hidden layer is narrower by the factor ``reduction``.
     """
 
     def __init__(self, channels: int, reduction: int = 16) -> None:
@@ -60,12 +59,12 @@ class CBAM(Attention):
     features · σ(conv([mean; maximum])) over the channels (Eq. 6).
 
     The MLP's hidden layer is narrower by the factor ``reduction``; the side of the spatial
-    convolution is odd, the paper's is 3. What is out of range is a :class:`UserError`.
+    convolution is odd, the paper's is 3.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:
         super().__init__()
-        if check_integer("kernel_size", kernel_size, 1, 31) % 2 == 0:
+        if check("kernel_size", kernel_size, int, Range(1, 31)) % 2 == 0:
             raise UserError(f"kernel_size={kernel_size}", "an odd number", "use 3 (the paper's)")
         self.mlp = _bottleneck(channels, reduction)
         self.spatial = nn.Conv2d(2, 1, kernel_size, padding=kernel_size // 2, bias=False)
@@ -82,7 +81,7 @@ class CBAM(Attention):
 
 def _bottleneck(channels: int, reduction: int) -> nn.Sequential:
     """Return W1·ReLU(W0·x), without biases as in both papers, at least one hidden unit."""
-    hidden = max(1, channels // check_integer("reduction", reduction, 1, 1024))
+    hidden = max(1, channels // check("reduction", reduction, int, Range(1, 1024)))
     return nn.Sequential(
         nn.Linear(channels, hidden, bias=False),
         nn.ReLU(inplace=True),

@@ -14,11 +14,12 @@ from typing import ClassVar, Final
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dopepp.core.checks import check_flag, check_integers
 from dopepp.core.errors import UserError
+from dopepp.core.validation import check
 from dopepp.models.layers import (
-    MAX_BLOCKS,
-    MAX_CHANNELS,
+    BLOCKS,
+    BLOCKS_OR_NONE,
+    CHANNELS,
     ResidualBlock,
     conv_block,
     double,
@@ -50,7 +51,17 @@ class Backbone(nn.Module, ABC):
         """Return the feature maps of normalised images."""
 
 
-class VGG19(Backbone):
+class _Chain(Backbone):
+    """Convolutions and poolings in a row."""
+
+    layers: nn.Sequential
+
+    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
+        """Return the feature maps of normalised images."""
+        return self.layers(images)  # type: ignore[no-any-return]
+
+
+class VGG19(_Chain):
     """DOPE's backbone: VGG19's layers 0–22, then 3×3 convolutions 512→256 and 256→128.
 
     Args:
@@ -58,8 +69,10 @@ class VGG19(Backbone):
         batch_norm: Put batch norm behind every convolution, in place of its bias.
         weights_path: A ``state_dict`` of torchvision's ``vgg19`` (keys ``features.N.weight`` and
             ``features.N.bias``) to start the VGG layers from. It is where training starts, not part
-            of the architecture, so checkpoints do not repeat it. What does not fit is a
-            :class:`UserError`.
+            of the architecture, so checkpoints do not repeat it.
+
+    Raises:
+        UserError: An argument is out of range, or the file does not fit.
     """
 
     plan: ClassVar[tuple[int | str, ...]] = (
@@ -74,7 +87,7 @@ class VGG19(Backbone):
         self, width: float = 1.0, batch_norm: bool = False, weights_path: str | None = None
     ) -> None:
         super().__init__()
-        check_flag("batch_norm", batch_norm)
+        check("batch_norm", batch_norm, bool)
         layers: list[nn.Module] = []
         channels = 3
         for step in (*self.plan, *self.reduction):
@@ -96,10 +109,6 @@ class VGG19(Backbone):
                 )
             self._load_pretrained(weights_path)
 
-    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
-        """Return the feature maps of normalised images."""
-        return self.layers(images)  # type: ignore[no-any-return]
-
     def _load_pretrained(self, path: str) -> None:
         weights = read_mapping(Path(path), "a torchvision-format state_dict of vgg19 (.pth)")
         convolutions = [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
@@ -120,14 +129,14 @@ class VGG19Original(VGG19):
     plan: ClassVar[tuple[int | str, ...]] = (*VGG19.plan, 512)
 
 
-class DSC(Backbone):
+class DSC(_Chain):
     """The paper's light backbone of depthwise separable convolutions (Fig. 7).
 
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
     each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels.
 
     ``width`` is a factor on every channel count, 1 is the paper's; batch norm stands behind every
-    convolution, in place of its bias. What is out of range is a :class:`UserError`.
+    convolution, in place of its bias.
     """
 
     plan: ClassVar[tuple[int | str, ...]] = (
@@ -139,7 +148,7 @@ class DSC(Backbone):
 
     def __init__(self, width: float = 1.0, batch_norm: bool = False) -> None:
         super().__init__()
-        check_flag("batch_norm", batch_norm)
+        check("batch_norm", batch_norm, bool)
         channels = scaled_channels(64, width)
         layers: list[nn.Module] = [conv_block(3, channels, 3, batch_norm=batch_norm)]
         for step in self.plan:
@@ -153,10 +162,6 @@ class DSC(Backbone):
         self.layers = nn.Sequential(*layers)
         self.out_channels = channels
         initialise(self)
-
-    def forward(self, images: Images) -> Float[Tensor, "batch channels height/8 width/8"]:
-        """Return the feature maps of normalised images."""
-        return self.layers(images)  # type: ignore[no-any-return]
 
 
 class Pyramid(Backbone):
@@ -189,12 +194,10 @@ class Pyramid(Backbone):
         width: float = 1.0,
     ) -> None:
         super().__init__()
-        scaled = [
-            scaled_channels(count, width)
-            for count in check_integers("channels", channels, 4, 8, MAX_CHANNELS)
-        ]
-        check_integers("blocks", blocks, 4, 1, MAX_BLOCKS)
-        check_integers("top_down", top_down, 2, 0, MAX_BLOCKS)
+        counts = check("channels", channels, tuple[int, int, int, int], CHANNELS)
+        blocks = check("blocks", blocks, tuple[int, int, int, int], BLOCKS)
+        top_down = check("top_down", top_down, tuple[int, int], BLOCKS_OR_NONE)
+        scaled = [scaled_channels(count, width) for count in counts]
         self.stem = nn.Sequential(
             nn.PixelUnshuffle(4), conv_block(3 * 4**2, scaled[0], 3, batch_norm=True)
         )
@@ -233,14 +236,12 @@ class Pyramid(Backbone):
 def copy_layer(
     weights: Mapping[str, object], name: str, layer: nn.Module, path: str, network: str
 ) -> None:
-    """Copy what a file holds of a layer under a name; a :class:`UserError` if it does not fit."""
-    for key, own in layer.state_dict().items():
+    """Copy a file's tensors of a layer; a :class:`UserError` where they do not fit."""
+    for key, parameter in layer.state_dict().items():
         value = weights.get(f"{name}.{key}")
-        if not isinstance(value, Tensor) or value.shape != own.shape:
-            got = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
-            raise UserError(
-                f"{got} under {name}.{key} in {path}",
-                f"a tensor of shape {tuple(own.shape)}",
-                f"pass a state_dict of {network}",
-            )
-        own.copy_(value)
+        if not isinstance(value, Tensor) or value.shape != parameter.shape:
+            shape = tuple(value.shape) if isinstance(value, Tensor) else "nothing"
+            got, allowed = f"{shape} under {name}.{key} in {path}", tuple(parameter.shape)
+            fix = f"pass a state_dict of {network}"
+            raise UserError(got, f"a tensor of shape {allowed}", fix)
+        parameter.copy_(value)

@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dopepp.core.checks import check_integer, check_integers
 from dopepp.core.errors import UserError, require
+from dopepp.core.validation import check
 from dopepp.models.backbones import Backbone, Images, copy_layer
 from dopepp.models.layers import (
+    BLOCKS_OR_NONE,
+    CHANNELS,
     IMAGENET_MEAN,
     IMAGENET_STD,
-    MAX_BLOCKS,
-    MAX_CHANNELS,
     Features,
     ResidualBlock,
     conv_block,
@@ -82,8 +82,8 @@ class EfficientNetLite(Backbone):
         weights_path: str | None = None,
     ) -> None:
         super().__init__()
-        inside = scaled_channels(check_integer("channels", channels, 8, MAX_CHANNELS), width)
-        check_integers("top_down", top_down, 2, 0, MAX_BLOCKS)
+        inside = scaled_channels(check("channels", channels, int, CHANNELS), width)
+        top_down = check("top_down", top_down, tuple[int, int], BLOCKS_OR_NONE)
         if isinstance(frozen, bool) or frozen not in (0, *self.strides):
             raise UserError(f"frozen={frozen!r:.100}", "0, 8, 16 or 32", "choose one of them")
         before, self.down = 32, nn.ModuleList()
@@ -129,9 +129,8 @@ class EfficientNetLite(Backbone):
 
     def _load(self, path: str) -> None:
         weights = read_mapping(Path(path), "a state_dict of EfficientNet-Lite0 (.pth)")
-        layers = [
-            one for one in self.down.modules() if isinstance(one, (nn.Conv2d, nn.BatchNorm2d))
-        ]
+        kinds = (nn.Conv2d, nn.BatchNorm2d)
+        layers = [layer for layer in self.down.modules() if isinstance(layer, kinds)]
         for layer, name in zip(layers, self._names(), strict=True):
             copy_layer(weights, name, layer, path, "EfficientNet-PyTorch's efficientnet-lite0")
         # The first convolution takes the network's normalised pixels, in place of EfficientNet's.
@@ -143,11 +142,11 @@ class EfficientNetLite(Backbone):
     def _names(self) -> list[str]:
         """Return what the file calls the convolutions and batch norms of the way down, in order."""
         names = ["_conv_stem", "_bn0"]
-        blocks = [one for one in self.down.modules() if isinstance(one, InvertedResidual)]
+        blocks = [block for block in self.down.modules() if isinstance(block, InvertedResidual)]
         for number, block in enumerate(blocks):
             expand = ("_expand_conv", "_bn0") if block.expansion > 1 else ()
-            own = (*expand, "_depthwise_conv", "_bn1", "_project_conv", "_bn2")
-            names += [f"_blocks.{number}.{layer}" for layer in own]
+            layers = (*expand, "_depthwise_conv", "_bn1", "_project_conv", "_bn2")
+            names += [f"_blocks.{number}.{layer}" for layer in layers]
         return names
 
 
@@ -171,9 +170,7 @@ class InvertedResidual(nn.Module):
         self.expansion = expansion
         self.added = stride == 1 and in_channels == out_channels
 
-    def forward(
-        self, features: Features
-    ) -> Float[Tensor, "batch out_channels height/stride width/stride"]:
+    def forward(self, features: Features) -> Features:
         """Return the block's features."""
         after: Tensor = self.layers(features)
         return features + after if self.added else after
@@ -215,15 +212,8 @@ def same_conv(
     """
     before, uneven = divmod(kernel_size - stride, 2)
     kind = nn.Conv2d if groups == 1 else DepthwiseConv
-    conv = kind(
-        in_channels,
-        out_channels,
-        kernel_size,
-        stride=stride,
-        padding=0 if uneven else before,
-        groups=groups,
-        bias=False,
-    )
+    pad = 0 if uneven else before
+    conv = kind(in_channels, out_channels, kernel_size, stride, pad, groups=groups, bias=False)
     padding = [nn.ZeroPad2d((before, before + 1) * 2)] if uneven else []
     norm = nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01)
     return nn.Sequential(*padding, conv, norm, *([nn.ReLU6(inplace=True)] if relu else []))

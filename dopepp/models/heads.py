@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dopepp.core.checks import check_flag, check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.geometry.cuboid import NUM_CORNERS, NUM_KEYPOINTS
 from dopepp.models.layers import (
-    MAX_BLOCKS,
-    MAX_CHANNELS,
+    BLOCKS,
+    CHANNELS,
     Features,
     ResidualBlock,
     conv_block,
@@ -32,9 +32,6 @@ Beliefs = Float[Tensor, "batch 9*objects height width"]
 Fields = Float[Tensor, "batch 16*objects height width"]
 Stage: TypeAlias = tuple[Beliefs, Fields]
 """Belief logits and vector field of one stage."""
-
-MAX_STAGES: Final = 12
-MAX_OBJECTS: Final = 64
 
 _OUTPUT_STD: Final = 0.01
 """Standard deviation of the output convolutions' weights: an untrained head answers its bias,
@@ -60,8 +57,7 @@ class Head(nn.Module):
     Stage 1 reads the features; every later one reads them together with the belief maps (after the
     activation, so that both losses feed it the same thing) and the field of the stage before. For C
     objects there are 9·C belief and 16·C field channels. ``make_branch`` is called with input
-    channels, output channels and the stage's number (from 0). A number out of range is a
-    :class:`UserError`.
+    channels, output channels and the stage's number (from 0).
 
     Attributes:
         cell_multiple: The feature map's height and width must be multiples of this.
@@ -79,8 +75,8 @@ class Head(nn.Module):
     ) -> None:
         super().__init__()
         self.activate = find_activation(activation)
-        check_integer("num_objects", num_objects, 1, MAX_OBJECTS)
-        check_integer("stages", stages, 1, MAX_STAGES)
+        check("num_objects", num_objects, int, Range(1, 64))
+        check("stages", stages, int, Range(1, 12))
         outputs = (NUM_KEYPOINTS * num_objects, 2 * NUM_CORNERS * num_objects)
         self.belief_branches, self.field_branches = (
             nn.ModuleList(
@@ -121,8 +117,7 @@ class Cascade(Head):
     (128), 1×1 (128), 1×1 to the maps. ReLU after all but the last.
 
     ``stages`` are 1–12, DOPE's are 6; ``width`` is a factor on the channel counts, 1 is the
-    paper's; batch norm stands behind every convolution but the last, in place of its bias. What is
-    out of range is a :class:`UserError`.
+    paper's; batch norm stands behind every convolution but the last, in place of its bias.
     """
 
     def __init__(
@@ -135,7 +130,7 @@ class Cascade(Head):
         batch_norm: bool = False,
     ) -> None:
         narrow, wide = scaled_channels(128, width), scaled_channels(512, width)
-        check_flag("batch_norm", batch_norm)
+        check("batch_norm", batch_norm, bool)
 
         def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
             steps = [(7, narrow)] * 5 + [(1, narrow)] if stage else [(3, narrow)] * 3 + [(1, wide)]
@@ -168,7 +163,7 @@ class MultiScale(Head):
     convolution but those of maps, in place of its bias. ``maps`` is what the three scales hand to
     the fusion: ``plain`` for maps of 9 or 16 channels each, as §3.3 has them; ``learned`` for the
     same, and each scale's maps are answers of their own, before the fused ones, that the loss sees
-    as well; None for features. What is out of range is a :class:`UserError`.
+    as well; None for features.
     """
 
     cell_multiple = 4
@@ -184,7 +179,7 @@ class MultiScale(Head):
         maps: str | None = None,
     ) -> None:
         channels = scaled_channels(128, width)
-        check_flag("batch_norm", batch_norm)
+        check("batch_norm", batch_norm, bool)
         if maps not in (None, "plain", "learned"):
             raise UserError(f"maps={maps!r}", "plain, learned or null", "choose one of them")
 
@@ -212,18 +207,14 @@ class MultiScaleBranch(Branch):
         scale_channels = out_channels if maps else channels
 
         def chain(inputs: int, kernel_sizes: tuple[int, ...], stride: int = 1) -> nn.Sequential:
-            return nn.Sequential(
-                *(
-                    conv_block(
-                        channels if position else inputs,
-                        channels,
-                        kernel_size,
-                        stride=1 if position else stride,
-                        batch_norm=batch_norm,
-                    )
-                    for position, kernel_size in enumerate(kernel_sizes)
+            blocks = []
+            for kernel_size in kernel_sizes:
+                block = conv_block(
+                    inputs, channels, kernel_size, stride=stride, batch_norm=batch_norm
                 )
-            )
+                blocks.append(block)
+                inputs, stride = channels, 1
+            return nn.Sequential(*blocks)
 
         def scale(inputs: int, length: int, stride: int = 1) -> nn.Sequential:
             if not maps:
@@ -261,19 +252,9 @@ class MultiScaleBranch(Branch):
 class SharedTrunk(Head):
     """One stage whose beliefs and field come from one trunk, by a short branch each.
 
-    Trunk: residual blocks of two 3×3 convolutions. Branch: 3×3, then 1×1 to the maps. Batch norm
-    behind every convolution but those of maps.
-
-    Args:
-        in_channels: Channels of the features.
-        num_objects: Number of objects.
-        activation: Name of the belief activation.
-        channels: Channels of trunk and branches, 8–1024.
-        blocks: Number of residual blocks of the trunk, 1–16.
-        width: Factor on the channel count.
-
-    Raises:
-        UserError: An argument is out of range.
+    Trunk: ``blocks`` residual blocks of two 3×3 convolutions, 1–16. Branch: 3×3, then 1×1 to the
+    maps. Both have ``channels`` · ``width`` channels, and batch norm behind every convolution but
+    those of maps.
     """
 
     def __init__(
@@ -285,8 +266,8 @@ class SharedTrunk(Head):
         blocks: int = 1,
         width: float = 1.0,
     ) -> None:
-        inside = scaled_channels(check_integer("channels", channels, 8, MAX_CHANNELS), width)
-        check_integer("blocks", blocks, 1, MAX_BLOCKS)
+        inside = scaled_channels(check("channels", channels, int, CHANNELS), width)
+        check("blocks", blocks, int, BLOCKS)
 
         def make_branch(inputs: int, outputs: int, stage: int) -> Branch:
             convolution = conv_block(inside, inside, 3, batch_norm=True)
@@ -299,6 +280,6 @@ class SharedTrunk(Head):
         )
         initialise(self.trunk)
 
-    def forward(self, features: Float[Tensor, "batch channels height width"]) -> list[Stage]:
+    def forward(self, features: Features) -> list[Stage]:
         """Return the belief logits and vector field of the only stage."""
         return super().forward(self.trunk(features))

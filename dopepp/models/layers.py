@@ -15,15 +15,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 
 Features = Float[Tensor, "batch channels height width"]
 
 MIN_WIDTH: Final = 1 / 64
 MAX_WIDTH: Final = 4.0
-MAX_CHANNELS: Final = 1024
-MAX_BLOCKS: Final = 16
+CHANNELS: Final = Range(8, 1024)
+BLOCKS: Final = Range(1, 16)
+BLOCKS_OR_NONE: Final = Range(0, 16)
 """Bounds of the width factor, and of channels and blocks where they are options, so that a hostile
 spec cannot ask for unlimited memory."""
 
@@ -37,7 +38,7 @@ _CHANNEL_STEP: Final = 8
 
 def scaled_channels(channels: int, width: float) -> int:
     """Scale a channel count by a factor in (0, 4], rounded to a multiple of 8 and at least 8."""
-    width = check_number("width", width, MIN_WIDTH, MAX_WIDTH)
+    width = check("width", width, float, Range(MIN_WIDTH, MAX_WIDTH))
     return max(_CHANNEL_STEP, round(channels * width / _CHANNEL_STEP) * _CHANNEL_STEP)
 
 
@@ -68,12 +69,8 @@ def conv_block(
 class ResidualBlock(nn.Module):
     """Two 3×3 convolutions with batch norm, added to their input (He et al. 2016, Fig. 2).
 
-    Where the shape changes, a 1×1 convolution with batch norm brings the input to the sum.
-
-    Args:
-        in_channels: Channels in.
-        out_channels: Channels out.
-        stride: Of the first convolution.
+    Where the shape changes, a 1×1 convolution with batch norm brings the input to the sum. The
+    stride is that of the first convolution.
     """
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
@@ -88,16 +85,12 @@ class ResidualBlock(nn.Module):
                 in_channels, out_channels, 1, stride=stride, batch_norm=True, relu=False
             )
 
-    def forward(
-        self, features: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch out_channels height/stride width/stride"]:
+    def forward(self, features: Features) -> Features:
         """Return the sum, after a ReLU."""
         return functional.relu(self.residual(features) + self.shortcut(features), inplace=True)
 
 
-def double(
-    maps: Float[Tensor, "batch channels height width"],
-) -> Float[Tensor, "batch channels 2*height 2*width"]:
+def double(maps: Features) -> Float[Tensor, "batch channels 2*height 2*width"]:
     """Return maps of twice the size, every value repeated."""
     return functional.interpolate(maps, scale_factor=2.0, mode="nearest")
 
@@ -117,14 +110,6 @@ def initialise(module: nn.Module) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-def _identity(logits: Tensor) -> Tensor:
-    return logits
-
-
-def _exp(logits: Tensor) -> Tensor:
-    return logits.float().clamp(max=0.0).exp()
-
-
 @dataclass(frozen=True)
 class Activation:
     """A belief activation: elementwise, and the bias that an untrained head starts from."""
@@ -139,11 +124,11 @@ class Activation:
 
 ACTIVATIONS: Final[Mapping[str, Activation]] = {
     # The output is the belief itself, as in DOPE: what MSE is paired with.
-    "identity": Activation(_identity, 0.0),
+    "identity": Activation(lambda logits: logits, 0.0),
     # belief = exp(logit), at most 1 and in float32: the log link of `losses.SpatialCrossEntropy`.
     # An untrained map starts at 0.01 in every cell, so its sum is that of one Gaussian of 2 cells
     # on a 52×52 map (2π·2² / 52² = 0.0093) and the "how much" term starts near its minimum.
-    "exp": Activation(_exp, math.log(0.01)),
+    "exp": Activation(lambda logits: logits.float().clamp(max=0.0).exp(), math.log(0.01)),
 }
 
 

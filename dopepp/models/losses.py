@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dopepp.core.checks import check_number
+from dopepp.core.validation import Range, check
 from dopepp.models.heads import Beliefs, Fields, Stage
 
 
@@ -81,6 +81,8 @@ class MapMSE(MapLoss):
         }
 
 
+_WEIGHTS: Final = Range(0, 1e6)
+
 _LINEAR_FROM: Final = 2.0
 """The exponential goes on as its tangent from e² ≈ 7 times too much mass on, so gradients stay
 bounded whatever the logits."""
@@ -102,8 +104,7 @@ class SpatialCrossEntropy(MapLoss):
 
     ``sigma`` is the standard deviation of the target's Gaussians, cells. ``count_weight`` is of the
     *how much* term, ``field_weight`` of the field's: smooth L1 per cell inside the keypoints'
-    discs, the only place where the field is defined and read. What is out of range is a
-    :class:`UserError`.
+    discs, the only place where the field is defined and read.
     """
 
     activation = "exp"
@@ -111,9 +112,9 @@ class SpatialCrossEntropy(MapLoss):
     def __init__(self, sigma: float, count_weight: float = 1.0, field_weight: float = 1.0) -> None:
         super().__init__()
         # At σ = 0.1 a Gaussian is one cell; at 100 it is wider than any map.
-        self.mass = 2 * math.pi * check_number("sigma", sigma, 0.1, 100.0) ** 2
-        self.count_weight = check_number("count_weight", count_weight, 0.0, 1e6)
-        self.field_weight = check_number("field_weight", field_weight, 0.0, 1e6)
+        self.mass = 2 * math.pi * check("sigma", sigma, float, Range(0.1, 100)) ** 2
+        self.count_weight = check("count_weight", count_weight, float, _WEIGHTS)
+        self.field_weight = check("field_weight", field_weight, float, _WEIGHTS)
 
     def parts(
         self, logits: Beliefs, field: Fields, belief_target: Beliefs, field_target: Fields
@@ -147,8 +148,7 @@ def _capped_exp(value: Tensor, count: Tensor) -> Tensor:
 def _field_error(field: Tensor, target: Tensor) -> Tensor:
     """Return each image's smooth-L1 distance of the vectors inside the discs.
 
-    It is divided by the mean number of the discs' cells in an image, so that the mean over images
-    is the mean over all cells.
+    Divided by the discs' mean number of cells: the mean over images is that over all cells.
     """
     corners = (field.shape[0], field.shape[1] // 2, 2, *field.shape[2:])
     field, target = field.view(corners), target.view(corners)

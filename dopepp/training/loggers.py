@@ -25,30 +25,30 @@ T = TypeVar("T")
 
 
 class MetricsTable(Logger):
-    """Writes everything that is logged into one CSV: a row per step, a column per metric.
+    """Writes all logged figures into one CSV: a row per step, a column per metric.
 
-    The file is rewritten whole, so it is never cut in the middle, and its columns may grow. An
-    existing file is continued. Of several processes only the first one writes. While it cannot be
-    written, its rows are kept, and the training goes on.
+    Lightning's ``CSVLogger`` appends rows and cannot continue a file. Here the file is rewritten
+    whole, so it is never cut in the middle, and an existing file is continued. Only the first of
+    several processes writes. While the file cannot be written, its rows are kept.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
-        self._rows: dict[int, dict[str, float]] = {}
+        self._rows: dict[int, dict[str, Any]] = {}
         self._failing = False
         if path.is_file():
-            self._rows = {int(row.pop("step")): row for row in _read(path)}
+            with path.open(newline="") as stream:
+                for row in csv.DictReader(stream):
+                    cells = {name: cell for name, cell in row.items() if cell != ""}
+                    self._rows[int(cells.pop("step"))] = cells
 
     @property
     def name(self) -> str:
         """Nothing, so that Lightning puts checkpoints into the run folder itself."""
         return ""
 
-    @property
-    def version(self) -> str:
-        """Nothing, likewise."""
-        return ""
+    version = name
 
     def forget_after(self, step: int) -> None:
         """Drop the rows of steps that a resumed run will take again."""
@@ -89,13 +89,8 @@ class MetricsTable(Logger):
         self.save()
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
-    with path.open(newline="") as stream:
-        return [{k: v for k, v in row.items() if v != ""} for row in csv.DictReader(stream)]
-
-
 class GuardedLogger(Logger):
-    """Passes everything on to a logger that it builds; survives its failures, telling the first."""
+    """Builds a logger and forwards to it; switches it off at its first failure, with a warning."""
 
     def __init__(self, make: Callable[[], Logger]) -> None:
         super().__init__()
@@ -114,38 +109,38 @@ class GuardedLogger(Logger):
             _log.warning("a logger failed and is off for the rest of the run: %r", error)
             return None
 
-    def _pass_on(self, call: Callable[[Logger], T]) -> T | None:
+    def _forward(self, call: Callable[[Logger], T]) -> T | None:
         inner = self.inner
         return None if inner is None else self.guard(lambda: call(inner))
 
     @property
     def name(self) -> str | None:
         """The inner logger's name."""
-        return self._pass_on(lambda inner: inner.name)
+        return self._forward(lambda inner: inner.name)
 
     @property
     def version(self) -> str | int | None:
         """The inner logger's version."""
-        return self._pass_on(lambda inner: inner.version)
+        return self._forward(lambda inner: inner.version)
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kw: Any) -> None:
-        """Pass on."""
-        self._pass_on(lambda inner: inner.log_hyperparams(params, *args, **kw))
+        """Forward."""
+        self._forward(lambda inner: inner.log_hyperparams(params, *args, **kw))
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Pass on."""
-        self._pass_on(lambda inner: inner.log_metrics(metrics, step))
+        """Forward."""
+        self._forward(lambda inner: inner.log_metrics(metrics, step))
 
     def save(self) -> None:
-        """Pass on."""
-        self._pass_on(lambda inner: inner.save())
+        """Forward."""
+        self._forward(lambda inner: inner.save())
 
     def finalize(self, status: str) -> None:
-        """Pass on."""
-        self._pass_on(lambda inner: inner.finalize(status))
+        """Forward."""
+        self._forward(lambda inner: inner.finalize(status))
 
     def log_picture(self, name: str, image: Picture, step: int | None = None) -> None:
-        """Hand an RGB picture to TensorBoard or Weights & Biases."""
+        """Log an RGB picture to TensorBoard or Weights & Biases."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_image(name, image, step, dataformats="HWC"))
@@ -153,10 +148,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_image(name, [image], step=step))
 
     def log_table(self, name: str, rows: Sequence[Mapping[str, str]], text: str) -> None:
-        """Hand a table over: its rows to Weights & Biases, its Markdown text to TensorBoard.
-
-        The first row has all headings.
-        """
+        """Log rows, the first with all headings, to W&B and their Markdown text to TensorBoard."""
         inner = self.inner
         if isinstance(inner, TensorBoardLogger):
             self.guard(lambda: inner.experiment.add_text(name, text))
@@ -166,7 +158,7 @@ class GuardedLogger(Logger):
             self.guard(lambda: inner.log_table(name, columns, cells))
 
     def log_summary(self, figures: Mapping[str, float]) -> None:
-        """Hand over what a run ends with: to Weights & Biases as the run's summary."""
+        """Log the final figures, in Weights & Biases as the run's summary."""
         inner = self.inner
         if isinstance(inner, WandbLogger):
             self.guard(lambda: inner.experiment.summary.update(dict(figures)))
@@ -174,7 +166,7 @@ class GuardedLogger(Logger):
             self.log_metrics(dict(figures))
 
     def close(self, failed: bool) -> None:
-        """End the run there: what is logged after this would be another one's."""
+        """End the logger's run: what is logged afterwards would belong to another one."""
         if isinstance(self.inner, WandbLogger):
             self._failed = False  # a run that failed midway has to end as well
             self.guard(lambda: _finish_wandb(failed))
@@ -183,10 +175,7 @@ class GuardedLogger(Logger):
 
 
 def _finish_wandb(failed: bool) -> None:
-    """End the run of Weights & Biases that is open; without one, do nothing.
-
-    Where its service has died, so has the run; the next one starts a service of its own.
-    """
+    """End the open run of Weights & Biases; a dead service is replaced by the next run."""
     import wandb  # takes a second, and few runs need it
 
     try:

@@ -1,8 +1,8 @@
 """Several processes on one machine that do not outlive one another.
 
-A process that waits in a collective for one that has died would wait for the process group's
-timeout, half an hour; and Lightning kills the first process without a word when another one ends.
-Here every process watches: the first one its children, the children their parent.
+A process that waits in a collective for a dead one would wait for the process group's timeout, half
+an hour; and Lightning kills the first process without a message when another one ends. Here every
+process watches: the first one its children, the children their parent.
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from dopepp.core.errors import RunError
 
 _STARTED_BY: Final = "DOPEPP_STARTED_BY"
-"""Environment variable that tells a process which one of the run has started it."""
+"""Environment variable with the id of the process that started this one."""
 _POLL_S: Final = 1.0
-"""How often a process looks after the others."""
 _NOTICE_S: Final = 5.0
-"""A broken connection is seen before the death that broke it; so long it may take to show."""
+"""Time that a death may take to show after the connection that it broke."""
 _GRACE_S: Final = 20.0
-"""What is still waiting in a collective so long after a death is ended from outside."""
+"""Time after a death in which a process may end by itself."""
 
 
 class ProcessDiedError(RunError):
@@ -38,10 +37,7 @@ class ProcessDiedError(RunError):
 
 
 class Watch(threading.Thread):
-    """Looks after other processes of this machine: this one's children, rank 1 first.
-
-    ``parent`` is the process that has started this one, where it belongs to the run.
-    """
+    """Watches this process's children, rank 1 first, and its parent if that belongs to the run."""
 
     def __init__(self, children: Sequence[subprocess.Popen[Any]], parent: int | None) -> None:
         super().__init__(daemon=True, name="process-watch")
@@ -86,7 +82,8 @@ class WatchedLauncher(_SubprocessScriptLauncher):
     ) -> Any:
         """Start the other processes, then call the function.
 
-        If that fails because another process has died, it is a :class:`ProcessDiedError`.
+        Raises:
+            ProcessDiedError: The function failed because another process has died.
         """
         self.cluster_environment.validate_settings(self.num_processes, self.num_nodes)
         started_by = os.environ.pop(_STARTED_BY, None)
@@ -115,8 +112,7 @@ class WatchedLauncher(_SubprocessScriptLauncher):
 class WatchedDDP(DDPStrategy):
     """Distributed data parallel whose processes notice each other's death.
 
-    A process waits for the others in a collective for ``timeout_s`` seconds, which tells that one
-    on another machine is gone.
+    The death of a process on another machine shows after ``timeout_s`` seconds in a collective.
     """
 
     def __init__(self, timeout_s: float) -> None:

@@ -3,7 +3,6 @@ import pytest
 import torch
 from scipy.signal import correlate2d
 
-from dopepp.core.errors import UserError
 from dopepp.models.attention import CBAM, SE, Identity
 
 
@@ -58,18 +57,3 @@ def test_shape_is_kept(module, channels):
     features = torch.randn(2, channels, 4, 7)
     assert module(channels)(features).shape == features.shape
     assert (module(channels)(features) is features) == (module is Identity)
-
-
-@pytest.mark.parametrize(
-    ("module", "arguments", "message"),
-    [
-        (SE, {"reduction": 0}, "reduction=0; allowed: an integer from 1"),
-        (CBAM, {"reduction": -16}, "reduction=-16"),
-        (CBAM, {"reduction": 1.5}, "reduction=1.5"),
-        (CBAM, {"kernel_size": 4}, "kernel_size=4; allowed: an odd number"),
-        (CBAM, {"kernel_size": 10**9}, "kernel_size=1000000000"),
-    ],
-)
-def test_arguments_are_bounded(module, arguments, message):
-    with pytest.raises(UserError, match=message):
-        module(8, **arguments)

@@ -90,36 +90,6 @@ def test_learned_depthwise_convolutions_stay_in_float32_on_the_cpu():
     assert torch.equal(learned, expected)
 
 
-def test_every_scale_reaches_the_features():
-    torch.manual_seed(0)
-    backbone = EfficientNetLite(width=0.125).eval()
-    images = torch.randn(1, 3, 64, 64)
-    with torch.no_grad():
-        before = backbone(images)
-        for lateral in backbone.laterals:
-            hook = lateral.register_forward_hook(lambda *arguments: 2 * arguments[-1])
-            assert not torch.allclose(backbone(images), before)
-            hook.remove()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"channels": 4}, "channels=4; allowed: an integer from 8 to 1024"),
-        ({"top_down": (1, 2, 3)}, r"top_down=.* a list of 2 integers"),
-        ({"top_down": (-1, 2)}, r"top_down\[0\]=-1; allowed: an integer from 0"),
-        ({"width": 0}, "width=0"),
-        ({"frozen": 4}, "frozen=4; allowed: 0, 8, 16 or 32"),
-        ({"frozen": False}, "frozen=False"),
-        ({"weights_path": 3}, "weights_path=3; allowed: a file's path or imagenet"),
-        ({"weights_path": "missing.pth"}, "missing.pth, which is no file"),
-    ],
-)
-def test_arguments_are_bounded(arguments, message):
-    with pytest.raises(UserError, match=message):
-        EfficientNetLite(**arguments)
-
-
 def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"weights_path=imagenet without .*'dopepp\[imagenet\]'"):

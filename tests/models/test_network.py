@@ -98,8 +98,6 @@ def test_maps_of_nine_channels_cost_less_than_features(make_spec):
     }
     assert counts["plain"] == counts["learned"] == 5_152_694
     assert counts[None] == 6_573_419
-    with pytest.raises(UserError, match="maps='all'; allowed: plain, learned or null"):
-        build_network(make_spec(head_maps="all"))
 
 
 def test_normalisation_is_imagenets_and_not_in_the_checkpoint(small_spec):
@@ -158,12 +156,6 @@ def test_activations():
     assert find_activation("exp")(logits.bfloat16()).dtype == torch.float32
 
 
-@pytest.mark.parametrize("name", ["relu", None, 3, ["exp"]])
-def test_unknown_activation_is_refused(name):
-    with pytest.raises(UserError, match=r"activation .* allowed: identity, exp"):
-        find_activation(name)
-
-
 @pytest.mark.parametrize(("activation", "expected"), [("identity", 0.0), ("exp", 0.01)])
 @pytest.mark.parametrize(
     "head", [partial(Cascade, stages=2), partial(MultiScale, stages=2), SharedTrunk]
@@ -201,26 +193,6 @@ def test_multiscale_has_the_paper_convolutions():
     assert num_parameters(MultiScale(128, 1)) == expected
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"stages": 0}, "stages=0; allowed: an integer from 1 to 12"),
-        ({"stages": 13}, "stages=13"),
-        ({"stages": True}, "stages=True"),
-        ({"stages": 2.0}, "stages=2.0"),
-        ({"width": 0}, "width=0; allowed: a number from"),
-        ({"width": 4.1}, "width=4.1"),
-        ({"width": float("nan")}, "width=nan"),
-        ({"width": "1"}, "width='1'"),
-        ({"batch_norm": 1}, "batch_norm=1; allowed: true or false"),
-    ],
-)
-@pytest.mark.parametrize("head", [Cascade, MultiScale])
-def test_head_arguments_are_bounded(head, arguments, message):
-    with pytest.raises(UserError, match=message):
-        head(8, 1, **arguments)
-
-
 def test_belief_and_field_share_the_trunk_alone():
     head = SharedTrunk(8, 2, channels=24, blocks=2)
     belief, field = head(torch.randn(1, 8, 8, 8))[0]
@@ -232,23 +204,6 @@ def test_belief_and_field_share_the_trunk_alone():
     # A block's convolutions, the first's shortcut; a 3×3 and a 1×1 of each branch.
     weights = 9 * (8 * 24 + 5 * 24 * 24) + 8 * 24 + 24 * (18 + 32)
     assert sum(p.numel() for p in head.parameters() if p.ndim == 4) == weights
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"channels": 4}, "channels=4; allowed: an integer from 8 to 1024"),
-        ({"channels": 64.0}, "channels=64.0"),
-        ({"blocks": 0}, "blocks=0; allowed: an integer from 1 to 16"),
-        ({"blocks": True}, "blocks=True"),
-        ({"width": 5}, "width=5"),
-        ({"num_objects": 65}, "num_objects=65"),
-        ({"activation": "relu"}, "activation 'relu'"),
-    ],
-)
-def test_a_shared_trunks_arguments_are_bounded(arguments, message):
-    with pytest.raises(UserError, match=message):
-        SharedTrunk(8, **{"num_objects": 1, **arguments})
 
 
 @pytest.mark.parametrize(

@@ -112,11 +112,8 @@ def test_registering_anything_else_fails_at_once(tiny_module, name):
     [
         ({"wdth": 1}, "argument 'wdth' of dopepp.*DSC; allowed: width, batch_norm; fix"),
         ({"_args_": [1]}, "argument '_args_'"),
-        ({"_partial_": True}, "argument '_partial_'"),
-        ({"_convert_": "all"}, "argument '_convert_'"),
         ({3: 1}, "argument 3"),
         ({"width": {"_target_": "os.getcwd"}}, "key '_target_' in .*argument width.*plain values"),
-        ({"width": [{"a": {"_target_": DSC}}]}, "key '_target_'"),
         ({"width": [{"a": {"_target_": DSC, "width": 1}}]}, "nested targets are not built"),
         ({"width": object()}, "a object in .*argument width"),
         ({"width": torch.ones(1)}, "a Tensor in"),

@@ -28,18 +28,16 @@ FOLDER: Final = "profile"
 _STARVED: Final = 0.2
 """A larger share of waiting is worth a hint."""
 _FILE: Final = "report"
-_SHOWN: Final = 12
 
 Total = tuple[str, int, float]
-"""What took time, how often it was called, and seconds of all calls."""
+"""A hook or operator, its number of calls, and the seconds of all calls."""
 
 
 class Throughput(Callback):
     """Logs images per second and the share of an epoch spent waiting for the loader.
 
     ``throughput/images_per_s`` counts training time only; ``throughput/loader_wait`` is the share
-    of it between the end of one step and the arrival of the next batch. Both are said in a line
-    per epoch, with what helps where the loader is too slow.
+    of it between the end of one step and the arrival of the next batch.
     """
 
     def __init__(self) -> None:
@@ -120,7 +118,7 @@ class RunProgress(TQDMProgressBar):
 
 
 class Operators(PyTorchProfiler):
-    """Torch's operators in a few steps of training and of validation, without what they call.
+    """Profiles torch's operators in a few steps of training and of validation.
 
     Lightning's own report is of the last recording alone, a validation. The folder gets the report
     and a trace of each recording.
@@ -136,16 +134,17 @@ class Operators(PyTorchProfiler):
         self._folder.mkdir(parents=True, exist_ok=True)
         recorded.export_chrome_trace(str(self._folder / f"trace_{self._num_traces}.json"))
         self._num_traces += 1
-        averages: Any = recorded.key_averages()
-        for one in averages:
-            if one.is_user_annotation or one.key.startswith("[pl]"):
+        operators: Any = recorded.key_averages()
+        for operator in operators:
+            if operator.is_user_annotation or operator.key.startswith("[pl]"):
                 continue  # Lightning's hooks
-            calls, seconds = self._totals.get(one.key, (0, 0.0))
-            spent = 1e-6 * (one.self_cpu_time_total + one.self_device_time_total)
-            self._totals[one.key] = (calls + one.count, seconds + spent)
+            calls, seconds = self._totals.get(operator.key, (0, 0.0))
+            # Of a GPU's operator, launching and running.
+            seconds += 1e-6 * (operator.self_cpu_time_total + operator.self_device_time_total)
+            self._totals[operator.key] = (calls + operator.count, seconds)
 
     def totals(self) -> list[Total]:
-        """Return every operator, the slowest first; of a GPU's, launching and running together."""
+        """Return every operator, the slowest first."""
         return _slowest_first((name, *total) for name, total in self._totals.items())
 
     def summary(self) -> str:
@@ -162,18 +161,13 @@ def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> P
 
     ``simple`` is of the hooks of the training loop, ``pytorch`` of the operators in a few steps.
     """
-    if kind is None:
-        return None
     if kind == "simple":
         return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
-    return Operators(run_dir / FOLDER)
+    return None if kind is None else Operators(run_dir / FOLDER)
 
 
-def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
-    """Return what took longest, a row of texts each; empty where nothing was recorded.
-
-    The profiler is of :func:`make_profiler`, after the training; of any other nothing is known.
-    """
+def profile_rows(profiler: object, limit: int = 12) -> list[dict[str, str]]:
+    """Return what took longest, a row of texts each; empty where nothing was recorded."""
     totals: list[Total] = []
     if isinstance(profiler, Operators):
         totals = profiler.totals()
@@ -181,13 +175,9 @@ def profile_rows(profiler: object, limit: int = _SHOWN) -> list[dict[str, str]]:
         recorded = profiler.recorded_durations.items()
         totals = _slowest_first((name, len(seconds), sum(seconds)) for name, seconds in recorded)
     return [
-        {
-            "what": name,
-            "calls": f"{calls:,}",
-            "s": f"{seconds:.3f}",
-            "ms/call": f"{1000 * seconds / max(1, calls):.2f}",
-        }
+        {"what": name, "calls": f"{calls:,}", "s": f"{seconds:.3f}", "ms/call": f"{ms:.2f}"}
         for name, calls, seconds in totals[:limit]
+        for ms in (1000 * seconds / max(1, calls),)
     ]
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -56,8 +56,8 @@ class TrialReport(Callback):
     ) -> None:
         self.monitor, self.number, self.prune, self.pruned = monitor, number, prune, ""
         self._place, self._name = storage, study
-        self._after_trials = check_integer("search.prune_after_trials", after_trials, 1, MOST)
-        self._after_epochs = check_integer("search.prune_after_epochs", after_epochs, 0, MOST)
+        self._after_trials = check("search.prune_after_trials", after_trials, int, Range(1, MOST))
+        self._after_epochs = check("search.prune_after_epochs", after_epochs, int, Range(0, MOST))
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Find the trial in its study."""
@@ -96,10 +96,7 @@ def raise_if_pruned(trainer: Trainer) -> None:
 
 
 def open_storage(place: str) -> BaseStorage:
-    """Open the database of a study, which is created where there is none.
-
-    A :class:`UserError`: it cannot be opened.
-    """
+    """Open or create the database of a study; a :class:`UserError` where that fails."""
     from optuna.exceptions import StorageInternalError
     from optuna.storages import RDBStorage
     from sqlalchemy.exc import SQLAlchemyError

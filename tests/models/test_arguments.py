@@ -1,0 +1,76 @@
+"""What the parts of a network refuse: one line per argument."""
+
+import pytest
+
+from dopepp.core.errors import UserError
+from dopepp.models.attention import CBAM, SE
+from dopepp.models.backbones import DSC, VGG19, Pyramid
+from dopepp.models.efficientnet import EfficientNetLite
+from dopepp.models.heads import Cascade, MultiScale, SharedTrunk
+from dopepp.models.layers import find_activation
+from dopepp.models.losses import SpatialCrossEntropy
+
+WITH_WEIGHTS = {"weights_path": "vgg19.pth"}
+FULL_WIDTH = "only with width=1 and batch_norm=false"
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (SE, {"reduction": 0}, "reduction=0; allowed: an integer from 1"),
+        (CBAM, {"reduction": -16}, "reduction=-16"),
+        (CBAM, {"reduction": 1.5}, "reduction=1.5"),
+        (CBAM, {"kernel_size": 4}, "kernel_size=4; allowed: an odd number"),
+        (CBAM, {"kernel_size": 10**9}, "kernel_size=1000000000"),
+        (DSC, {"width": 0}, "width=0; allowed: a number from"),
+        (DSC, {"width": 100}, "width=100"),
+        (DSC, {"width": "wide"}, "width='wide'"),
+        (DSC, {"batch_norm": "yes"}, "batch_norm='yes'; allowed: true or false"),
+        (VGG19, {"width": -1}, "width=-1"),
+        (VGG19, {"batch_norm": "yes"}, "batch_norm"),
+        (VGG19, {**WITH_WEIGHTS, "width": 0.5}, FULL_WIDTH),
+        (VGG19, {**WITH_WEIGHTS, "batch_norm": True}, FULL_WIDTH),
+        (VGG19, {"weights_path": 3}, FULL_WIDTH),
+        (VGG19, {"weights_path": "no.pth"}, "which is no file; allowed: a torchvision-format"),
+        (Pyramid, {"channels": (32, 96, 128)}, r"channels=.*; allowed: a list of 4 integers"),
+        (Pyramid, {"channels": (32, 96, 4, 128)}, "a list of 4 integers from 8 to 1024"),
+        (Pyramid, {"channels": (32, 96, 128, 10**9)}, "channels="),
+        (Pyramid, {"channels": "abcd"}, "channels='abcd'"),
+        (Pyramid, {"blocks": (1, 0, 2, 2)}, "blocks=.* a list of 4 integers from 1 to 16"),
+        (Pyramid, {"blocks": (1, 3, 2.5, 2)}, "blocks="),
+        (Pyramid, {"blocks": None}, "blocks=None"),
+        (Pyramid, {"top_down": (-1, 2)}, "top_down=.* a list of 2 integers from 0"),
+        (Pyramid, {"top_down": (1, True)}, "top_down="),
+        (Pyramid, {"width": 0}, "width=0"),
+        (EfficientNetLite, {"channels": 4}, "channels=4; allowed: an integer from 8 to 1024"),
+        (EfficientNetLite, {"top_down": (1, 2, 3)}, "top_down=.* a list of 2 integers"),
+        (EfficientNetLite, {"width": 0}, "width=0"),
+        (EfficientNetLite, {"frozen": 4}, "frozen=4; allowed: 0, 8, 16 or 32"),
+        (EfficientNetLite, {"frozen": False}, "frozen=False"),
+        (EfficientNetLite, {"weights_path": 3}, "weights_path=3; allowed: a file's path or image"),
+        (EfficientNetLite, {"weights_path": "missing.pth"}, "missing.pth, which is no file"),
+        (Cascade, {"stages": 0}, "stages=0; allowed: an integer from 1 to 12"),
+        (Cascade, {"stages": True}, "stages=True"),
+        (Cascade, {"width": float("nan")}, "width=nan"),
+        (Cascade, {"batch_norm": 1}, "batch_norm=1; allowed: true or false"),
+        (MultiScale, {"stages": 13}, "stages=13"),
+        (MultiScale, {"width": 4.1}, "width=4.1"),
+        (MultiScale, {"batch_norm": 1}, "batch_norm=1"),
+        (MultiScale, {"maps": "all"}, "maps='all'; allowed: plain, learned or null"),
+        (SharedTrunk, {"channels": 64.5}, "channels=64.5; allowed: an integer from 8 to 1024"),
+        (SharedTrunk, {"blocks": 0}, "blocks=0; allowed: an integer from 1 to 16"),
+        (SharedTrunk, {"width": 5}, "width=5"),
+        (SharedTrunk, {"num_objects": 65}, "num_objects=65"),
+        (SharedTrunk, {"activation": "relu"}, "activation 'relu'; allowed: identity, exp"),
+        (SpatialCrossEntropy, {"sigma": 0}, "sigma=0"),
+        (SpatialCrossEntropy, {"sigma": "2"}, "sigma='2'"),
+        (SpatialCrossEntropy, {"sigma": 1, "count_weight": -1}, "count_weight=-1"),
+        (find_activation, {"name": ["exp"]}, "activation .* allowed: identity, exp"),
+    ],
+)
+def test_arguments_are_bounded(kind, arguments, message):
+    provided = {SE: {"channels": 8}, CBAM: {"channels": 8}}
+    provided |= {head: {"in_channels": 8, "num_objects": 1} for head in (Cascade, MultiScale)}
+    provided[SharedTrunk] = provided[Cascade]
+    with pytest.raises(UserError, match=message):
+        kind(**{**provided.get(kind, {}), **arguments})
