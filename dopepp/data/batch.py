@@ -28,8 +28,7 @@ class Batch:
         T_cam_obj: Rigid transforms, metres; the identity in padding.
         keypoints: Projected cuboids in pixels; NaN behind the camera and in padding.
         object_index: Position of the instance's object in the list of objects, −1 in padding.
-        visible_fraction: Visible share of the silhouette, 0 in padding.
-        masked_fraction: Share of the visible pixels covered by the random mask, 0 in padding.
+        visible_fraction: 0 in padding, as is ``masked_fraction``; see ``Instance``.
     """
 
     images: UInt8[Tensor, "batch 3 height width"]
@@ -70,19 +69,6 @@ class Batch:
 
 def collate(samples: Sequence[Sample], object_index: Mapping[str, int]) -> Batch:
     """Stack samples of one size; ``object_index`` has the position of every object, by name."""
-    images = torch.from_numpy(np.stack([sample.image for sample in samples]))
-    return Batch(
-        images=images.permute(0, 3, 1, 2),
-        K=torch.from_numpy(np.stack([sample.K for sample in samples]).astype(np.float32)),
-        keys=[sample.key for sample in samples],
-        sources=[sample.source for sample in samples],
-        **_stack_instances(samples, object_index),
-    )
-
-
-def _stack_instances(
-    samples: Sequence[Sample], object_index: Mapping[str, int]
-) -> dict[str, Tensor]:
     # One slot even when nothing is visible anywhere: an empty axis is a special case for everybody.
     shape = (len(samples), max(1, *(len(sample.instances) for sample in samples)))
     stated = {
@@ -97,5 +83,12 @@ def _stack_instances(
             index[row, column] = object_index[instance.label]
             for name, array in stated.items():
                 array[row, column] = getattr(instance, name)
+    images = torch.from_numpy(np.stack([sample.image for sample in samples]))
     arrays = {"object_index": index, **stated}
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return Batch(
+        images=images.permute(0, 3, 1, 2),
+        K=torch.from_numpy(np.stack([sample.K for sample in samples]).astype(np.float32)),
+        keys=[sample.key for sample in samples],
+        sources=[sample.source for sample in samples],
+        **{name: torch.from_numpy(array) for name, array in arrays.items()},
+    )

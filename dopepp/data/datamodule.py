@@ -51,12 +51,8 @@ class PoseDataModule(LightningDataModule):
     """Training, validation and test data for pose estimation.
 
     Training items are resized, jittered, masked, augmented and padded; validation items only
-    letterboxed; test items come at their native resolution, as :class:`Sample`.
-
-    Args:
-        val: Validation data (model selection, thresholds); its epoch is always 0.
-        test: Test data; its epoch is always 0.
-        backgrounds: Other pictures that masking may need; required with ``masking``.
+    letterboxed; test items come at their native resolution. Only training items have epochs.
+    ``masking`` requires ``backgrounds``, other pictures that it may need.
     """
 
     def __init__(
@@ -90,11 +86,8 @@ class PoseDataModule(LightningDataModule):
         self._backgrounds = backgrounds
 
     def train_item(self, epoch: int, index: int) -> Sample:
-        """Return a training item, a pure function of (seed, epoch, index).
-
-        Jitter, masking and augmentation come between resizing and padding: the padding is neither
-        background nor does it get noise, as at prediction.
-        """
+        """Return a training item, a pure function of (seed, epoch, index)."""
+        # Padding comes last: as at prediction, it is neither background nor does it get noise.
         sample = resize_sample(self.train_source.sample(index, epoch), self.input_size)
         rng = item_rng(self.seed, Purpose.AUGMENT, epoch, index)
         if self._jitter is not None:
@@ -142,10 +135,7 @@ class PoseDataModule(LightningDataModule):
             )
 
     def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
-        """Return how large and how far away the parts are in the network's input.
-
-        Measured on validation images; for a part that none of them shows, on training images.
-        """
+        """Measure how large and how far away the parts are on validation, else training images."""
         views: dict[str, list[Seen]] = {part.name: [] for part in parts}
         for source in (self.val_source, self.train_source):
             missing = [part for part in parts if not views[part.name]]
@@ -202,12 +192,12 @@ class SampleDataset(Dataset[Sample | UserError]):
 class EpochSampler(DistributedSampler[tuple[int, int]]):
     """Hands out (epoch, index) in an order that depends on (seed, epoch) only.
 
-    It is a ``DistributedSampler`` so that Lightning leaves it in its place; it calls ``set_epoch``.
-    Of the next pass, this rank's first ``skip`` items are left out, to resume inside an epoch.
+    A ``DistributedSampler``, so that Lightning keeps it and calls ``set_epoch``. The next pass
+    leaves out this rank's first ``skip`` items, to resume inside an epoch.
 
     Args:
-        shuffle: Training: a new order every epoch, and every rank gets equally many items. Without
-            it the items come in order, epoch 0 always, and every item exactly once over all ranks.
+        shuffle: Use a new order every epoch, with equally many items for every rank. Otherwise the
+            items come in order, of epoch 0, every item exactly once over all ranks.
     """
 
     def __init__(
@@ -236,9 +226,8 @@ class EpochSampler(DistributedSampler[tuple[int, int]]):
 class PoseLoader(DataLoader[Any]):
     """A ``DataLoader`` that resumes inside an epoch and raises a worker's ``UserError``.
 
-    An exception from a worker arrives re-made from its text, with the worker's stack in it; a user
-    is owed the one line. So it travels as a value and is raised here. ``object_names`` are in the
-    network's order.
+    A worker's exception would arrive with its stack as text; so the error travels as a value.
+    ``object_names`` are in the network's order.
     """
 
     def __init__(

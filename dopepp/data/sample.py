@@ -86,10 +86,9 @@ class SourceInfo:
     """What a source holds, for the start-up print and the data fingerprint.
 
     Attributes:
-        identity: Everything that decides the items (file list, seed, preset, part hashes, …), as
-            plain values that JSON can write.
+        identity: Everything that decides the items, as plain values that JSON can write.
         num_instances: Instances of each object, empty where counting them is not cheap.
-        num_per_epoch: Images it gives to an epoch; all of them unless a mix says otherwise.
+        num_per_epoch: Images it gives to an epoch (default: all).
     """
 
     name: str
@@ -110,10 +109,9 @@ class DescribedSource(Source, Protocol):
 
 
 def silhouette(instance: Instance, shape: Shape) -> Mask:
-    """Return the instance's mask or, where it has none, its projected cuboid's convex hull.
+    """Return the instance's mask or, without one, the hull of its cuboid (empty behind the camera).
 
-    The hull contains the object's true outline, so a background crop that avoids it is free of the
-    object; an instance with a corner behind the camera has no hull and gives an empty map.
+    The hull contains the true outline: a crop that avoids it is free of the object.
     """
     if instance.mask is not None:
         return instance.mask
@@ -128,9 +126,9 @@ def silhouette(instance: Instance, shape: Shape) -> Mask:
 def hull_areas(
     points_px: Float[np.ndarray, "points 2"], shape: tuple[int, ...]
 ) -> tuple[float, float]:
-    """Return the area of the points' convex hull inside an image (height, width), and all of it.
+    """Return the area (px²) of the points' hull inside an image (height, width), and all of it.
 
-    Points behind the camera (NaN) do not count. Areas in square pixels.
+    Points behind the camera (NaN) do not count.
     """
     points = points_px[np.isfinite(points_px).all(axis=1)].astype(np.float32)
     if len(points) < 3:
@@ -146,10 +144,9 @@ def hull_areas(
 def less_visible(
     before: Instance, after: Instance, shapes: tuple[Shape, Shape], scale: float = 1.0
 ) -> Instance:
-    """Return an object as another view of its image shows it, with what of it is left there.
+    """Return an object in another view of its image, its visible fraction reduced by what is lost.
 
-    The visible fraction becomes smaller by the share of the mask's pixels that the view lost or,
-    where there is no mask, of the area of the cuboid's outline.
+    The loss is a share of the mask's pixels or, without a mask, of the cuboid's outline.
 
     Args:
         before: The object on the image.
@@ -178,20 +175,16 @@ class Purpose(IntEnum):
 
 
 def item_rng(seed: int, purpose: Purpose, epoch: int, index: int = 0) -> Generator:
-    """Return the generator of one item (all arguments non-negative), which nobody shares.
-
-    It depends on nothing else, so workers, ranks and resuming a run never change an item.
-    """
+    """Return the generator of one item: workers, ranks and a resumed run never change it."""
     # Last, because a generator ignores trailing zeros: [seed, epoch, index], from which the
     # factory draws its scenes, is [seed, epoch, index, 0].
     return np.random.default_rng([seed, epoch, index, int(purpose)])
 
 
 def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Resize by exact nearest: target pixel j takes the source pixel that holds its centre.
+    """Resize by exact nearest: target pixel j takes source pixel ⌊(j + ½) / s⌋, which holds it.
 
-    The centre of target pixel j lies at (j + ½) / s − ½, inside source pixel ⌊(j + ½) / s⌋; integer
-    arithmetic keeps the rule exact (``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off).
+    Integer arithmetic is exact; ``cv2.INTER_NEAREST`` takes ⌊j / s⌋, half a pixel off.
     """
     rows = (2 * np.arange(height) + 1) * image.shape[0] // (2 * height)
     columns = (2 * np.arange(width) + 1) * image.shape[1] // (2 * width)
@@ -199,11 +192,7 @@ def nearest(image: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 
 def resize_sample(sample: Sample, input_size: Size) -> Sample:
-    """Scale a sample by one factor so that it just fits into ``input_size``, without padding.
-
-    Image, K, keypoints, masks and depth all follow the one rule of
-    :class:`~dopepp.geometry.camera.Letterbox`.
-    """
+    """Scale a sample to just fit into ``input_size``, without padding, by ``Letterbox``'s rule."""
     box = Letterbox.fit(sample.size, input_size)
     if (box.width, box.height) == sample.size:
         return sample
@@ -241,17 +230,13 @@ def pad_sample(sample: Sample, input_size: Size) -> Sample:
 
 
 def crop_sample(sample: Sample, left: int, top: int, size: Size) -> Sample:
-    """Cut (width, height) pixels out of an image, from (left, top) on.
-
-    Of the objects, visible fractions become smaller by what lies outside (:func:`less_visible`).
-    """
+    """Cut (width, height) pixels out of an image; visible fractions shrink (`less_visible`)."""
     width, height = size
 
     def cut(pixels: NDArray[Any]) -> NDArray[Any]:
         return pixels[top : top + height, left : left + width]
 
     def kept(one: Instance) -> Instance:
-        """Return an object as the crop shows it."""
         mask = None if one.mask is None else cut(one.mask)
         moved = replace(one, keypoints=one.keypoints - (left, top), mask=mask)
         return less_visible(one, moved, (sample.image.shape[:2], (height, width)))

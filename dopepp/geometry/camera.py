@@ -113,17 +113,10 @@ def resize_points(points_px: Pixels, scale_x: float, scale_y: float) -> Pixels:
 
 @dataclass(frozen=True)
 class Letterbox:
-    """How an image of one size is brought into a network's input size, and back.
+    """Scaling of an image to fit inside a network's input, which padding then fills.
 
-    The image is scaled by one factor to fit inside the input and then padded on the right and at
-    the bottom; padding leaves K unchanged. The two axis scales differ only by rounding to whole
-    pixels.
-
-    Attributes:
-        width: Width of the resized image before padding, pixels.
-        height: Height of the resized image before padding, pixels.
-        scale_x: ``width`` over the original width.
-        scale_y: ``height`` over the original height.
+    Padding on the right and at the bottom leaves K unchanged. ``width`` and ``height`` (pixels) are
+    those of the resized image; the scales of the two axes differ by the rounding to whole pixels.
     """
 
     width: int
@@ -192,8 +185,8 @@ MOST_VIEW_DEG: Final = 150.0
 """Of a whole picture's longer side."""
 
 WHOLE: Final = 0.2
-"""How far off its middle the principal point of a whole picture may be, share of a side: lenses'
-are within a tenth, and that of a picture half or one and a half times as large is a quarter off."""
+"""How far off the middle a whole picture's principal point may be, share of a side: lenses' are
+within a tenth, and that of a picture half or one and a half times as large is a quarter off."""
 
 INSIDE: Final = 0.5
 """Idem of a picture that may have been cut out of a larger one, as some data sets' are."""
@@ -207,9 +200,10 @@ def check_camera(
 ) -> CameraMatrix:
     """Return K as float64 after checking that it can belong to an image of (width, height).
 
-    A :class:`UserError`: K is not a finite pinhole matrix, its principal point is farther than
-    ``off_centre`` (a share of the side) from the image's middle, or its focal length gives a field
-    of view outside 5° – 150°. What was cut out (``ANYWHERE``) may see less than 5°.
+    Raises:
+        UserError: K is not a finite pinhole matrix, its principal point is farther than
+            ``off_centre`` (a share of the side) from the image's middle, or the field of view is
+            outside 5° – 150°. What was cut out (``ANYWHERE``) may see less than 5°.
     """
     width, height = image_size
     K = pinhole_matrix(K, source)

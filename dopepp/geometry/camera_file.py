@@ -49,10 +49,9 @@ class Camera:
     """A calibrated camera.
 
     Attributes:
-        size: (width, height) of the pictures that K belongs to, pixels; None where nobody says.
-        K: The camera matrix, pixels; (0, 0) is the centre of the top-left pixel.
-        distortion: Coefficients in OpenCV's order (k1, k2, p1, p2, k3, …); () where there is none.
-        source: Where it comes from, for messages.
+        size: (width, height) of the pictures that K belongs to, pixels; None if unknown.
+        distortion: Coefficients in OpenCV's order (k1, k2, p1, p2, k3, …); () without any.
+        source: Origin, for messages.
     """
 
     size: Size | None
@@ -76,18 +75,27 @@ class Camera:
     def for_picture(
         self, size: Size, K_size: Size | None = None, crop: Crop | None = None
     ) -> Camera:
-        """Return the camera of a picture of (width, height), its K checked against that size.
+        """Return the camera of a picture, its K checked against the picture's size.
 
         Args:
-            size: The picture's.
-            K_size: The size that K belongs to, where the picture is the whole one, resized.
-            crop: What of the calibrated picture this one is, where it was cut out of it.
+            size: (width, height) of the picture.
+            K_size: Size that K belongs to, for a picture that was resized.
+            crop: Part of the calibrated picture, for a picture that was cut out.
 
         Raises:
-            UserError: K belongs to another size and it is not said how the picture came about, or
-                what is said cannot be.
+            UserError: K belongs to another size and neither is stated, or what is stated is wrong.
         """
-        own = self._own_size(K_size, crop)
+        if K_size is not None and crop is not None:
+            got, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
+            raise UserError(got, "one of the two", fix)
+        if K_size is not None:
+            stated = f"--K-size {K_size[0]} {K_size[1]}"
+            if min(K_size) < 1:
+                raise UserError(stated, "width and height above 0", "correct it")
+            if self.size is not None and K_size != self.size:
+                allowed = f"the file's own size, {_by(self.size)}"
+                raise UserError(f"{stated} with {self.source}", allowed, "correct it")
+        own = K_size or self.size
         if own is not None:
             check_camera(self.K, own, self.source, WHOLE)
         if crop is not None:
@@ -104,20 +112,6 @@ class Camera:
             K = resize_camera(self.K, size[0] / own[0], size[1] / own[1])
         return replace(self, size=size, K=K)
 
-    def _own_size(self, said: Size | None, crop: Crop | None) -> Size | None:
-        """Return the size that K belongs to, by the file or by what is said."""
-        if said is not None and crop is not None:
-            got, fix = "--K-size with --crop", "crop first, and pass the K of the crop's size"
-            raise UserError(got, "one of the two", fix)
-        if said is not None and min(said) < 1:
-            raise UserError(
-                f"--K-size {said[0]} {said[1]}", "width and height above 0", "correct it"
-            )
-        if said is not None and self.size is not None and said != self.size:
-            got = f"--K-size {said[0]} {said[1]} with {self.source}"
-            raise UserError(got, f"the file's own size, {_by(self.size)}", "correct it")
-        return said or self.size
-
 
 def read_camera(path: Path | str) -> Camera:
     """Read a camera file; see the module for the formats.
@@ -125,9 +119,8 @@ def read_camera(path: Path | str) -> Camera:
     COLMAP, whose pixel (0.5, 0.5) is the centre of the top-left one, is shifted by half a pixel.
 
     Raises:
-        UserError: The file is missing, over 250 kB, in none of the formats, or of several cameras;
-            it has no camera matrix, a lens model that is not OpenCV's pinhole one (fisheye), or a
-            field that cannot be right.
+        UserError: The file is missing, over 250 kB, in none of the formats, of several cameras,
+            without a camera matrix, of a fisheye lens, or has a field that cannot be right.
     """
     return _camera(parse_calibration(_text(Path(path)), str(path)), str(path))
 
@@ -192,21 +185,15 @@ def _cut(K: CameraMatrix, own: Size | None, size: Size, crop: Crop) -> CameraMat
     return crop_camera(K, x, y)
 
 
-def _one_shape(one: Size, other: Size) -> bool:
-    """Tell whether one size is the other resized, but for rounding to whole pixels."""
-    return (
-        min(abs(one[0] - one[1] * other[0] / other[1]), abs(one[1] - one[0] * other[1] / other[0]))
-        <= 1
-    )
+def _one_shape(a: Size, b: Size) -> bool:
+    """Return whether one size is the other resized, but for rounding to whole pixels."""
+    return min(abs(a[0] - a[1] * b[0] / b[1]), abs(a[1] - a[0] * b[1] / b[0])) <= 1
 
 
 def _fix(size: Size, own: Size) -> str:
     """Say what to do where a picture's size is not the one that K belongs to."""
-    cut = (
-        ""
-        if size[0] > own[0] or size[1] > own[1]
-        else (f"--crop X Y {size[0]} {size[1]} if it was cut out")
-    )
+    fits = size[0] <= own[0] and size[1] <= own[1]
+    cut = f"--crop X Y {size[0]} {size[1]} if it was cut out" if fits else ""
     if _one_shape(size, own):
         return f"--K-size {own[0]} {own[1]} if the picture was resized" + (cut and f", {cut}")
     if size == own[::-1]:

@@ -70,12 +70,11 @@ class PnPResult:
     Attributes:
         T_cam_obj: Object-to-camera transform in metres; None when there is no trustworthy pose.
         reprojection_error_px: RMS distance over the inliers, pixels; infinite without a pose.
-        inliers: Which of the given points agree with the pose within
+        inliers: The given points that agree with the pose within
             :data:`~dopepp.geometry.refine.GATE` standard deviations.
         reason: Why there is no pose; empty when there is one.
-        covariance: Of a small turn of the object about its origin (rotation vector in the camera
-            frame, radians) and a small shift (camera frame, metres), from the inliers'
-            covariances; None without a pose.
+        covariance: Of a small turn about the object's origin and a small shift (camera axes,
+            radians, metres), from the inliers' covariances; None without a pose.
     """
 
     T_cam_obj: Transform | None
@@ -99,16 +98,18 @@ def solve_pnp(
         object_points: Points in the object frame, metres.
         image_points: Their pixels; a row with NaN is a missing point.
         K: Camera matrix, pixels; it may have skew.
-        sigma_px: Standard deviation of each pixel position (isotropic), pixels; a point whose
-            deviation is not finite and positive is missing.
-        covariance_px: Covariance of each pixel position, pixels²; where given it replaces
-            ``sigma_px``. A point whose covariance is not finite and positive definite is missing.
-        widenings: Factors on the standard deviations, the least first, tried in turn until two
-            thirds of the points agree on a pose; of those tried, most points agree on the best.
+        sigma_px: Standard deviation of each pixel position (isotropic), pixels.
+        covariance_px: Covariance of each pixel position, pixels², in place of ``sigma_px``. A point
+            whose deviation or covariance is not finite and positive (definite) is missing.
+        widenings: Ascending factors on the standard deviations, tried in turn until two thirds of
+            the points agree on a pose; the pose with the most agreeing points wins.
 
-    Returned is the pose with the smallest robust cost among the refined starts: SQPnP on all
-    points, its mirror image for a plate and, where outliers show, SQPnP on all but one and all but
-    two. A ``ValueError``: the arguments differ in length, or K is no invertible pinhole matrix.
+    Returns:
+        The pose with the smallest robust cost among the refined starts: SQPnP on all points, its
+        mirror image for a plate and, where outliers show, SQPnP on all but one and all but two.
+
+    Raises:
+        ValueError: The arguments differ in length, or K is no invertible pinhole matrix.
     """
     object_points = np.asarray(object_points, np.float64).reshape(-1, 3)
     image_points = np.asarray(image_points, np.float64).reshape(-1, 2)
@@ -138,11 +139,9 @@ def solve_pnp(
 def _prepared(
     object_points: Array, image_points: Array, K: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the rays and whitenings of the points that can be used, and which these are.
-
-    A whitening is W with WᵀW = Σ⁻¹: the inverse of Cholesky's L with Σ = LLᵀ. Any number may come
-    in and squares may overflow: what comes of it is looked at instead.
-    """
+    """Return the usable points' rays and whitenings W (WᵀW = Σ⁻¹), and which points these are."""
+    # Any number may come in and squares may overflow: the results are checked instead. W is the
+    # inverse of Cholesky's L with Σ = LLᵀ.
     n, count = len(object_points), 0
     rays, whitening, usable = np.empty((n, 2)), np.zeros((n, 2, 2)), np.empty(n, np.bool_)
     determinant = K[0, 0] * K[1, 1] - K[0, 1] * K[1, 0]
@@ -230,12 +229,9 @@ def _concluded(
     size: float,
     centre: Array,
 ) -> tuple[Array, float, Array]:
-    """Return pose (metres), RMS error (pixels) and covariance from the points that agree.
-
-    The gate has done its work: among points that agree, least squares is the better estimate. A
-    turn ω about the points' centre is the same turn about the object's origin and a shift by
-    centre × ω.
-    """
+    """Return pose (metres), RMS error (pixels) and covariance from the points that agree."""
+    # Among points that agree, least squares is the better estimate. A turn ω about the points'
+    # centre is the same turn about the object's origin and a shift by centre × ω.
     refine_pose(object_points, rays, whitening, R, t, NO_GATE)
     residuals = np.empty((len(rays), 2))
     reproject(object_points, rays, whitening, R, t, residuals)
@@ -264,10 +260,7 @@ def _concluded(
 
 
 class _Starts:
-    """Closed-form poses of all points, all but one and all but two, each solved when asked for.
-
-    They know no deviations, so that they serve every widening.
-    """
+    """Closed-form poses of all points, all but one and all but two, for every widening."""
 
     def __init__(
         self, object_points: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2"]
@@ -278,10 +271,7 @@ class _Starts:
         self._steps: list[Float[np.ndarray, "s 6"]] = []
 
     def without(self, left_out: int) -> Float[np.ndarray, "s 6"]:
-        """Return SQPnP's poses (rotation vector, translation) of all points but so many.
-
-        They are NaN where it raises or finds none.
-        """
+        """Return SQPnP's poses (rotation vector, translation) of all points but so many, or NaN."""
         while len(self._steps) <= left_out:
             kept = _kept(len(self.rays), len(self._steps))
             steps = np.full((len(kept), 6), np.nan)
@@ -306,10 +296,7 @@ def _kept(count: int, left_out: int) -> list[NDArray[np.intp]]:
 def _best_pose(
     points: Correspondences, starts: _Starts
 ) -> tuple[tuple[RotationMatrix, Vector] | None, Bool[np.ndarray, "n"]]:
-    """Return the refined pose with the smallest truncated cost, and which points agree with it.
-
-    All points are tried together, then all but one, then all but two, until as many agree.
-    """
+    """Return the refined pose with the smallest truncated cost, and which points agree with it."""
     R, t, cost = np.empty((3, 3)), np.empty(3), math.inf
     count = len(points.rays)
     agree = np.zeros(count, bool)
@@ -336,11 +323,9 @@ def _improved(
     best: float,
     agree: Array,
 ) -> float:
-    """Refine the likeliest starts, and replace the best pose where one is better.
+    """Refine the likeliest starts, update the best pose and ``agree``, and return its cost.
 
-    Returned is its truncated cost; ``agree`` tells which points lie within the gate. Besides each
-    start of a plate, its other tilt is refined; a thicker part has none. A pose is dropped that is
-    no rotation, has points behind the camera or is at an unbelievable distance.
+    Besides each start of a plate, its other tilt is refined; a thicker part has none.
     """
     count = len(starts)
     residuals = np.empty((len(rays), 2))

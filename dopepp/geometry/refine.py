@@ -52,10 +52,9 @@ SAME_PIXEL: Final = 1e-3
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Object points, the rays they are seen along, and how well these are known.
+    """Object points, centred and of unit size, the rays (x/z, y/z) that show them, and whitening.
 
-    Points are in the object frame, centred and of unit size; rays are (x/z, y/z) of their pixels;
-    whitening turns a difference of rays into standard deviations of the pixel's position.
+    A whitening turns a difference of rays into standard deviations of the pixel's position.
     """
 
     object_points: Float[np.ndarray, "n 3"]
@@ -183,16 +182,13 @@ def normal_equations(
 
 @compiled()
 def solve_damped(hessian: Array, gradient: Array, damping: float, step: Array) -> None:
-    """Solve (H + damping) step = −gradient by Cholesky's factors.
-
-    Scaled to a unit diagonal, rotations and translations of any size are damped alike.
-    """
+    """Solve (H + damping) step = −gradient by Cholesky, H scaled to a unit diagonal."""
     solve_inside(hessian, gradient, damping, step, np.empty((7, 6)))
 
 
 @compiled()
 def solve_inside(hessian: Array, gradient: Array, damping: float, step: Array, room: Array) -> None:
-    """Do the same within a (7, 6) array, so that a loop need not ask for memory each time."""
+    """Like :func:`solve_damped`, in a (7, 6) workspace, which saves a loop its allocations."""
     L, scale = room[:6], room[6]
     for i in range(6):
         scale[i] = 1.0 / math.sqrt(hessian[i, i] + 1e-12)
@@ -273,11 +269,10 @@ def too_few(num_points: int) -> str:
 def _spreads(
     object_points: Array, rays: Array, to_px: Array, whitening: Array
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Return how far points spread, for :func:`degenerate`.
+    """Return the spreads that :func:`degenerate` judges.
 
-    That is the object's largest extent, metres, and its two largest singular values over that; the
-    number of pixels more than a thousandth apart, and the pixels' two singular values; the median
-    over points of their mean deviation over both directions, (det W)^(−1/2).
+    The object's extent (metres) and its two largest singular values over that; the number of
+    distinct pixels and the pixels' singular values; the median deviation, (det W)^(−1/2).
     """
     n = len(object_points)
     extent = 0.0

@@ -41,17 +41,16 @@ def symmetry_group(
 ) -> Float[np.ndarray, "group 4 4"]:
     """Return all symmetry transforms, the identity first, continuous ones in steps.
 
-    As in BOP, a continuous symmetry is cut into ⌈π / max_step⌉ steps, so that a point at half a
-    diameter from the axis moves by at most ``max_step`` diameters, and every step is combined with
-    every discrete symmetry.
+    As in BOP, every step of a continuous symmetry is combined with every discrete symmetry. Two
+    axes that are not parallel make a ball of the part, whose rotations are 0.2 rad apart.
 
-    Two axes that are not parallel make a ball of the part, which any rotation about their common
-    point maps onto itself. Steps of 0.01 would be ten million; so the steps are at least 0.2 rad,
-    about 10,000 rotations.
+    Args:
+        discrete: BOP-style rigid transforms without the identity, metres.
+        continuous: BOP-style (axis, offset) pairs, metres.
+        max_step: Largest move of a point at half a diameter from the axis, diameters.
 
-    ``discrete`` are BOP-style rigid transforms without the identity, ``continuous`` BOP-style
-    (axis, offset) pairs, metres. A ``ValueError``: ``max_step`` is not positive or an axis has no
-    length.
+    Raises:
+        ValueError: ``max_step`` is not positive or an axis has no length.
     """
     if not max_step > 0:
         raise ValueError(f"max_step must be positive, got {max_step}")
@@ -88,10 +87,7 @@ def _with_centre(
 
 
 def _rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
-    """Return rotations about a step (radians) apart, the identity first.
-
-    Each takes z to one of a spiral of directions, after one of a circle of turns about z.
-    """
+    """Return rotations about a step (radians) apart: z to a spiral of directions, and turns."""
     number = np.arange(math.ceil(4 * math.pi / step**2))
     z = 1 - 2 * number / number[-1]  # the first is z itself
     polar, around = np.arccos(z), np.pi * (3 - math.sqrt(5)) * number
@@ -105,13 +101,11 @@ def _rotations(step: float) -> Float[np.ndarray, "rotations 3 3"]:
 def exact_group(
     rotations: Float[np.ndarray, "generators 3 3"],
 ) -> Float[np.ndarray, "group 3 3"] | None:
-    """Return the finite group that measured rotations generate, closed to rounding.
+    """Return the finite group that measured rotations generate, the identity first, or None.
 
-    Products are added until there is none that is not within 10° of an element. Then each element
-    g is replaced by the mean of ρ(gh)·ρ(h)⁻¹ over all h, made a rotation again, which turns an
+    Products are added until all are within 10° of an element; a group of more than 60 elements is
+    None. Then each element g is replaced by the mean of ρ(gh)·ρ(h)⁻¹ over all h, which turns an
     approximate homomorphism ρ into an exact one (Grove, Karcher, Ruh 1974).
-
-    The group, of which the identity is the first, is None where it has more than 60 elements.
     """
     group = [np.eye(3)]
     generators = [np.asarray(rotation, np.float64) for rotation in rotations]

@@ -1,10 +1,9 @@
 """Parts by the text a user writes: the path of a mesh file, or a built-in part's name.
 
 Built in are the paper's two parts (§2.1): Servoholder, 77×77×7 mm, and PivConnector, 105×52×7 mm.
-The paper gives their sizes only; the shapes are this project's. A 4 mm plate carries raised
-features on its front (+z) and recesses in its back (−z), placed so that no rotation maps a part
-onto itself and any side of it shows how the part is turned. All numbers here are millimetres; the
-parts come out in metres with the origin in the centre of the bounding box.
+Their shapes are this project's: a 4 mm plate with raised features on its front (+z) and recesses in
+its back (−z), so that no rotation maps a part onto itself and any side shows how the part is
+turned. All numbers here are millimetres; parts are in metres about the bounding box's centre.
 
 To add a built-in part, write its solid with the shapes below and a function like ``servoholder``.
 """
@@ -98,11 +97,15 @@ BUILTIN: Final[dict[str, Callable[[], Part]]] = {
 def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
     """Return a built-in part, or the part in a mesh file, named after the file.
 
-    ``unit`` is the file's; None takes the one it has by its format, or millimetres, which the log
-    says. It says what size the part has, too, and warns where that is unlikely. A built-in part has
-    its size without it, so that one unit can go with a list of files and built-in parts. A
-    UserError: there is no such part or file, or the file cannot be used (see
-    :func:`~dopepp.parts.mesh.read.read_mesh`).
+    The log states the part's size, and warns of an unlikely one.
+
+    Args:
+        path_or_name: Mesh file, or name of a built-in part, which needs no unit.
+        unit: Unit of the file (default: of its format, else millimetres, which the log says).
+
+    Raises:
+        UserError: There is no such part or file, or the file cannot be used (see
+            :func:`~dopepp.parts.mesh.read.read_mesh`).
     """
     text = str(path_or_name)
     if text in BUILTIN:

@@ -66,10 +66,10 @@ class Mesh:
     Attributes:
         vertices: Positions in metres, float64.
         faces: Vertex indices of each triangle, counter-clockwise from outside, int32.
-        uv: Texture coordinates per vertex, v upwards as in OBJ; None without a texture.
-        texture: RGB texture image, uint8, first row on top; None for an untextured part.
-        colours: sRGB of each vertex, uint8; None where there are none, or a texture.
-        normals: Normal of each vertex as the file has it, of any length, not checked; None without.
+        uv: Texture coordinates per vertex, v upwards as in OBJ, with a texture.
+        texture: RGB texture image, first row on top.
+        colours: sRGB of each vertex, without a texture.
+        normals: Normal of each vertex as the file has it, of any length, not checked.
     """
 
     vertices: Vertices
@@ -90,12 +90,11 @@ class Part:
         points: ADD points in the object frame, metres.
         mesh: Triangles to render, at most 200,000; out of a checkpoint, its :attr:`light_mesh`;
             None for an object known by its ADD points only.
-        mesh_deviation: How far the mesh is from all triangles, at most, metres; 0 where it has all.
+        mesh_deviation: Largest distance of the mesh from the file's triangles, metres.
         mesh_hash: SHA-256 of the vertices and faces that the part was made from, hex.
-        symmetries_discrete: BOP-style rigid transforms that map the part onto itself, without the
-            identity, shape (S, 4, 4).
+        symmetries_discrete: BOP-style rigid transforms (S, 4, 4) without the identity.
         symmetries_continuous: BOP-style axes of rotational symmetry as (axis, offset) pairs.
-        unit: The unit that its own file was read in; empty for all other parts.
+        unit: Unit that the part's own file was read in; empty for all other parts.
     """
 
     name: str
@@ -111,10 +110,9 @@ class Part:
 
     @cached_property
     def light_mesh(self) -> tuple[Mesh, float] | None:
-        """At most 4,000 triangles, without texture, for a checkpoint to hold.
+        """At most 4,000 untextured triangles for a checkpoint, and their largest deviation, metres.
 
-        With them comes how far any vertex of :attr:`mesh` is from them, at most, metres; lengths
-        are rounded to 0.1 µm. None where there is no mesh, or none with so few triangles.
+        Lengths are rounded to 0.1 µm. None without a mesh, or where so few triangles cannot be.
         """
         if self.mesh is None:
             return None
@@ -157,6 +155,9 @@ class Part:
             UserError: A field is missing, unknown, or not what ``to_record`` writes.
         """
         values = parse(_Record, record, "part", _FIX)
+        if not all(any(axis) for axis, _ in values.symmetries_continuous):
+            got = "part.symmetries_continuous with an axis of length 0"
+            raise UserError(got, "[axis, offset] with an axis other than 0", _FIX)
         mesh, deviation = None, 0.0
         if values.mesh is not None:
             faces = np.array(values.mesh.faces, np.int32)
@@ -174,7 +175,7 @@ class Part:
             mesh_deviation=deviation,
             mesh_hash=values.mesh_hash,
             symmetries_discrete=_checked_transforms(values.symmetries_discrete),
-            symmetries_continuous=_checked_axes(values.symmetries_continuous),
+            symmetries_continuous=tuple(values.symmetries_continuous),
         )
 
 
@@ -238,13 +239,6 @@ def _checked_transforms(
     return transforms
 
 
-def _checked_axes(pairs: Sequence[tuple[_Point, _Point]]) -> tuple[ContinuousSymmetry, ...]:
-    if any(not any(axis) for axis, _ in pairs):
-        got = "part.symmetries_continuous with an axis of length 0"
-        raise UserError(got, "[axis, offset] with an axis other than 0", _FIX)
-    return tuple(pairs)
-
-
 Parts = Sequence[Part]
 
 
@@ -259,10 +253,8 @@ def make_part(
 ) -> Part:
     """Measure a mesh and make the part it describes.
 
-    A mesh of over 200,000 triangles is measured as it is, so that poses, errors and the hash do not
-    depend on it, and then decimated for rendering, which the log says. ``mesh`` is None for an
-    object known by its ADD points only; ``points`` are by default 2,000 fixed-seed samples of the
-    surface; ``unit`` is that of the file, named when the size is unlikely.
+    A mesh of over 200,000 triangles is measured first and then decimated for rendering. ADD points
+    are by default 2,000 fixed-seed samples of the surface; ``unit`` is the file's, for messages.
 
     Raises:
         UserError: The name is empty or too long, the diameter lies outside 5 mm – 5 m, or the mesh
@@ -329,7 +321,5 @@ def check_name(name: object) -> str:
     """Return a name that can label instances: a text of 1 to 200 printable characters."""
     if isinstance(name, str) and 0 < len(name) <= MAX_NAME and name.isprintable():
         return name
-    got = (
-        f"part name {name[:50]!r}" if isinstance(name, str) else f"a part name that is {name!r:.50}"
-    )
-    raise UserError(got, f"1–{MAX_NAME} printable characters", "rename the part or its file")
+    allowed = f"1–{MAX_NAME} printable characters"
+    raise UserError(f"part name {name!r:.50}", allowed, "rename the part or its file")

@@ -51,10 +51,9 @@ def _shares(
 class HybridSource:
     """A mix with exact shares, a pure function of (seed, epoch, index).
 
-    Every epoch holds exactly round(share × samples_per_epoch) items of each source in an order
-    drawn per epoch. Each source is gone through in its own shuffled order from one epoch into the
-    next, so all its items are used equally often; how often it was gone through is the epoch it is
-    asked for.
+    Every epoch holds round(share × samples_per_epoch) items of each source in an order drawn per
+    epoch. A source is gone through in its own shuffled order from one epoch into the next, so that
+    its items are used equally often; the number of the round is the epoch that it is asked for.
 
     Args:
         real: Real camera frames; without them the real share is 0.
@@ -88,7 +87,11 @@ class HybridSource:
         self.name, self._seed, self._length = name, seed, samples_per_epoch
         self._plan = lru_cache(1)(self._make_plan)
         # An epoch may straddle two cycles of a source; older ones are not needed again.
-        self._order = lru_cache(2 * len(_ROLES))(self._make_order)
+        self._order = lru_cache(2 * len(_ROLES))(
+            lambda role, cycle, length: item_rng(seed, Purpose.CYCLE, cycle, role).permutation(
+                length
+            )
+        )
 
     def __len__(self) -> int:
         return self._length
@@ -119,9 +122,6 @@ class HybridSource:
             ranks[roles == role] = np.arange(count)
         return roles, ranks
 
-    def _make_order(self, role: int, cycle: int, length: int) -> Order:
-        return item_rng(self._seed, Purpose.CYCLE, cycle, role).permutation(length)
-
     def contains(self, label: str) -> bool:
         """Tell whether any source that has a share holds this object."""
         return any(
@@ -145,16 +145,13 @@ class HybridSource:
 class WindowedSource:
     """Another source's images, scaled, and of each a window with the centre of an object in it.
 
-    A network that learns on windows of renders sees the same of photographs. The object is drawn
-    anew every epoch, and so is the window, among all that lie in the picture and hold the centre;
-    an image without objects gives a window from anywhere. In a direction in which the picture is
-    smaller than the window, it is padded, as for prediction.
+    A network that learns on windows of renders sees the same of photographs. Object and window are
+    drawn anew every epoch, the window among all in the picture that hold the object's centre, or
+    anywhere without an object. Pictures smaller than the window are padded, as for prediction.
 
     Args:
-        source: Whose images.
-        picture: (width, height) that they are resized to fit, pixels.
+        picture: (width, height) that the source's images are resized to fit, pixels.
         window: (width, height) of the windows, pixels.
-        seed: Of the windows.
     """
 
     def __init__(self, source: DescribedSource, picture: Size, window: Size, seed: int) -> None:

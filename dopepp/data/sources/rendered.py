@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_whole
+from dopepp.core.files import draft, write_whole
 from dopepp.data.sample import DescribedSource, Instance, Sample, SourceInfo, resize_sample
 from dopepp.drawing.pictures import Shape, Size
 from dopepp.virtual.factory import Factory
@@ -38,9 +38,8 @@ class RenderedSource:
     """A range of a factory's images.
 
     Args:
-        split: Which of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
-        scale: How many times as large the parts appear: the camera of the same scenes, moved (see
-            :mod:`dopepp.virtual.factory`).
+        split: One of the three disjoint index ranges; ``val`` and ``test`` ignore the epoch.
+        scale: Enlargement of the parts: the camera of the same scenes, moved.
     """
 
     def __init__(
@@ -89,10 +88,7 @@ class RenderedSource:
 
 
 def rendered_sample(rendered: Rendered, source: str, key: str) -> Sample:
-    """Turn a rendered image into a sample; distractors are no instances.
-
-    A target of which no pixel is visible stays an instance with visible fraction 0.
-    """
+    """Turn a rendered image into a sample of its targets, hidden ones included."""
     scene = rendered.scene
     instances = [
         Instance(
@@ -122,19 +118,13 @@ def _in_memory(dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " ite
 
 def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndarray, " items"]:
     """Map a file that is there, or else a new one of zeros, into memory."""
-    # All of its disk space is taken now: a disk that is full now is an error that can be told, and
-    # one that becomes full under a map with holes kills the process.
+    # All of its disk space is taken now: a disk that becomes full under a map with holes kills the
+    # process.
     size = dtype.itemsize * num_items
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.stat().st_size != size:
-            partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-            try:
-                with partial.open("wb") as file:
-                    os.posix_fallocate(file.fileno(), 0, size)
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
+            with draft(path) as partial, partial.open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
         with path.open("r+b") as file:
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
     except OSError as error:
@@ -148,22 +138,16 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
 class CachedSource:
     """A source that keeps another one's items of epoch 0, resized to the network's input size.
 
-    It is one array with a slot for every item, in memory or in a file. Loader workers are forked
-    and share it: what one of them renders, all can read. A file outlasts the run: later runs, and
-    runs at the same time, read what is in it and fill what is not.
-
-    Whoever asks for an item first renders it and fills its slot: the content, then the content's
-    checksum. A slot counts as filled where its checksum is right, so one that was left half written
-    (a kill, a power cut) is filled again. No lock is needed: an item is a pure function of its
-    index, so two processes that fill one slot at once write the same bytes.
+    It is one array with a slot for every item, in memory, which forked workers share, or in a file,
+    which runs share. Whoever asks for an item first fills its slot: the content, then its checksum.
+    A slot with a wrong checksum, left by a kill, is filled again. No lock is needed: processes that
+    fill one slot at once write the same bytes.
 
     Args:
-        input_size: (width, height) the images are shrunk to fit in, so no more than that is kept;
-            None keeps size and depth, which training does not need.
-        folder: Where to keep them across runs; None keeps them in memory, for this run. Each cache
-            has a subfolder, named by a hash of everything that decides the items.
-        identity: What decides them beside the source's own description, e.g. the version of the
-            code that renders them: items of another version are never read.
+        input_size: (width, height) that the images are shrunk to fit; None keeps size and depth.
+        folder: Folder of the files, each in a subfolder named by a hash of everything that decides
+            its items; None keeps the items in memory.
+        identity: What decides the items beside the source's description, e.g. the code's version.
 
     Raises:
         UserError: The cache would take more than half of the machine's memory, or there is no room
@@ -185,7 +169,14 @@ class CachedSource:
         self.num_bytes = slot.itemsize * len(source)
         self.folder = None
         if folder is None:
-            _check_memory(self.num_bytes, len(source), source.name)
+            available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+            if self.num_bytes > available / 2:
+                raise UserError(
+                    f"data.cache=memory for {len(source)} images of {source.name}: "
+                    f"{self.num_bytes / 1e9:.1f} GB",
+                    f"at most half of this machine's {available / 1e9:.1f} GB",
+                    "set data.cache=none or disk, a smaller input size or fewer samples per epoch",
+                )
             self._slots = _in_memory(slot, len(source))
             self._checksums = _in_memory(np.dtype("u8"), len(source))
         else:
@@ -304,13 +295,3 @@ def _slot(shape: Shape, has_depth: bool) -> np.dtype[Any]:
             *([("depth", "f4", shape)] if has_depth else []),
         ]
     )
-
-
-def _check_memory(num_bytes: int, num_items: int, source: str) -> None:
-    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if num_bytes > available / 2:
-        raise UserError(
-            f"data.cache=memory for {num_items} images of {source}: {num_bytes / 1e9:.1f} GB",
-            f"at most half of this machine's {available / 1e9:.1f} GB",
-            "set data.cache=none or disk, a smaller input size or fewer samples per epoch",
-        )

@@ -1,12 +1,9 @@
 """Random mask local processing (paper Eq. 3, 4): cover a part of the object with background.
 
 A patch is a crop of the image's own background, never a solid colour, at most 0.8 of the object's
-box high and wide; it is smaller where the background has no such window. The network still has to
-place the keypoints that the patch covers: keypoints stay as they are, while masks and visible
-fractions lose the covered pixels.
-
-The shading protocol (:mod:`dopepp.data.transforms.shading`) differs in where patches lie and how
-many there are; what a patch may show, :class:`BackgroundCrops` decides for both.
+box high and wide; it is smaller where the background has no such window. Masks and visible
+fractions lose the covered pixels; keypoints stay, as the network still has to place them.
+:class:`BackgroundCrops` also serves the shading protocol (:mod:`dopepp.data.transforms.shading`).
 """
 
 from __future__ import annotations
@@ -67,11 +64,7 @@ class BackgroundCrops:
         return None
 
     def search(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width) with contrast, however rare they are.
-
-        Where no crop has enough, as on a smooth background under small patches, one that is not of
-        a single colour will do; None when there is none of these, either.
-        """
+        """Return a crop of (height, width) with contrast, however rare, or else of two colours."""
         free = self._is_free(size)
         if not free.any():
             return None
@@ -87,10 +80,7 @@ class BackgroundCrops:
         return None
 
     def largest(self, size: Size, rng: Generator) -> Picture | None:
-        """Return a crop of (height, width), of half that where there is none, and so on.
-
-        None where the background has no contrast at all, or no room for two pixels by two.
-        """
+        """Return a crop of (height, width), or of half that, and so on; None without any."""
         height, width = size
         while True:
             crop = self.draw((height, width), rng)
@@ -136,21 +126,16 @@ def covered_instances(
     instances: Sequence[Instance], silhouettes: Sequence[Mask], covered: Mask
 ) -> list[Instance]:
     """Return an image's instances without its covered pixels; keypoints and poses stay."""
-    pairs = zip(instances, silhouettes, strict=True)
-    return [_covered(instance, seen, covered) for instance, seen in pairs]
-
-
-def _covered(instance: Instance, seen: Mask, covered: Mask) -> Instance:
-    before = int(np.count_nonzero(seen))
-    if before == 0:
-        return instance
-    share = int(np.count_nonzero(seen & covered)) / before
-    return replace(
-        instance,
-        mask=None if instance.mask is None else instance.mask & ~covered,
-        visible_fraction=instance.visible_fraction * (1 - share),
-        masked_fraction=share,
-    )
+    changed = []
+    for instance, seen in zip(instances, silhouettes, strict=True):
+        num_seen = int(np.count_nonzero(seen))
+        if num_seen:
+            share = int(np.count_nonzero(seen & covered)) / num_seen
+            mask = None if instance.mask is None else instance.mask & ~covered
+            visible = instance.visible_fraction * (1 - share)
+            instance = replace(instance, mask=mask, visible_fraction=visible, masked_fraction=share)
+        changed.append(instance)
+    return changed
 
 
 class RandomMask:
@@ -159,10 +144,8 @@ class RandomMask:
     Args:
         max_height: Largest patch height as a share of the object's box height (paper: 0.8).
         max_width: Largest patch width as a share of the object's box width (paper: 0.8).
-        min_contrast: A crop counts as solid when no colour channel's standard deviation reaches
-            this many grey levels.
-        max_draws: Crops drawn from each picture until one is not solid; an instance for which even
-            the other picture gives none stays uncovered, with ``masked_fraction`` 0.
+        min_contrast: Grey levels of standard deviation that a crop needs in a colour channel.
+        max_draws: Crops drawn from each picture; without any, the instance stays uncovered.
     """
 
     def __init__(
@@ -182,11 +165,7 @@ class RandomMask:
         self.min_contrast, self.max_draws = min_contrast, max_draws
 
     def __call__(self, sample: Sample, rng: Generator, other: Backgrounds) -> Sample:
-        """Return a masked copy of the sample; the argument is not changed.
-
-        The image must be unpadded, so that padding is never taken as background; ``other`` gives
-        another picture when the image has no fitting background left.
-        """
+        """Return a masked copy of an unpadded sample; ``other`` replaces a missing background."""
         silhouettes = [
             silhouette(instance, sample.image.shape[:2]) for instance in sample.instances
         ]

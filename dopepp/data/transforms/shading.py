@@ -41,10 +41,9 @@ class Shaded:
     """An image with shaded objects.
 
     Attributes:
-        sample: The image; masks, visible fractions and masked fractions say what is left, depth is
-            unknown where a patch lies.
-        reached: The share of each instance's visible pixels that is covered; None of an instance
-            without a mask or without a visible pixel, which cannot be shaded.
+        sample: The image; depth is unknown where a patch lies.
+        reached: Covered share of each instance's visible pixels; None without a visible pixel or
+            a mask.
     """
 
     share: float
@@ -83,7 +82,6 @@ def _can_be_shaded(instance: Instance) -> bool:
 def _shaded(
     sample: Sample, silhouettes: Sequence[Mask], covers: Sequence[_Cover], share: float
 ) -> Shaded:
-    """Lay every instance's patches, so far as the share goes."""
     image, covered = sample.image.copy(), np.zeros(sample.image.shape[:2], bool)
     for cover in covers:
         laid = cover.laid(share)
@@ -102,10 +100,9 @@ def _shaded(
 
 
 class _Cover:
-    """Patches over one instance and the order in which they cover its box, pixel by pixel.
+    """Patches over one instance until ``share`` of its visible pixels is covered.
 
-    ``order`` is :data:`_NEVER` where none of them lies. They are drawn until they cover ``share``
-    of the visible pixels, and never cover those that are ``spared``.
+    ``order`` numbers the pixels of its box as they are covered; ``spared`` ones never are.
     """
 
     def __init__(
@@ -137,10 +134,7 @@ class _Cover:
         return round(share * self._num_seen)
 
     def _draw_crop(self, crops: BackgroundCrops, rng: Generator) -> Picture | None:
-        """Draw a crop of random size, of half that size where the background has none, and so on.
-
-        None where the box is too small for any, or the background is a single colour.
-        """
+        """Draw a crop of random size, smaller where the background has none, or None."""
         extent = self._seen.shape
         if min(extent) < MIN_PATCH_PX:
             return None

@@ -43,10 +43,7 @@ triangle along an edge."""
 
 
 class RawMesh(NamedTuple):
-    """What a format's reader returns: a file's triangles, in the unit that it states, if any.
-
-    Colours (sRGB) and normals are per vertex, as far as the file has them.
-    """
+    """Triangles of a file, in the unit that it states, if any; see ``parts.part.Mesh``."""
 
     vertices: Vertices
     faces: Faces
@@ -66,10 +63,7 @@ def face_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " faces"]:
 def sample_surface(
     vertices: Vertices, faces: Faces, num_points: int = NUM_SURFACE_POINTS, seed: int = SURFACE_SEED
 ) -> Points:
-    """Draw points uniformly over the surface: by area, and the same ones for the same seed.
-
-    A ValueError, if the triangles have no area.
-    """
+    """Draw points uniformly over the surface; triangles without area are a ValueError."""
     rng = np.random.default_rng(seed)
     cumulative = np.cumsum(face_areas(vertices, faces))
     if not cumulative[-1] > 0:
@@ -93,10 +87,10 @@ def _points_inside(
 def largest_distance(points: Points) -> float:
     """Return the largest distance between two points.
 
-    The two farthest points are vertices of the convex hull. Flat and straight sets have no hull in
-    space, so it is taken in the subspace that the points span. The distance is exact for hulls of
-    up to 5,000 corners; for the more that a rounded shape has, it may be 0.09 % too small.
+    It is exact for convex hulls of up to 5,000 corners, else up to 0.09 % too small.
     """
+    # The two farthest points are corners of the convex hull, which flat and straight sets have only
+    # in the subspace that they span.
     offsets = points - points.mean(axis=0)
     _, spread, axes = np.linalg.svd(offsets, full_matrices=False)
     # Leaving out a thickness of 1e-6 of the length changes the distance by 1e-12 of it.
@@ -184,9 +178,8 @@ def weld(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "welded 3"
 class SurfaceTree:
     """A triangle mesh that answers how far points are from it.
 
-    A point is measured against the triangles of its nearest surface points, so that its distance
-    is never too small, and too large by no more than the surface points are apart. A ValueError, if
-    the triangles have no area.
+    A distance is taken to the triangles of the nearest surface points: it is never too small, and
+    too large by no more than the surface points are apart. Triangles without area: ValueError.
     """
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
@@ -207,10 +200,7 @@ class SurfaceTree:
         self._owners = np.concatenate([self._owners, own, own, own, own])
 
     def spread(self, num_points: int, seed: int) -> tuple[Points, Int[np.ndarray, " points"]]:
-        """Spread points over the surface, more evenly than at random, and name their triangles.
-
-        The places along the summed area are equally spaced, those within the triangle random.
-        """
+        """Spread points evenly along the summed area; return them and their triangles."""
         rng = np.random.default_rng(seed)
         cumulative = np.cumsum(self.areas)
         places = (np.arange(num_points) + rng.random()) / num_points * cumulative[-1]

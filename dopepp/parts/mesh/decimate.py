@@ -35,12 +35,13 @@ def decimate(
     Float[np.ndarray, "fewer width"] | None,
     float,
 ]:
-    """Replace triangles by at most ``max_faces`` larger ones; return the farthest move, too.
+    """Replace triangles, which all have an area, by at most ``max_faces`` larger ones.
 
-    All ``faces`` have an area; ``values`` are the vertices' texture coordinates or colours.
-    Vertices that share a position and a cell but no edge, such as those on both sides of a seam,
-    keep values of their own. A ValueError: no grid leaves a
-    triangle, because all of them are tiny and apart.
+    ``values`` are texture coordinates or colours; vertices on both sides of a seam keep values of
+    their own. The last of the returned values is the farthest move of a vertex.
+
+    Raises:
+        ValueError: No grid leaves a triangle, because all of them are tiny and apart.
     """
     cells, kept = _cluster(vertices, faces, max_faces)
     placed = _place(vertices, faces, cells)

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.drawing.pictures import Picture, whole_picture
+from dopepp.drawing.pictures import whole_picture
 from dopepp.geometry.camera import Transform
 from dopepp.parts.mesh import RawMesh, Vertices, weld
 
@@ -57,8 +57,8 @@ _TRIANGLES: Final = 4
 def read_stl(path: Path) -> RawMesh:
     """Read a binary or text STL file, with the corners that its triangles share merged.
 
-    A ValueError: it is cut short or longer than the number of its triangles says, or a coordinate
-    is not finite.
+    Raises:
+        ValueError: It is not as long as the number of its triangles says, or not finite.
     """
     data = path.read_bytes()
     num_triangles = int.from_bytes(data[_STL_HEADER - 4 : _STL_HEADER], "little")
@@ -87,10 +87,12 @@ def read_stl(path: Path) -> RawMesh:
 
 
 def read_3mf(path: Path) -> RawMesh:
-    """Read what a 3MF file's build shows, in the unit that it states; a UserError for an odd one.
+    """Read what a 3MF file's build shows, in the unit that it states.
 
-    A ValueError: the file is no whole archive, unpacks to too much, declares a document type, shows
-    objects of other files, or ones that are not above their users.
+    Raises:
+        UserError: The unit is none of :data:`UNITS_3MF`.
+        ValueError: The file is no whole archive, unpacks to too much, declares a document type,
+            shows objects of other files, or ones that are not above their users.
     """
     size = path.stat().st_size
     _check_size(size)
@@ -150,8 +152,9 @@ def _check_size(num_bytes: int, most: int = MAX_UNPACKED_BYTES) -> None:
 def read_glb(path: Path) -> RawMesh:
     """Read what a GLB file's scene shows, in metres, with its one texture.
 
-    A UserError: it needs other files, or its faces have several textures. Other ValueErrors: it is
-    cut short, damaged or too large, or has what is not read.
+    Raises:
+        UserError: It needs other files, or its faces have several textures.
+        ValueError: It is cut short, damaged or too large, or has what is not read.
     """
     header, binary = _chunks(path.read_bytes())
     files = [entry for kind in ("buffers", "images") for entry in header.get(kind, ())]
@@ -172,7 +175,15 @@ def read_glb(path: Path) -> RawMesh:
             "bake them into one texture, or remove them",
         )
     picture = next(iter(pictures), None)
-    texture = None if picture is None else _texture(header, binary, picture)
+    texture = None
+    if picture is not None:
+        view = header["bufferViews"][header["images"][picture]["bufferView"]]
+        start = view.get("byteOffset", 0)
+        try:
+            image = whole_picture(binary[start : start + view["byteLength"]])
+        except ValueError as error:
+            raise ValueError(f"a texture that cannot be read: {error}") from error
+        texture = np.asarray(image.convert("RGB"))
     # trimesh would open pictures of any kind; for texture coordinates it needs but a material.
     header |= {"images": [], "materials": [{} for _ in header.get("materials", ())]}
     mesh, _ = read_scene(_packed(header, binary), "glb")
@@ -243,22 +254,15 @@ def _picture(header: dict[str, Any], primitive: dict[str, Any]) -> int | None:
     return int(header["textures"][info["index"]]["source"])
 
 
-def _texture(header: dict[str, Any], binary: bytes, picture: int) -> Picture:
-    view = header["bufferViews"][header["images"][picture]["bufferView"]]
-    start = view.get("byteOffset", 0)
-    try:
-        image = whole_picture(binary[start : start + view["byteLength"]])
-    except ValueError as error:
-        raise ValueError(f"a texture that cannot be read: {error}") from error
-    return np.asarray(image.convert("RGB"))
-
-
 def read_scene(data: bytes, kind: str) -> tuple[RawMesh, int]:
     """Let trimesh read a file's content; without a path it can reach no other file.
 
-    The meshes that it shows come as one, with the unit as it names it; then comes their number. A
-    ValueError: a face has a vertex that its mesh has not, or there are too many triangles. Any
-    other exception is what trimesh makes of a damaged file.
+    Returns:
+        The meshes as one, with the unit as trimesh names it, and their number.
+
+    Raises:
+        ValueError: A face has a vertex that its mesh has not, or there are too many triangles.
+        Exception: Whatever trimesh makes of a damaged file.
     """
     import trimesh  # takes a while: only for those who read such a file
 

@@ -52,16 +52,19 @@ READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     """Read an STL, OBJ, PLY, GLB, 3MF or OFF file, as its suffix says, in metres.
 
-    ``unit`` is the file's: mm, cm, m or inch. None takes the one that a 3MF file states, metres for
-    GLB, and millimetres for all others, which the log says. Duplicate STL vertices are merged, flat
-    triangles dropped, triangles turned to face as their neighbours do. There are uv and texture
-    where an OBJ or PLY names a texture in its own folder or a GLB has one, colours and normals
-    where a PLY has them. Edges may be open, and triangles may intersect each other.
+    Duplicate STL vertices are merged, flat triangles dropped, triangles turned to face as their
+    neighbours do. Edges may be open, and triangles may intersect each other. OBJ, PLY and GLB files
+    may have a texture, PLY files colours and normals.
+
+    Args:
+        path: Mesh file; a texture must lie in its folder.
+        unit: mm, cm, m or inch (default: as a 3MF file states, metres for GLB, and millimetres for
+            all others, which the log says).
 
     Raises:
         UserError: The file is missing, too large, of another format or damaged; the unit is
-            unknown; there is no face with an area; a coordinate is not finite; a texture is
-            missing, damaged or outside of the mesh's folder.
+            unknown; no face has an area; a coordinate is not finite; a texture is missing, damaged
+            or outside of the mesh's folder.
     """
     return read_in_unit(path, unit)[0]
 
@@ -75,14 +78,15 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
     if reader is None:
         suffixes = ", ".join(READERS)
         raise UserError(f"mesh {path}", f"files ending in {suffixes}", "export one of these")
-    if not _is_file(path):
+    try:
+        is_file = path.is_file()
+    except OSError:  # a name that is too long, for one
+        is_file = False
+    if not is_file:
         raise UserError(f"mesh {path}, no such file", "a mesh file", "check the path")
-    if path.stat().st_size > MAX_BYTES:
-        raise _damaged(
-            path,
-            f"{path.stat().st_size / 1e6:.0f} MB",
-            "reduce its triangles, or write it as a binary file",
-        )
+    if (size := path.stat().st_size) > MAX_BYTES:
+        fix = "reduce its triangles, or write it as a binary file"
+        raise _damaged(path, f"{size / 1e6:.0f} MB", fix)
     try:
         raw = reader(path)
     except UserError:
@@ -103,30 +107,22 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
 def ycb_part(root: str | Path, name: str) -> Part:
     """Make a part from a YCB-Video folder: ``models/NAME/points.xyz`` and ``textured.obj``.
 
-    The ADD points are all of ``points.xyz``. Without a ``textured.obj`` the part has no mesh, and
-    its points give cuboid and diameter. Both files are in metres. A UserError: the folder has no
-    models, no model of that name, or one of its files is damaged.
+    Both files are in metres. Without a ``textured.obj`` the part has no mesh, and its ADD points
+    give cuboid and diameter.
+
+    Raises:
+        UserError: The folder has no models, none of that name, or a damaged file.
     """
     models = Path(root) / "models"
     names = sorted(path.parent.name for path in models.glob("*/points.xyz"))
     if not names:
-        raise UserError(
-            f"{root}, which has no models/NAME/points.xyz",
-            "the root folder of YCB-Video",
-            "check data.root, or unpack YCB_Video_Models into its models folder",
-        )
+        got, allowed = f"{root}, which has no models/NAME/points.xyz", "the root of YCB-Video"
+        raise UserError(got, allowed, "check data.root, or unpack YCB_Video_Models into models")
     if name not in names:
         raise UserError(f"unknown object {name!r}", ", ".join(names), f"choose one of {models}")
     points_path, mesh_path = models / name / "points.xyz", models / name / "textured.obj"
     mesh = read_mesh(mesh_path, unit="m") if mesh_path.exists() else None
     return make_part(name, mesh, _read_points(points_path), unit="m")
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long, for one
-        return False
 
 
 def _read_points(path: Path) -> Points:
@@ -145,7 +141,7 @@ def _read_points(path: Path) -> Points:
 
 
 def _checked(path: Path, raw: RawMesh) -> Mesh:
-    """Refuse what is no mesh, and drop flat triangles and vertices that no triangle uses."""
+    """Refuse what is no mesh, drop flat triangles and unused vertices, and orient the triangles."""
     vertices, faces, uv, texture, *_ = raw
     if not len(vertices) or not len(faces):
         raise _damaged(path, f"{len(vertices)} vertices and {len(faces)} faces")
@@ -163,19 +159,7 @@ def _checked(path: Path, raw: RawMesh) -> Mesh:
     if not proper.all():
         logger.info("%s: dropped %d triangles without area", path, (~proper).sum())
     used, index = np.unique(faces[proper], return_inverse=True)
-    vertices = vertices[used]
-    return Mesh(
-        vertices=vertices,
-        faces=_outward(path, vertices, index.reshape(-1, 3)).astype(np.int32),
-        uv=None if uv is None else np.asarray(uv, np.float64)[used],
-        texture=texture,
-        colours=None if raw.colours is None else raw.colours[used],
-        normals=None if raw.normals is None else raw.normals[used],
-    )
-
-
-def _outward(path: Path, vertices: Vertices, faces: Faces) -> Faces:
-    """Make neighbouring triangles face the same way, and say what is unusual about their edges."""
+    vertices, faces = vertices[used], index.reshape(-1, 3)
     topology = find_topology(vertices, faces)
     if not topology.is_closed:
         logger.info(
@@ -185,7 +169,14 @@ def _outward(path: Path, vertices: Vertices, faces: Faces) -> Faces:
     turned = opposed_faces(vertices, faces, topology)
     if turned.any():
         logger.info("%s: turned over %d triangles that faced the wrong way", path, turned.sum())
-    return turn_over(faces, turned)
+    return Mesh(
+        vertices=vertices,
+        faces=turn_over(faces, turned).astype(np.int32),
+        uv=None if uv is None else np.asarray(uv, np.float64)[used],
+        texture=texture,
+        colours=None if raw.colours is None else raw.colours[used],
+        normals=None if raw.normals is None else raw.normals[used],
+    )
 
 
 def _damaged(path: Path, got: str, fix: str = "export the mesh again") -> UserError:
@@ -199,10 +190,10 @@ class Topology:
     """The edges of triangles, where corners at one position are one.
 
     Attributes:
-        num_open: Edges of one triangle: the rim of a hole.
+        num_open: Number of edges of one triangle: the rim of a hole.
+        num_crowded: Number of edges of more than two triangles.
         neighbours: The two triangles at every other edge.
-        opposed: Whether these two run along the edge in the same direction, so that one of them
-            shows its inside where the other one shows its outside.
+        opposed: Whether one of these two shows its inside where the other shows its outside.
     """
 
     num_open: int
@@ -240,10 +231,9 @@ def opposed_faces(
 ) -> Bool[np.ndarray, " faces"]:
     """Find triangles to turn over so that all of a connected surface face the same way.
 
-    In every connected surface those that face one way are kept and the others turned, whichever
-    have less area. A surface with one side only, such as a Möbius strip, is left as it is. Where
-    the surface is closed and faces inwards as a whole, everything is turned; so is then a single
-    body that faces inwards, unless the box of another one holds it, as it does for a cavity.
+    Of a connected surface, the triangles with less area are turned. A Möbius strip is left as it
+    is. A closed surface that faces inwards is turned as a whole, and so is then every body that
+    faces inwards, except a cavity, which lies in another body's box.
     """
     turned = np.zeros(len(faces), bool)
     if topology.opposed.any():
