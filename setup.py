@@ -9,6 +9,7 @@ setup(
     package_data={
         "dopepp": [
             "py.typed",
+            "experiment/results/templates/*",
             "pretrained/*",
             "robot/grasping/data/*",
             "robot/nodes/share/*",

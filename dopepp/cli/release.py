@@ -19,7 +19,7 @@ def release(
     out: Annotated[Path, typer.Option(help="folder of both files")] = Path(),
 ) -> None:
     """Write a checkpoint as NAME.safetensors, small and without local paths, and a model card."""
-    from dopepp.experiment.results.release import release as write
+    from dopepp.experiment.results.pages import release as write
 
     with report_errors():
         for path in write(checkpoint, results, name, out):

@@ -84,6 +84,14 @@ def write_csv(
     write_whole(path, text.getvalue().encode())
 
 
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV by heading, as far as it goes; none where there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", errors="replace") as stream:
+        return list(csv.DictReader(stream))
+
+
 def write_whole(path: Path | str, content: bytes) -> None:
     """Write a file beside its place and rename it, so that a crash leaves no half of one."""
     path = Path(path)

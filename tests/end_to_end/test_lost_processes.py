@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 from dopepp.models.checkpoint import load_network
 
 _PR_SET_CHILD_SUBREAPER = 36

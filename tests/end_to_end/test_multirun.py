@@ -16,7 +16,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb.proto import wandb_internal_pb2
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 
 BLOCK = 32768
 """Bytes of a block of LevelDB's log format, which the files have behind seven bytes of their own;

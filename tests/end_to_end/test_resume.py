@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 from dopepp.experiment.run.resume import read_overrides
 from dopepp.training.checkpointing.files import newest_checkpoint
 from dopepp.training.system import PoseSystem

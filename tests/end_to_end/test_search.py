@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 
 SPACE = "optimizer.lr=tag(log, interval(1e-6, 1e-2))"
 SEARCH = (

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 from dopepp.training.system import PoseSystem
 
 

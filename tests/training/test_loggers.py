@@ -4,7 +4,7 @@ from collections.abc import Callable
 import pytest
 from lightning.pytorch.loggers import Logger
 
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 from dopepp.training.loggers import GuardedLogger, MetricsTable
 
 

@@ -205,7 +205,7 @@ class RunConfig(MeasurementConfig):
         cost: Of ``job=cost``.
         lr_finder: Of ``job=lr_finder``.
         table: Of a multirun, how its table is laid out
-            (:class:`~dopepp.experiment.results.paper_table.PaperTable`).
+            (:class:`~dopepp.experiment.results.paper.PaperTable`).
         search: Of a multirun, what a search varies (:mod:`dopepp.experiment.sweep.search`).
         recipe: Name of the loss, optimiser and schedule that were chosen together.
         seed: Of initial weights, order and training images.

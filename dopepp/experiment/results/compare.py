@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_csv, write_png, write_whole
+from dopepp.core.files import read_csv, write_csv, write_png
 from dopepp.data.sample import Sample
 from dopepp.drawing.curves import (
     PlotLine,
@@ -32,7 +32,7 @@ from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.sources import held_out_source
 from dopepp.experiment.config.data import chosen_data, trained_on
 from dopepp.experiment.results import display
-from dopepp.experiment.results.differences import figures, full, headline, notes
+from dopepp.experiment.results.differences import compared, full, headline, notes
 from dopepp.experiment.results.entries import (
     BASELINE,
     Entry,
@@ -42,9 +42,10 @@ from dopepp.experiment.results.entries import (
     ordered,
     with_refined,
 )
-from dopepp.experiment.results.paper_table import PaperTable, write_paper_table
+from dopepp.experiment.results.frame import Row, header_of, markdown
+from dopepp.experiment.results.pages import write_page
+from dopepp.experiment.results.paper import PaperTable, write_paper_table
 from dopepp.experiment.results.report import Report
-from dopepp.experiment.results.tables import Row, markdown_text, read_csv
 from dopepp.inference.estimator import PoseEstimator
 
 TABLE_FILE: Final = "compare.csv"
@@ -74,9 +75,9 @@ def compare_reports(reports: Sequence[Report], folder: Path, baseline: str) -> N
     write_comparison(ordered(entries, baseline), folder)
 
 
-def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
-    """Print and write table and AUC curves; returns the text of ``compare.md``."""
-    table = figures(entries)
+def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
+    """Print and write table and AUC curves; return the content of ``compare.md``."""
+    table = compared(entries)
     means = [report.mean for entry in entries for report in entry.reports]
     symmetric = any(row.num_symmetries > 1 for row in means)
     compact, said = headline(table, symmetric), notes(entries, table)
@@ -87,15 +88,16 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> str:
     )
     for note in said:
         display.console.print(note)
-    write_csv(folder / TABLE_FILE, full(table))
-    text = "\n".join([markdown_text(compact), *(f"- {note}" for note in said)]) + "\n"
-    write_whole(folder / TEXT_FILE, text.encode())
+    rows = full(table)
+    write_csv(folder / TABLE_FILE, rows, header_of(rows))
+    page = {"table": markdown(compact), "notes": said, "picture": "", "missing": "", "origins": ""}
+    write_page(folder / TEXT_FILE, "compare", **page)
     curves = accuracy_curves(entries)
     if curves:
         save_accuracy_curves(
             (folder / CURVES_FILE).with_suffix(""), curves, title="ADD, all objects"
         )
-    return text
+    return page
 
 
 def accuracy_curves(entries: Sequence[Entry]) -> dict[str, np.ndarray]:
@@ -152,7 +154,7 @@ def compare_runs(
         raise UserError(f"baseline {baseline!r}", ", ".join(names), "choose one of them")
     networks = ordered(entries, baseline or BASELINE)
     entries = with_refined(networks)
-    text = write_comparison(entries, folder)
+    page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
     shown = num_pictures if any(entry.reports for entry in networks) else 0
     tiles, note = picture_tiles(networks, shown) if shown else ([], "")
@@ -164,12 +166,11 @@ def compare_runs(
                   contact_sheet(tiles, len(networks), width // columns - _GAP_PX)]  # fmt: skip
     if panels:
         write_png(folder / PANELS_FILE, grid(panels, 1 if tiles else 2))
-        text += f"\n![training, accuracy and pictures]({PANELS_FILE})\n"
+        page["picture"] = PANELS_FILE
     if note:
         display.console.print(note)
-        text += f"\n{note}\n"
-    text += f"\n{markdown_text(_origins(networks))}"
-    write_whole(folder / TEXT_FILE, text.encode())
+    page |= {"missing": note, "origins": markdown(_origins(networks))}
+    write_page(folder / TEXT_FILE, "compare", **page)
     return entries
 
 

@@ -10,10 +10,10 @@ To add one, describe it as a :class:`Condition` and write a function that measur
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
-from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -26,9 +26,27 @@ from dopepp.data.sample import Sample, Source
 from dopepp.data.transforms.shading import TOLERANCE, Shaded, shade
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.drawing.sheet import Tile, contact_sheet
-from dopepp.experiment.results import display, tables
-from dopepp.experiment.results.evaluators import FileMethod, Method, image_id
-from dopepp.experiment.results.report import Measured, Report, accumulators, measure
+from dopepp.experiment.results import display
+from dopepp.experiment.results.frame import (
+    PassRate,
+    Row,
+    Value,
+    heading,
+    markdown,
+    pivot,
+    rate_curves,
+    row_values,
+    shown_rows,
+)
+from dopepp.experiment.results.measurement import (
+    FileMethod,
+    Measured,
+    Method,
+    accumulators,
+    image_id,
+    measure,
+)
+from dopepp.experiment.results.report import Report
 from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
 from dopepp.metrics.row import PoseRow
 
@@ -39,6 +57,8 @@ MAX_EXAMPLES: Final = 4
 
 _FIELDS: Final = ("auc_10cm", "median_rotation_deg", "miss_rate")
 """Measures that stand beside the pass rates."""
+
+_LABELS: Final = ("method", "object")
 
 _MARGIN: Final = 0.3
 """Around shaded objects on the sheet, as a share of their extent."""
@@ -69,11 +89,6 @@ class Condition:
     images: str
     per_unit: float = 1.0
     ratio: bool = False
-
-    @property
-    def table_file(self) -> str:
-        """Name of the CSV file."""
-        return f"{self.name}.csv"
 
     def heading(self, level: float) -> str:
         """Return what stands above a level's column."""
@@ -127,7 +142,7 @@ class Level:
 
     value: float
     rows: Mapping[str, Mapping[str, PoseRow]]
-    facts: Mapping[str, float | None] = field(default_factory=dict)
+    facts: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
 
 
@@ -136,7 +151,7 @@ def record_condition(
     condition: Condition,
     levels: Sequence[Level],
     tiles: Sequence[Tile],
-    rates: Sequence[tables.PassRate],
+    rates: Sequence[PassRate],
 ) -> None:
     """Print the table and write ``NAME.csv``, ``.md``, ``.png`` and ``NAME_examples.png``.
 
@@ -145,65 +160,57 @@ def record_condition(
     rows = [row for rows in levels[0].rows.values() for row in rows.values()]
     extra = ["median_rotation_s_deg"] if any(row.num_symmetries > 1 for row in rows) else []
     fields = [*(rate.field for rate in rates), *_FIELDS, *extra]
-    table = list(_figures(levels, fields, rates))
+    values = list(_values(levels, fields, rates))
 
-    def cells(one: tables.Figure) -> tables.Row:
-        return {**one.names, condition.heading(one.condition): one.text}
+    def cells(value: Value) -> Row:
+        return {**value.names, condition.heading(value.condition): value.text}
 
-    shown, sections = [], []
-    for name in fields:
-        rows_of_it = tables.pivot(
-            tables.select(table, measure=name), attrgetter("method", "object"), cells
-        )
-        shown += [{"measure": tables.heading(name), **row} for row in rows_of_it]
-        sections.append(f"## {tables.heading(name)}\n\n{tables.markdown_text(rows_of_it)}")
+    def recorded(value: Value) -> dict[str, object]:
+        return {**value.names, condition.level: value.condition, value.measure: value.plain}
+
+    tables = {
+        heading(field): pivot([v for v in values if v.measure == field], _LABELS, cells)
+        for field in fields
+    }
+    shown = [{"measure": title, **row} for title, table in tables.items() for row in table]
     display.show_table(f"{condition.name}: {condition.axis}", shown, num_labels=3)
     notes = [level.note for level in levels if level.note]
     for line in notes:
         _log.warning("%s", line)
-    records = tables.pivot(
-        table,
-        attrgetter("method", "object", "condition"),
-        lambda one: {**one.names, condition.level: one.condition, one.measure: one.value},
-    )
-    write_csv(run_dir / condition.table_file, records)
+    path = run_dir / f"{condition.name}.md"
+    write_csv(path.with_suffix(".csv"), pivot(values, (*_LABELS, "condition"), recorded))
+    sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
-    write_whole(run_dir / f"{condition.name}.md", text.encode())
-    _draw(run_dir / f"{condition.name}.png", condition, table, rates)
+    write_whole(path, text.encode())
+    _draw(path.with_suffix(".png"), condition, values, rates)
     if tiles:
         sheet = contact_sheet(tiles, columns=len(levels))
         write_png(run_dir / f"{condition.name}_examples.png", sheet)
 
 
-def _figures(
-    levels: Sequence[Level], fields: Sequence[str], rates: Sequence[tables.PassRate]
-) -> Iterator[tables.Figure]:
+def _values(
+    levels: Sequence[Level], fields: Sequence[str], rates: Sequence[PassRate]
+) -> Iterator[Value]:
     """Return what was measured, by method, object and level."""
     rated = [rate.field for rate in rates]
     for method, rows in levels[0].rows.items():
-        for name in tables.shown_rows(rows):
+        for name in shown_rows(rows):
             for level in levels:
+                for fact, number in level.facts.items():
+                    yield Value(method, name, fact, number, condition=level.value)
                 row = level.rows[method][name]
-                for fact, known in level.facts.items():
-                    yield tables.Figure(method, name, fact, known, level.value)
-                for column in ("num_instances", *fields):
-                    num = row.num_instances if column in rated else 0
-                    value = getattr(row, column)
-                    yield tables.Figure(method, name, column, value, level.value, num_instances=num)
+                yield from row_values(row, ["num_instances", *fields], rated, level.value)
 
 
 def _draw(
-    path: Path,
-    condition: Condition,
-    table: Sequence[tables.Figure],
-    rates: Sequence[tables.PassRate],
+    path: Path, condition: Condition, values: Sequence[Value], rates: Sequence[PassRate]
 ) -> None:
     """Draw a panel per object and rate, in each every method that was measured on it."""
     panels = {}
-    for name in dict.fromkeys(one.object for one in table if one.object != MEAN):
+    for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
         for rate in rates:
-            measured = tables.select(table, object=name, measure=rate.field)
-            curves = tables.rate_curves(measured, condition.per_unit)
+            own = [one for one in values if one.object == name and one.measure == rate.field]
+            curves = rate_curves(own, condition.per_unit)
             shown = {method: curve for method, curve in curves.items() if len(curve.x)}
             panels[f"{name}: {rate.title}"] = shown
     figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
@@ -268,7 +275,7 @@ def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[
     outside = [one for one in reached if not abs(one - share) <= TOLERANCE]
     known = [one for one in reached if np.isfinite(one)]
     facts = {
-        "share_reached": float(np.mean(known)) if known else None,
+        "share_reached": float(np.mean(known)) if known else math.nan,
         "num_outside_tolerance": len(outside),
     }
     note = (
@@ -333,12 +340,11 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
     """Sum up, and say where the instances are not those of the test set or less is in sight."""
     rows = {report.name: report.rows for report in measured.reports}
     visible, usual = _visible_fractions(measured), _visible_fractions(unmoved)
-    mean = float(visible.mean()) if len(visible) else None
-    others = len(visible) != len(usual)
+    mean = float(visible.mean()) if len(visible) else math.nan
     note = (
         f"Instances that count at {SCALE.heading(scale)}: {_in_words(visible)}; "
         f"at {SCALE.heading(1)}: {_in_words(usual)}."
-        if others or (mean is not None and abs(mean - usual.mean()) > _NOTABLE)
+        if len(visible) != len(usual) or abs(mean - usual.mean()) > _NOTABLE
         else ""
     )
     return Level(scale, rows, {"visible_fraction": mean}, note)

@@ -11,19 +11,20 @@ a trained network would answer: the true maps of the picture's objects, with noi
 from __future__ import annotations
 
 import platform
+import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import nn
 
-from dopepp.core.files import write_csv, write_png
+from dopepp.core.files import read_csv, write_csv, write_png
 from dopepp.data.batch import collate
 from dopepp.data.sample import Sample, pad_sample, resize_sample
 from dopepp.drawing.curves import PlotLine, figure_image, lines_figure
@@ -34,13 +35,13 @@ from dopepp.experiment.assembly.system import build_untrained, map_geometry
 from dopepp.experiment.config.run import RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import VERSIONS_FILE, environment, write_config, write_json
-from dopepp.experiment.results.readme import write_job_readme
-from dopepp.experiment.results.tables import read_csv
+from dopepp.experiment.results.pages import write_job_readme
+from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
 from dopepp.inference.picture import letterboxed
 from dopepp.maps.encode import MapGeometry
-from dopepp.models.network import network_cost
+from dopepp.models.network import build_network, network_cost
 from dopepp.training.targets import draw_maps
 
 COST_FILE: Final = "cost.json"
@@ -263,6 +264,27 @@ def save_frame_rates(path: Path, frames: Mapping[str, FrameTimes]) -> None:
         lines.append(PlotLine(f"{name}, picture to poses", at, whole, colour, False))
         lines.append(PlotLine(f"{name}, network alone", at, alone, colour, True))
     write_png(path, figure_image(lines_figure(lines, "time (s)", "frames a second")))
+
+
+def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
+    """Measure the untrained network of a spec at width 1: what narrowing has saved.
+
+    The input is (width, height), pixels (the paper's is 416×416). Of three timed forward passes
+    after one that is not, the median counts.
+    """
+    widened = {
+        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
+        for key, node in spec.items()
+    }
+    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
+    times = []
+    with torch.inference_mode():
+        for _ in range(4):
+            start = time.perf_counter()
+            network.maps(images)
+            times.append(1000 * (time.perf_counter() - start))
+    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))
 
 
 @torch.inference_mode()

@@ -14,8 +14,8 @@ from rich.text import Text
 from rich.tree import Tree
 
 from dopepp.data.sample import SourceInfo
+from dopepp.experiment.results.frame import header_of
 from dopepp.experiment.results.report import Report
-from dopepp.experiment.results.tables import header_of
 from dopepp.metrics.row import shown_columns
 
 # Tables are wider than a pipe's default of 80 columns; a terminal keeps its own width. No markup:

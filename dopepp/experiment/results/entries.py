@@ -17,7 +17,6 @@ import numpy as np
 from dopepp.core.errors import UserError
 from dopepp.core.yaml import read_yaml
 from dopepp.experiment.results.cost import COST_FILE
-from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.folder import (
     BEST_CHECKPOINT,
     CONFIG_FILE,
@@ -27,8 +26,8 @@ from dopepp.experiment.results.folder import (
     PRUNED_FILE,
     read_json,
 )
-from dopepp.experiment.results.report import Report
-from dopepp.experiment.results.tables import shown_rows
+from dopepp.experiment.results.frame import shown_rows
+from dopepp.experiment.results.report import Cost, Report
 
 BASELINE: Final = "dope"
 """A method of this name stands first, and every other one's Δ is against it."""

@@ -1,201 +1,323 @@
-"""Measuring methods on a test set, and writing down what came out."""
+"""Measuring methods on a test set: one loop, one accumulator, for every kind of comparison.
+
+A method is an estimator that is run, or poses that a file brings. To measure something else, write
+a class with the methods of :class:`Method`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import re
+import statistics
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Final, Protocol
 
 import numpy as np
+import torch
+from jaxtyping import Float
 
-from dopepp.core.files import write_png
-from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
-from dopepp.data.sample import Source
-from dopepp.drawing.curves import save_accuracy_curves
-from dopepp.drawing.sheet import contact_sheet
-from dopepp.experiment.assembly.renders import scaled_test_renders
-from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.core.errors import UserError
+from dopepp.data.formats.bop.models import parts_by_id, read_models
+from dopepp.data.formats.bop.results import PoseResult, read_results
+from dopepp.data.formats.ycb_video import read_classes
+from dopepp.data.sample import Sample
+from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
+from dopepp.drawing.pictures import DepthMap, Size
+from dopepp.drawing.sheet import Tile
 from dopepp.experiment.config.data import DataConfig
-from dopepp.experiment.config.protocols import Protocols
-from dopepp.experiment.results import conditions, display, evaluators
-from dopepp.experiment.results.compare import compare_reports
-from dopepp.experiment.results.folder import METRICS_FILE, write_json
-from dopepp.experiment.results.protocols import record_breakdown
-from dopepp.experiment.results.report import Measured, Report, measure
-from dopepp.experiment.results.tables import reported_rates
+from dopepp.experiment.results.report import Cost, Fingerprint, Report
+from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.inference.estimator import PoseEstimator
-from dopepp.inference.refinement.refiner import Refine
-from dopepp.parts.part import Parts
-from dopepp.recovery.recover import summary
+from dopepp.inference.runtimes.runtime import ExportedNetwork
+from dopepp.metrics.localisation import BopScores, Localisation
+from dopepp.metrics.pose import PoseMetrics, PredictedPose
+from dopepp.models.network import build_network, network_cost
+from dopepp.parts.part import Part, Parts
+from dopepp.recovery.recover import Reason, furthest
+from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
+from dopepp.virtual.scene import SceneObject
+from dopepp.virtual.surface import Surface, make_surface
+
+_log = logging.getLogger(__name__)
+
+ImageId = tuple[int, int]
+"""BOP's scene_id and im_id."""
+
+_WARM_UP_FRAMES: Final = 3
+"""The first frames allocate memory and choose kernels; they are not timed."""
+
+_BOP_KEY: Final = re.compile(r"(\d{1,9})[/_](\d{1,9})", re.ASCII)
+_NUMBERED_SOURCES: Final = ("bop", "webdataset", "ycb_video")
 
 
-def measure_and_record(
-    estimators: Mapping[str, PoseEstimator],
-    parts: Parts,
-    data: DataConfig,
-    run_dir: Path,
-    num_pictures: int,
-    details: Mapping[str, Any] | None = None,
-    *,
-    results: Mapping[str, Path] | None = None,
-    bop_csv: bool = False,
-    all_measures: bool = False,
-    protocols: Protocols | None = None,
-    refine: Refine | None = None,
-) -> list[Report]:
-    """Measure methods on a test set; show and write tables, curves and pictures.
+class Posed(PredictedPose, Protocol):
+    """What a measurement reads of a detection."""
 
-    Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
-    challenge CSVs of other methods. The parts are those that are scored, as the test data have
-    them; ``details`` are further plain facts for ``metrics.json``. ``bop_csv`` writes the poses of
-    each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
-    every estimator is measured without and with it; ``metrics.json`` is the last estimator's, with
-    its refined poses' under ``refined``, and a file's where there is no estimator.
+    @property
+    def keypoints(self) -> Float[np.ndarray, "9 2"]:
+        """The cuboid projected with it, pixels."""
 
-    Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
+
+@dataclass(frozen=True)
+class MeasuredPose:
+    """A pose on an image of the test set, and what the whole image took; None where unknown."""
+
+    image: ImageId
+    pose: Posed
+    seconds: float | None
+
+
+class Method(Protocol):
+    """Something that gives poses for the images of a test set.
+
+    Attributes:
+        parts: The objects it is scored on, as the test set has them.
     """
-    protocols = protocols or Protocols()
-    source = held_out_source(data, parts, "test")
-    numbers = evaluators.object_numbers(data, parts)
-    files = {
-        name: evaluators.FileMethod(path, parts, numbers) for name, path in (results or {}).items()
-    }
-    methods: dict[str, evaluators.Method] = {
-        **{
-            name: evaluators.EstimatorMethod(one, parts)
-            for name, one in with_refined(estimators, refine, parts).items()
-        },
-        **files,
-    }
-    # What cannot be measured in the end is refused before anything is.
-    if protocols.shading:
-        conditions.SHADING.check_methods(methods)
-        conditions.check_masks(source)
-    if protocols.scales:
-        conditions.SCALE.check_methods(methods)
-    scaled = {one: scaled_test_renders(data, parts, one) for one in protocols.scales}
-    samples = (source.sample(index, 0) for index in range(len(source)))
-    is_bop = data.root is not None and data.format in ("bop", "webdataset")
-    measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
-    for file in files.values():
-        file.check_used()
-    for report in measured.reports:
-        display.show_report(report, all_measures)
-        if report.name in measured.bop:
-            display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
-    _show_silence(methods, measured.silent, source)
-    # What is compared later is the network's own result, unrefined; a file's where no network is.
-    own = of_networks(measured.reports, len(files))
-    refines = refine is not None and bool(estimators)
-    main = own[-2 if refines else -1]
-    main.details.update(details or {})
-    if refines:
-        main.refined = own[-1]
-        share = main.details["made_worse"] = made_worse(main, main.refined)
-        display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
-    write_json(run_dir / METRICS_FILE, main.to_record())
-    if bop_csv:
-        _write_results(run_dir, measured.poses, data, numbers)
-    _draw(run_dir, measured, len(source))
-    if len(measured.reports) > 1:
-        compare_reports(measured.reports, run_dir, baseline=measured.reports[0].name)
-    rates = reported_rates(data, parts)
-    for quantity in protocols.by:
-        record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
-    if protocols.shading:
-        shaded = conditions.measure_shading(
-            methods, source, protocols.shading, data.eval_seed, measured.reports, num_pictures
+
+    parts: Parts
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Return the poses on an image and the seconds they took, None where unknown."""
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Return what it costs, given the known times of all images, in order."""
+
+
+class EstimatorMethod:
+    """An estimator, run on every image at its own size; scored on the objects that it knows."""
+
+    def __init__(self, estimator: PoseEstimator, parts: Parts) -> None:
+        known = {part.name for part in estimator.parts}
+        self.estimator = estimator
+        self.parts: Parts = [part for part in parts if part.name in known]
+        self._names = {part.name for part in self.parts}
+
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Run it; what it finds of objects that are not measured is left out."""
+        start = time.perf_counter()
+        detections = self.estimator.predict(
+            sample.image, sample.K, depth=sample.depth, cropped=True
         )
-        conditions.record_condition(run_dir, conditions.SHADING, *shaded, rates)
-    if scaled:
-        levels = conditions.measure_scales(methods, scaled, measured, num_pictures)
-        conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
-    display.show_files(run_dir)
-    return measured.reports
+        seconds = time.perf_counter() - start
+        return [one for one in detections if one.object in self._names], seconds
+
+    def silence(self, sample: Sample) -> Reason | None:
+        """Return why it finds nothing on an image: how its best candidate ended, if one did."""
+        found = furthest(self.estimator.explain(sample.image, sample.K, sample.depth, cropped=True))
+        return next((one for one in reversed(found) if one.object in self._names), None)
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Count parameters and operations, and take the median of the timed frames."""
+        checkpoint, network = self.estimator.checkpoint, self.estimator.network
+        if isinstance(network, ExportedNetwork):  # without the network's own modules
+            parameters, gmacs = network.export.parameters, network.export.gmacs
+        else:
+            with torch.device("meta"):  # as it was trained, where the estimator's is folded
+                trained = build_network(checkpoint.spec)
+            parameters, gmacs = network_cost(trained, checkpoint.input_size)
+        return Cost(parameters, gmacs, _median_ms(seconds[_WARM_UP_FRAMES:] or seconds))
 
 
-def of_networks(reports: list[Report], num_files: int) -> list[Report]:
-    """Return the estimators' reports of a measurement; the files' where there is no estimator."""
-    return reports[: len(reports) - num_files] or reports
+@dataclass(frozen=True)
+class FilePose:
+    """A pose that a file brings; see :class:`Posed`."""
+
+    object: str
+    score: float
+    T_cam_obj: Transform
+    keypoints: Float[np.ndarray, "9 2"]
+    covariance: None = None
 
 
-def with_refined(
-    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
-) -> dict[str, PoseEstimator]:
-    """Return every estimator, and behind it the same one refining: two rows in every table."""
-    pairs: dict[str, PoseEstimator] = {}
-    for name, one in estimators.items():
-        pairs[name] = one
-        if refine is not None:
-            terms = " + ".join([refine] if isinstance(refine, str) else refine)
-            pairs[f"{name} + {terms}"] = refining(one, refine, parts)
-    return pairs
+class FileMethod:
+    """Another program's poses, out of a BOP challenge CSV; a :class:`UserError` if that is wrong.
 
-
-def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
-    """Return an estimator that refines, or for None the same one.
-
-    A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.
+    ``numbers`` are those of the data set's objects, by name; poses of objects that are not measured
+    are left out.
     """
-    if refine is None:
-        return estimator
-    known = {part.name: part for part in parts}
-    own = [part if part.mesh is not None else known.get(part.name, part)
-           for part in estimator.parts]  # fmt: skip
-    return estimator.refining(refine, own)
 
+    def __init__(self, path: Path, parts: Parts, numbers: Mapping[str, int]) -> None:
+        self._path = path
+        self.parts: Parts = list(parts)
+        self._parts = {numbers[part.name]: part for part in parts}
+        self._unused: dict[ImageId, list[PoseResult]] = {}
+        self._used: dict[ImageId, list[PoseResult]] = {}
+        for one in read_results(path, numbers.values()):
+            self._unused.setdefault((one.scene_id, one.im_id), []).append(one)
 
-def made_worse(network: Report, refined: Report) -> float:
-    """Return the share of instances whose ADD refinement has made larger by more than 1 mm."""
-    pairs = [(network.errors[name], errors) for name, errors in refined.errors.items()]
-    worse = np.concatenate([after > before + 0.001 for before, after in pairs])
-    return float(worse.mean()) if len(worse) else 0.0
-
-
-def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
-    """Draw the accuracy curves of every method and object, and the first images' poses."""
-    reports = measured.reports
-    curves = {
-        f"{report.name} {name}" if len(reports) > 1 else name: errors
-        for report in reports
-        for name, errors in report.errors.items()
-    }
-    save_accuracy_curves(run_dir / "auc", curves, title=f"{num_images} test images")
-    if measured.tiles:
-        write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
-
-
-def _show_silence(
-    methods: Mapping[str, evaluators.Method], silent: Mapping[str, Sequence[int]], source: Source
-) -> None:
-    """Print of every estimator on how many images it found nothing, and why."""
-    for name, numbers in silent.items():
-        method = methods[name]
-        if numbers and isinstance(method, evaluators.EstimatorMethod):
-            reasons = [method.silence(source.sample(number, 0)) for number in numbers]
-            line = summary([one for one in reasons if one is not None], len(source))
-            display.console.print(f"{name}: {line}")
-
-
-def _write_results(
-    run_dir: Path,
-    poses: Mapping[str, Sequence[evaluators.MeasuredPose]],
-    data: DataConfig,
-    numbers: Mapping[str, int],
-) -> None:
-    """Write every method's poses as a BOP challenge CSV."""
-    dataset, split = data.name, "test"
-    if data.root is not None and not data.is_rendered("test"):
-        dataset, split = data.root.resolve().name, data.image_set("test")
-    for method, found in poses.items():
-        rows = [
-            PoseResult(
-                *one.image,
-                numbers[one.pose.object],
-                one.pose.score,
-                one.pose.T_cam_obj,
-                UNKNOWN_TIME if one.seconds is None else one.seconds,
-            )
-            for one in found
+    def detect(self, sample: Sample, image: ImageId) -> tuple[Sequence[Posed], float | None]:
+        """Look the image up; of several times that its lines state, the largest counts."""
+        rows = self._used.setdefault(image, self._unused.pop(image, []))
+        poses = [
+            FilePose(part.name, one.score, T, project_keypoints(part.cuboid, T, sample.K))
+            for one, T in ((one, one.T_cam_obj) for one in rows)
+            if (part := self._parts.get(one.obj_id)) is not None
         ]
-        write_results(run_dir / results_name(method, dataset, split), rows)
+        seconds = max((one.seconds for one in rows), default=-1.0)
+        return poses, seconds if seconds >= 0 else None
+
+    def cost(self, seconds: Sequence[float]) -> Cost:
+        """Return the median of the stated times."""
+        return Cost(ms_per_frame=_median_ms(seconds))
+
+    def check_used(self) -> None:
+        """Say, after all images, how many poses had no place in the measurement.
+
+        A :class:`UserError`: none of them was on one of the images.
+        """
+        used = [one for rows in self._used.values() for one in rows]
+        unused = [one for rows in self._unused.values() for one in rows]
+        if unused and not used:
+            raise UserError(
+                f"{self._path}, whose {len(unused):,} poses are all on other images, the first "
+                f"in scene {unused[0].scene_id}, image {unused[0].im_id}",
+                f"images of the test set, e.g. scene and image {next(iter(self._used), 'none')}",
+                "choose the images that the file was made for, e.g. with data.image_sets.test",
+            )
+        others = sum(one.obj_id not in self._parts for one in used)
+        if unused or others:
+            _log.warning(
+                "%s: left out %s poses on images that are not in the test set and %s of objects "
+                "that are not measured", self._path, f"{len(unused):,}", f"{others:,}",
+            )  # fmt: skip
+
+
+def object_numbers(data: DataConfig, parts: Parts) -> dict[str, int]:
+    """Return BOP's number of each object, by name.
+
+    In a BOP data set they are those of ``models_info.json``, all of them; in YCB-Video the lines of
+    ``classes.txt``, which BOP's YCB-V has kept. Elsewhere parts are counted from 1.
+    """
+    root = data.root
+    if root is not None and data.format in ("bop", "webdataset"):
+        known = {info.name: number for number, info in read_models(root).items()}
+        return known or {part.name: number for number, part in parts_by_id(root, parts).items()}
+    if root is not None and data.format == "ycb_video":
+        return {name: number for number, name in enumerate(read_classes(root), 1)}
+    return {part.name: number for number, part in enumerate(parts, 1)}
+
+
+def image_id(sample: Sample, index: int) -> ImageId:
+    """Return an image's BOP numbers.
+
+    They are those in the key of a BOP data set or of YCB-Video, like ``000001/000017``, whose
+    numbers BOP's YCB-V has kept; elsewhere scene 0 and the image's place in the test set.
+    """
+    match = _BOP_KEY.fullmatch(sample.key)
+    if match is None or sample.source.partition("/")[0] not in _NUMBERED_SOURCES:
+        return 0, index
+    return int(match[1]), int(match[2])
+
+
+def _median_ms(seconds: Sequence[float]) -> float | None:
+    return 1000 * statistics.median(seconds) if seconds else None
+
+
+@dataclass
+class Measured:
+    """What came out of measuring methods: a report each, and pictures of the first images.
+
+    ``poses`` is every pose of each method, ``metrics`` the accumulator of each; ``silent`` are the
+    numbers of the images with instances on which each found nothing, ``bop`` BOP's scores of each
+    where they were asked for and there are targets.
+    """
+
+    reports: list[Report]
+    tiles: list[Tile]
+    poses: dict[str, list[MeasuredPose]]
+    metrics: dict[str, PoseMetrics]
+    silent: dict[str, list[int]]
+    bop: dict[str, BopScores] = field(default_factory=dict)
+
+
+def measure(
+    methods: Mapping[str, Method],
+    samples: Iterable[Sample],
+    num_pictures: int = 12,
+    *,
+    bop: bool = False,
+) -> Measured:
+    """Run methods, the baseline first where there is one, over the same images at native size.
+
+    ``bop`` asks for BOP's scores as well.
+
+    Returns a report per method, and pictures with the truth in green, the last method's predictions
+    in yellow and those of the methods before it in blue (paper Fig. 14).
+    """
+    metrics = accumulators(methods)
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    poses_of: dict[str, list[MeasuredPose]] = {name: [] for name in methods}
+    measured = Measured([], [], poses_of, metrics, {name: [] for name in methods})
+    draw = DepthDrawer().draw
+    localised = {name: Localisation(one.parts, draw) for name, one in methods.items() if bop}
+    num_images = 0
+    parts = {part.name: part for method in methods.values() for part in method.parts}
+    seen = Fingerprint(list(parts.values()))
+    for index, sample in enumerate(samples):
+        num_images += 1
+        seen.add(sample)
+        image = image_id(sample, index)
+        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
+        for number, (name, method) in enumerate(methods.items()):
+            poses, taken = method.detect(sample, image)
+            seconds[name] += [] if taken is None else [taken]
+            metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
+            if bop:
+                localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
+            if sample.instances and not poses:
+                measured.silent[name].append(index)
+            measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
+            colour = BLUE if number < len(methods) - 1 else YELLOW
+            wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
+        if len(measured.tiles) < num_pictures:
+            measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
+    scores = {name: one.scores() for name, one in localised.items()}
+    measured.bop = {name: one for name, one in scores.items() if one is not None}
+    measured.reports = [
+        Report(
+            name,
+            metrics[name].compute(),
+            metrics[name].references(),
+            {part.name: metrics[name].errors(part.name) for part in method.parts},
+            method.cost(seconds[name]),
+            num_images,
+            rotation_deg={
+                part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
+            },
+            diameters={part.name: float(part.diameter) for part in method.parts},
+            test_set=seen.word(),
+            details={"bop": measured.bop[name].to_record()} if name in measured.bop else {},
+        )
+        for name, method in methods.items()
+    ]
+    return measured
+
+
+class DepthDrawer:
+    """Draws the depth of parts alone; each part's mesh is prepared once."""
+
+    def __init__(self) -> None:
+        self._surfaces: dict[str, Surface] = {}
+
+    def draw(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
+        """Return metres along z at pixel centres, 0 beside the part."""
+        assert part.mesh is not None
+        if part.name not in self._surfaces:
+            self._surfaces[part.name] = make_surface(part.mesh)
+        item = SceneObject(self._surfaces[part.name], T_cam_obj, part=part)
+        inverse, _ = draw_alone(item, project_object(item, K).hom, (0, 0, *size))
+        depth = np.zeros_like(inverse)
+        np.divide(1, inverse, out=depth, where=inverse > 0)
+        return depth
+
+
+def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
+    """Return what scores each method's poses on its parts."""
+    # One process measures alone: after a distributed training the others have ended.
+    return {
+        name: PoseMetrics(method.parts, name, sync_on_compute=False)
+        for name, method in methods.items()
+    }

@@ -1,66 +1,75 @@
-"""Measuring methods on a test set: one loop, one accumulator, for every kind of comparison."""
+"""One method's result on one test set, as ``metrics.json`` holds it.
+
+Results on other images cannot be compared, so a report holds a fingerprint of its test images.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import statistics
-import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from dopepp.data.sample import Sample
-from dopepp.drawing.overlay import BLUE, GREEN, YELLOW, Wireframe, overlay
-from dopepp.drawing.pictures import DepthMap, Size
-from dopepp.drawing.sheet import Tile
-from dopepp.experiment.results.evaluators import Cost, MeasuredPose, Method, image_id
-from dopepp.experiment.results.tables import shown_rows
-from dopepp.geometry.camera import CameraMatrix, Transform
-from dopepp.metrics.localisation import BopScores, Localisation
-from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION, PoseMetrics
+from dopepp.experiment.results.frame import shown_rows
+from dopepp.metrics.pose import MEAN, MIN_VISIBLE_FRACTION
 from dopepp.metrics.row import PoseRow, mean_row
-from dopepp.models.network import build_network, network_cost
-from dopepp.parts.part import Part, Parts
-from dopepp.virtual.renderers.raster.visibility import draw_alone, project_object
-from dopepp.virtual.scene import SceneObject
-from dopepp.virtual.surface import Surface, make_surface
-
-FULL_SIZE_COST: Final = "full_size_cost"
-"""Key of the details that holds what a narrowed network costs at full width and size."""
-
-BOP: Final = "bop"
-"""Key of the details that holds BOP's scores."""
+from dopepp.parts.part import Parts
 
 _DECIMALS: Final = 6
 """Of pixels and metres: machines differ in the last digits of what they compute."""
 
-_REFINED: Final = "refined"
-"""Key of a record that holds that of the same poses refined."""
+FULL_SIZE_COST: Final = "full_size_cost"
+"""Key of the details that holds what a narrowed network costs at full width and size."""
+
+Errors = dict[str, Float[np.ndarray, "instances"]]
+"""An error of every instance, by object; infinite where it was missed."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a method costs; None where nobody knows.
+
+    That is trained numbers, multiply-accumulates of one image of the input size (10⁹), and the
+    median time from image to poses, of an estimator in this run.
+    """
+
+    parameters: int | None = None
+    gmacs: float | None = None
+    ms_per_frame: float | None = None
 
 
 @dataclass
 class Report:
-    """One method's result on one test set, whose fingerprint is empty where that is not known.
+    """One method's result on one test set.
 
-    ``rows`` are of every object, then their mean, ``references`` the same by reference. By object,
-    ``errors`` are the ADD, metres, and ``rotation_deg`` the rotation error of every instance,
-    infinite where missed; ``diameters`` are metres. ``details`` are further plain facts,
-    ``refined`` is the result of the same poses refined, where they were.
+    Attributes:
+        name: Name of the method.
+        rows: Rows of every object, then their mean.
+        references: The same of each reference.
+        errors: ADD of every instance by object, metres.
+        cost: Cost of the method.
+        num_images: Images of the test set.
+        details: Further plain facts.
+        rotation_deg: Rotation error of every instance by object.
+        diameters: Diameters of the objects, metres.
+        test_set: Fingerprint of the test set; empty where it is not known.
+        refined: Result of the same poses refined; None where they were not.
     """
 
     name: str
     rows: dict[str, PoseRow]
     references: dict[str, dict[str, PoseRow]]
-    errors: dict[str, Float[np.ndarray, "instances"]]
+    errors: Errors
     cost: Cost
     num_images: int
     details: dict[str, Any] = field(default_factory=dict)
-    rotation_deg: dict[str, Float[np.ndarray, "instances"]] = field(default_factory=dict)
+    rotation_deg: Errors = field(default_factory=dict)
     diameters: dict[str, float] = field(default_factory=dict)
     test_set: str = ""
     refined: Report | None = None
@@ -83,40 +92,38 @@ class Report:
         return {
             "name": self.name,
             "num_images": self.num_images,
-            "objects": {name: row.to_record() for name, row in self.rows.items()},
+            "objects": {name: asdict(row) for name, row in self.rows.items()},
             "references": {
-                reference: {name: row.to_record() for name, row in rows.items()}
+                reference: {name: asdict(row) for name, row in rows.items()}
                 for reference, rows in self.references.items()
             },
             "add": _listed(self.errors),
             "rotation_deg": _listed(self.rotation_deg),
             "diameters": self.diameters,
             "test_set": self.test_set,
-            "cost": vars(self.cost),
-            **({} if self.refined is None else {_REFINED: self.refined.to_record()}),
+            "cost": asdict(self.cost),
+            **({} if self.refined is None else {"refined": self.refined.to_record()}),
             **self.details,
         }
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Report:
-        """Read ``metrics.json`` back; files of earlier versions lack the optional fields."""
+        """Read ``metrics.json`` back."""
+        refined = record.get("refined")
         report = cls(
             name=record["name"],
-            rows={name: PoseRow(**row) for name, row in record["objects"].items()},
-            references={
-                reference: {name: PoseRow(**row) for name, row in rows.items()}
-                for reference, rows in record["references"].items()
-            },
+            rows=_rows(record["objects"]),
+            references={name: _rows(rows) for name, rows in record["references"].items()},
             errors=_unlisted(record["add"]),
             cost=Cost(**record["cost"]),
             num_images=record["num_images"],
-            rotation_deg=_unlisted(record.get("rotation_deg", {})),
-            diameters=dict(record.get("diameters", {})),
-            test_set=record.get("test_set", ""),
-            refined=cls.from_record(record[_REFINED]) if _REFINED in record else None,
+            rotation_deg=_unlisted(record["rotation_deg"]),
+            diameters=dict(record["diameters"]),
+            test_set=record["test_set"],
+            refined=None if refined is None else cls.from_record(refined),
         )
-        known = report.to_record()
-        report.details = {key: value for key, value in record.items() if key not in known}
+        fields = report.to_record()
+        report.details = {key: value for key, value in record.items() if key not in fields}
         return report
 
     @classmethod
@@ -124,7 +131,7 @@ class Report:
         """Return the results of networks that differ in nothing but their parts as one method's."""
         reports = sorted(reports, key=lambda report: list(report.rows))
         first = reports[0]
-        known = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
+        times = [time for report in reports if (time := report.cost.ms_per_frame) is not None]
         refined = [report.refined for report in reports if report.refined is not None]
         return replace(
             first,
@@ -134,13 +141,17 @@ class Report:
                 for reference in first.references
             },
             errors={name: e for report in reports for name, e in report.errors.items()},
-            cost=replace(first.cost, ms_per_frame=statistics.mean(known) if known else None),
+            cost=replace(first.cost, ms_per_frame=statistics.mean(times) if times else None),
             num_images=sum(report.num_images for report in reports),
-            rotation_deg={name: e for one in reports for name, e in one.rotation_deg.items()},
+            rotation_deg={n: e for report in reports for n, e in report.rotation_deg.items()},
             diameters={name: d for report in reports for name, d in report.diameters.items()},
             test_set=" ".join(report.test_set for report in reports),
             refined=cls.joined(refined) if len(refined) == len(reports) else None,
         )
+
+
+def _rows(record: Mapping[str, Mapping[str, Any]]) -> dict[str, PoseRow]:
+    return {name: PoseRow(**row) for name, row in record.items()}
 
 
 def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
@@ -149,7 +160,7 @@ def _joined_rows(groups: Sequence[Mapping[str, PoseRow]]) -> dict[str, PoseRow]:
     return {**rows, MEAN: mean_row(list(rows.values()), groups[0][MEAN].method)}
 
 
-def _listed(errors: Mapping[str, Float[np.ndarray, "instances"]]) -> dict[str, list[float | None]]:
+def _listed(errors: Errors) -> dict[str, list[float | None]]:
     """Return errors as JSON has them, null where missed."""
     return {
         name: [float(error) if np.isfinite(error) else None for error in values]
@@ -157,94 +168,12 @@ def _listed(errors: Mapping[str, Float[np.ndarray, "instances"]]) -> dict[str, l
     }
 
 
-def _unlisted(
-    record: Mapping[str, Sequence[float | None]],
-) -> dict[str, Float[np.ndarray, "instances"]]:
+def _unlisted(record: Mapping[str, Sequence[float | None]]) -> Errors:
     """Undo :func:`_listed`."""
     return {
         name: np.array([np.inf if error is None else error for error in values], np.float64)
         for name, values in record.items()
     }
-
-
-@dataclass
-class Measured:
-    """What came out of measuring methods: a report each, and pictures of the first images.
-
-    ``poses`` is every pose of each method, ``metrics`` the accumulator of each; ``silent`` are the
-    numbers of the images with instances on which each found nothing, ``bop`` BOP's scores of each
-    where they were asked for and there are targets.
-    """
-
-    reports: list[Report]
-    tiles: list[Tile]
-    poses: dict[str, list[MeasuredPose]]
-    metrics: dict[str, PoseMetrics]
-    silent: dict[str, list[int]]
-    bop: dict[str, BopScores] = field(default_factory=dict)
-
-
-def measure(
-    methods: Mapping[str, Method],
-    samples: Iterable[Sample],
-    num_pictures: int = 12,
-    *,
-    bop: bool = False,
-) -> Measured:
-    """Run methods, the baseline first where there is one, over the same images at native size.
-
-    ``bop`` asks for BOP's scores as well.
-
-    Returns a report per method, and pictures with the truth in green, the last method's predictions
-    in yellow and those of the methods before it in blue (paper Fig. 14).
-    """
-    metrics = accumulators(methods)
-    seconds: dict[str, list[float]] = {name: [] for name in methods}
-    poses_of: dict[str, list[MeasuredPose]] = {name: [] for name in methods}
-    measured = Measured([], [], poses_of, metrics, {name: [] for name in methods})
-    draw = DepthDrawer().draw
-    localised = {name: Localisation(one.parts, draw) for name, one in methods.items() if bop}
-    num_images = 0
-    parts = {part.name: part for method in methods.values() for part in method.parts}
-    seen = Fingerprint(list(parts.values()))
-    for index, sample in enumerate(samples):
-        num_images += 1
-        seen.add(sample)
-        image = image_id(sample, index)
-        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in sample.instances]
-        for number, (name, method) in enumerate(methods.items()):
-            poses, taken = method.detect(sample, image)
-            seconds[name] += [] if taken is None else [taken]
-            metrics[name].update(poses, sample.instances, sample.K, sample.size[0])
-            if bop:
-                localised[name].update(poses, sample.instances, sample.K, sample.size, sample.depth)
-            if sample.instances and not poses:
-                measured.silent[name].append(index)
-            measured.poses[name] += [MeasuredPose(image, one, taken) for one in poses]
-            colour = BLUE if number < len(methods) - 1 else YELLOW
-            wireframes += [Wireframe(one.keypoints, colour, name) for one in poses]
-        if len(measured.tiles) < num_pictures:
-            measured.tiles.append(Tile(overlay(sample.image, wireframes), sample.key))
-    scores = {name: one.scores() for name, one in localised.items()}
-    measured.bop = {name: one for name, one in scores.items() if one is not None}
-    measured.reports = [
-        Report(
-            name,
-            metrics[name].compute(),
-            metrics[name].references(),
-            {part.name: metrics[name].errors(part.name) for part in method.parts},
-            method.cost(seconds[name]),
-            num_images,
-            rotation_deg={
-                part.name: metrics[name].errors(part.name, "rotation_deg") for part in method.parts
-            },
-            diameters={part.name: float(part.diameter) for part in method.parts},
-            test_set=seen.word(),
-            details={BOP: measured.bop[name].to_record()} if name in measured.bop else {},
-        )
-        for name, method in methods.items()
-    ]
-    return measured
 
 
 class Fingerprint:
@@ -278,51 +207,3 @@ class Fingerprint:
 def _rounded(values: Float[np.ndarray, "rows columns"]) -> list[float]:
     """Return rounded numbers, of which none is a negative zero."""
     return [float(value) + 0.0 for value in np.round(values, _DECIMALS).ravel()]
-
-
-class DepthDrawer:
-    """Draws the depth of parts alone; each part's mesh is prepared once."""
-
-    def __init__(self) -> None:
-        self._surfaces: dict[str, Surface] = {}
-
-    def draw(self, part: Part, T_cam_obj: Transform, K: CameraMatrix, size: Size) -> DepthMap:
-        """Return metres along z at pixel centres, 0 beside the part."""
-        assert part.mesh is not None
-        if part.name not in self._surfaces:
-            self._surfaces[part.name] = make_surface(part.mesh)
-        item = SceneObject(self._surfaces[part.name], T_cam_obj, part=part)
-        inverse, _ = draw_alone(item, project_object(item, K).hom, (0, 0, *size))
-        depth = np.zeros_like(inverse)
-        np.divide(1, inverse, out=depth, where=inverse > 0)
-        return depth
-
-
-def accumulators(methods: Mapping[str, Method]) -> dict[str, PoseMetrics]:
-    """Return what scores each method's poses on its parts."""
-    # One process measures alone: after a distributed training the others have ended.
-    return {
-        name: PoseMetrics(method.parts, name, sync_on_compute=False)
-        for name, method in methods.items()
-    }
-
-
-def full_size_cost(spec: Mapping[str, Any], input_size: tuple[int, int]) -> Cost:
-    """Measure the untrained network of a spec at width 1: what narrowing has saved.
-
-    The input is (width, height), pixels (the paper's is 416×416). Of three timed forward passes
-    after one that is not, the median counts.
-    """
-    widened = {
-        key: {**node, "width": 1.0} if isinstance(node, Mapping) and "width" in node else node
-        for key, node in spec.items()
-    }
-    network = build_network(widened).eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images = torch.zeros(1, 3, input_size[1], input_size[0], dtype=torch.uint8)
-    times = []
-    with torch.inference_mode():
-        for _ in range(4):
-            start = time.perf_counter()
-            network.maps(images)
-            times.append(1000 * (time.perf_counter() - start))
-    return Cost(*network_cost(network, input_size), statistics.median(times[1:]))

@@ -18,8 +18,8 @@ from dopepp.experiment.config.data import DataConfig, chosen_data, trained_on
 from dopepp.experiment.config.run import EvaluationConfig, FalsePositiveTarget
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment, write_json
-from dopepp.experiment.results.measurement import measure_and_record, of_networks, refining
-from dopepp.experiment.results.readme import write_job_readme
+from dopepp.experiment.results.pages import write_job_readme
+from dopepp.experiment.results.recording import measure_and_record, of_networks, refining
 from dopepp.experiment.results.report import Report
 from dopepp.experiment.run.images import warn_of_other_images
 from dopepp.experiment.run.tuning import Tuning, tune, write_tuned

@@ -18,8 +18,7 @@ from dopepp.data.sample import Sample, Source
 from dopepp.experiment.assembly.renders import validation_renders
 from dopepp.experiment.config.data import trained_on
 from dopepp.experiment.program import typed
-from dopepp.experiment.results.evaluators import EstimatorMethod
-from dopepp.experiment.results.report import measure
+from dopepp.experiment.results.measurement import EstimatorMethod, measure
 from dopepp.inference import runtimes
 from dopepp.inference.agreement import Agreement, compare
 from dopepp.inference.estimator import PoseEstimator

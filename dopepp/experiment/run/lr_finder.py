@@ -30,7 +30,7 @@ from dopepp.experiment.assembly.system import build_system, build_trainer
 from dopepp.experiment.config.run import LearningRateConfig, RunConfig
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import write_config, write_environment
-from dopepp.experiment.results.readme import write_job_readme
+from dopepp.experiment.results.pages import write_job_readme
 from dopepp.training.system import PoseSystem
 
 TABLE_FILE: Final = "lr_finder.csv"

@@ -33,9 +33,9 @@ from dopepp.experiment.assembly.system import (
     keep_freed_memory,
 )
 from dopepp.experiment.config.run import RunConfig, TrainerConfig
-from dopepp.experiment.results import display, readme
+from dopepp.experiment.results import display, pages
 from dopepp.experiment.results.conditions import check_masks
-from dopepp.experiment.results.cost import measure_cost
+from dopepp.experiment.results.cost import full_size_cost, measure_cost
 from dopepp.experiment.results.folder import (
     LAST_CHECKPOINT,
     OBJECTIVE,
@@ -43,9 +43,9 @@ from dopepp.experiment.results.folder import (
     write_config,
     write_environment,
 )
-from dopepp.experiment.results.measurement import measure_and_record, refining
-from dopepp.experiment.results.paper_table import PaperTable
-from dopepp.experiment.results.report import FULL_SIZE_COST, Report, full_size_cost
+from dopepp.experiment.results.paper import PaperTable
+from dopepp.experiment.results.recording import measure_and_record, refining
+from dopepp.experiment.results.report import FULL_SIZE_COST, Report
 from dopepp.experiment.run.evaluate import tune_and_record
 from dopepp.experiment.run.images import describe_images
 from dopepp.experiment.run.lr_finder import find_learning_rate
@@ -101,29 +101,29 @@ def train(config: RunConfig, run_dir: Path) -> Report:
     training a ``PrunedError``; what cannot be written a ``SavingFailedError``; a signal that ends
     it an :class:`Interruption`, whose message names the last checkpoint.
     """
-    explanation = readme.RunReadme(config, run_dir)
+    explanation = pages.RunReadme(config, run_dir)
     try:
         with tracked(config, run_dir) as trackers:
             report = _train(config, run_dir, explanation, trackers)
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
         advice = _advice(run_dir)
-        explanation.end(readme.INTERRUPTED, advice)
+        explanation.end(pages.INTERRUPTED, advice)
         raise Interruption(number, advice) from interrupt
     except PrunedError as pruned:
-        explanation.end(readme.PRUNED, str(pruned))
+        explanation.end(pages.PRUNED, str(pruned))
         raise
     except Exception as error:
-        explanation.end(readme.FAILED, " ".join(str(error).split()) or repr(error))
+        explanation.end(pages.FAILED, " ".join(str(error).split()) or repr(error))
         raise
-    explanation.end(readme.FINISHED, report=report)
+    explanation.end(pages.FINISHED, report=report)
     return report
 
 
 def _train(
     config: RunConfig,
     run_dir: Path,
-    explanation: readme.RunReadme,
+    explanation: pages.RunReadme,
     trackers: Sequence[GuardedLogger],
 ) -> Report:
     if not config.keep_checkpoints and config.resume is not None:

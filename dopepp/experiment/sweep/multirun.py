@@ -47,9 +47,9 @@ class CompareJobs(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Say in the sweep's folder what runs there."""
-        from dopepp.experiment.results.readme import write_sweep_readme
+        from dopepp.experiment.results.pages import write_multirun_readme
 
-        write_sweep_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
+        write_multirun_readme(Path(str(config.hydra.sweep.dir)), program.command(), {})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Compare all jobs of the sweep folder; exit with code 1 if one failed."""
@@ -62,8 +62,8 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
     from dopepp.experiment.results import display
     from dopepp.experiment.results.compare import compare_runs
     from dopepp.experiment.results.entries import read_run
-    from dopepp.experiment.results.paper_table import PaperTable, write_paper_table
-    from dopepp.experiment.results.readme import write_sweep_readme
+    from dopepp.experiment.results.pages import write_multirun_readme
+    from dopepp.experiment.results.paper import PaperTable, write_paper_table
     from dopepp.experiment.run.tracking import log_comparison
 
     table = _node(config, "table")
@@ -74,7 +74,7 @@ def compare_jobs(folder: Path, config: DictConfig) -> bool:
     if table is not None:
         write_paper_table(PaperTable.of(table), entries, folder)
     log_comparison(_node(config, "logger"), folder)
-    write_sweep_readme(folder, program.command(), {job.name: _state(job) for job in jobs})
+    write_multirun_readme(folder, program.command(), {job.name: _state(job) for job in jobs})
     display.console.print(f"comparison in {folder}")
     return not any(entry.failure and not entry.pruned for entry in entries)
 

@@ -11,7 +11,7 @@ from dopepp.experiment.assembly.sources import build_datamodule, held_out_source
 from dopepp.experiment.assembly.system import build_untrained
 from dopepp.experiment.config.data import DataConfig
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
-from dopepp.experiment.results.measurement import measure_and_record
+from dopepp.experiment.results.recording import measure_and_record
 from dopepp.experiment.run.evaluate import parts_of
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.metrics.row import shown_columns

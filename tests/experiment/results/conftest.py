@@ -10,9 +10,8 @@ import pytest
 import torch
 import yaml
 
-from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.folder import FAILURE_FILE, METRICS_FILE, write_config, write_json
-from dopepp.experiment.results.report import Report
+from dopepp.experiment.results.report import Cost, Report
 from dopepp.metrics.pose import MEAN
 from dopepp.metrics.row import PoseErrors, PoseRow, mean_row, summarise
 

@@ -17,15 +17,15 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from dopepp.experiment.results import display, readme
+from dopepp.experiment.results import display, pages
+from dopepp.experiment.results.breakdown import record_breakdown
 from dopepp.experiment.results.compare import compare_paths, write_comparison
 from dopepp.experiment.results.conditions import SCALE, SHADING, Level, record_condition
 from dopepp.experiment.results.cost import COST_FILE, NetworkCost
 from dopepp.experiment.results.entries import Entry
 from dopepp.experiment.results.folder import VERSIONS_FILE, write_json
-from dopepp.experiment.results.protocols import record_breakdown
-from dopepp.experiment.results.release import release
-from dopepp.experiment.results.tables import ADD_01D, ADD_5CM
+from dopepp.experiment.results.frame import ADD_01D, ADD_5CM
+from dopepp.experiment.results.pages import release
 from dopepp.experiment.sweep.multirun import CompareJobs
 from dopepp.metrics.pose import MEAN, PoseMetrics
 from dopepp.metrics.row import COLUMNS, PoseRow, mean_row
@@ -263,7 +263,7 @@ def level(value: float, rates: dict[str, float | None], note: str = "", **facts:
 def test_conditions(condition, compare_golden):
     levels = [
         level(0.5, {"dope": 0.5, "dopepp": 0.75}, share_reached=0.5, num_outside_tolerance=0),
-        level(1.0, {"dope": 0.25, "dopepp": 0.5}, "A note.", share_reached=None),
+        level(1.0, {"dope": 0.25, "dopepp": 0.5}, "A note.", share_reached=np.nan),
         level(2.0, {"dope": None, "dopepp": 0.5}, "Another note.", share_reached=0.97),
     ]
     record_condition(Path(), condition, levels, [], (ADD_5CM, ADD_01D))
@@ -327,17 +327,17 @@ def test_the_readme_of_a_run(keep, report, compare_golden):
     command = {"command": ["train.py", "data.parts=[a,b]"]}
     again = {"command": ["train.py", "resume=RUN"], "earlier": [command, {"other": 1}]}
     write_json(folder / VERSIONS_FILE, again)
-    page = readme.RunReadme(config, folder)
+    page = pages.RunReadme(config, folder)
     page.begin()
     texts = []
-    for state in (readme.INTERRUPTED, readme.FINISHED):
-        page.end(state, "for a reason" if state == readme.INTERRUPTED else "")
+    for state in (pages.INTERRUPTED, pages.FINISHED):
+        page.end(state, "for a reason" if state == pages.INTERRUPTED else "")
         texts.append((folder / "README.md").read_text())
     for name in ("overlay.png", "auc.png", "metrics.json", "config.yaml", "checkpoints/best.ckpt"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).touch()
     report.details["checkpoint"] = "checkpoints/best_tuned.ckpt"
-    page.end(readme.FINISHED, report=report)
+    page.end(pages.FINISHED, report=report)
     texts.append((folder / "README.md").read_text())
     Path("pages").write_text("-----\n".join(texts))
     compare_golden(f"readme_{'kept' if keep else 'trial'}", "pages", terminal=False)
@@ -349,15 +349,15 @@ def test_the_readmes_of_jobs_and_sweeps(report, compare_golden):
     (folder / "frame_rate.png").touch()
     texts = []
     for known in (None, report):
-        readme.write_job_readme(folder, "Cost of x", known)
+        pages.write_job_readme(folder, "Cost of x", known)
         texts.append((folder / "README.md").read_text())
     command = ["train.py", "-m", "seed=1,2"]
     for jobs in ({}, {"0": "finished", "1": "failed: a | b"}):
-        readme.write_sweep_readme(folder, command, jobs)
+        pages.write_multirun_readme(folder, command, jobs)
         texts.append((folder / "README.md").read_text())
     (folder / "compare.md").touch()
     (folder / "compare.png").touch()
-    readme.write_sweep_readme(folder, command, jobs)
+    pages.write_multirun_readme(folder, command, jobs)
     texts.append((folder / "README.md").read_text())
     Path("pages").write_text("-----\n".join(texts))
     compare_golden("readme_jobs", "pages", terminal=False)

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.folder import read_json, write_json
-from dopepp.experiment.results.report import FULL_SIZE_COST, Report
+from dopepp.experiment.results.report import FULL_SIZE_COST, Cost, Report
 from dopepp.metrics.row import PoseRow
 
 
@@ -48,15 +47,6 @@ def test_a_report_survives_json(errors, share, ms):
     assert back.details == report.details
     assert back.refined is not None
     assert back.refined.to_record() == report.refined.to_record()
-
-
-def test_a_report_of_an_earlier_version_is_read():
-    stored = make_report().to_record()
-    for key in ("rotation_deg", "diameters", "test_set"):
-        del stored[key]
-    back = Report.from_record(stored)
-    assert (back.rotation_deg, back.diameters, back.test_set) == ({}, {}, "")
-    assert back.refined is None
 
 
 def test_json_that_nobody_else_could_read_is_not_written(tmp_path):

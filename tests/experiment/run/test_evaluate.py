@@ -4,10 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dopepp.experiment.results.evaluators import Cost
 from dopepp.experiment.results.folder import METRICS_FILE, read_json
-from dopepp.experiment.results.measurement import made_worse
-from dopepp.experiment.results.report import Report
+from dopepp.experiment.results.recording import made_worse
+from dopepp.experiment.results.report import Cost, Report
 from dopepp.experiment.run.evaluate import evaluate
 from dopepp.models.checkpoint import read, write_atomic
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dopepp.core.errors import RunError
-from dopepp.experiment.results.tables import read_csv
+from dopepp.core.files import read_csv
 from dopepp.experiment.run.lr_finder import find_learning_rate, smooth, suggest
 from dopepp.models.losses import SpatialCrossEntropy
 

@@ -12,10 +12,10 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
 
+from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.results.tables import read_csv
 from dopepp.metrics.pose import PoseMetrics
 from dopepp.recovery.detection import Detection
 from dopepp.training.callbacks import throughput

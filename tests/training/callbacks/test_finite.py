@@ -17,9 +17,9 @@ from torch.optim.lr_scheduler import OneCycleLR
 from torch.utils.data import DataLoader
 
 from dopepp.core.errors import RunError, UserError
+from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
-from dopepp.experiment.results.tables import read_csv
 from dopepp.training.callbacks.guards import FOLDER, FiniteSteps
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem, check_state

@@ -14,8 +14,8 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from dopepp.core.errors import UserError
+from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
-from dopepp.experiment.results.tables import read_csv
 from dopepp.training.callbacks.throughput import Throughput
 from dopepp.training.callbacks.validation import EarlyStop
 from dopepp.training.checkpointing.files import newest_checkpoint

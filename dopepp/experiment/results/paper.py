@@ -8,22 +8,24 @@ must be said of them, and give it a line in :data:`KINDS`.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
+import pandas as pd
 from scipy.stats import t
 
 from dopepp.core.errors import UserError
-from dopepp.core.files import write_csv, write_png, write_whole
+from dopepp.core.files import write_csv, write_png
 from dopepp.core.validation import STRICT, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.drawing.curves import figure_image, rates_figure
-from dopepp.experiment.results import display, tables
+from dopepp.experiment.results import display
 from dopepp.experiment.results.conditions import SHADING
 from dopepp.experiment.results.cost import (
     COST_FILE,
@@ -32,17 +34,25 @@ from dopepp.experiment.results.cost import (
     read_frames,
     save_frame_rates,
 )
-from dopepp.experiment.results.differences import (
-    REFINED_NOTE,
-    figures,
-    noise,
-    row_figures,
-    summary,
-)
+from dopepp.experiment.results.differences import REFINED_NOTE, compared, noise
 from dopepp.experiment.results.entries import Entry
 from dopepp.experiment.results.folder import read_json
+from dopepp.experiment.results.frame import (
+    ADD_5CM,
+    ADD_10CM,
+    DELTA,
+    Row,
+    Value,
+    header_of,
+    heading,
+    interval,
+    markdown,
+    rate_curves,
+    row_values,
+    values_of,
+)
+from dopepp.experiment.results.pages import write_page
 from dopepp.metrics.pose import MEAN
-from dopepp.metrics.row import COLUMNS
 
 TEXT_FILE: Final = "table.md"
 TABLE_FILE: Final = "table.csv"
@@ -59,7 +69,7 @@ _NETWORK: Final = "network"
 """What stands for the object, where there is none."""
 _PAPER: Final = "the paper"
 
-_PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (tables.ADD_5CM, tables.ADD_10CM)}
+_PASS_FIELDS: Final = {rate.threshold: rate.field for rate in (ADD_5CM, ADD_10CM)}
 _MEASURED: Final = ("poses", "shading")
 """Kinds that rest on trained networks."""
 _UNTRAINED: Final = "dopepp.models.backbones.VGG19"
@@ -84,9 +94,9 @@ class PaperTable:
     title: str
     kind: str = "poses"
     threshold: float = 0.05
-    labels: Mapping[str, str] = field(default_factory=dict)
-    paper: Printed = field(default_factory=dict)
-    recomputed: Printed = field(default_factory=dict)
+    labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    paper: Printed = dataclasses.field(default_factory=dict)
+    recomputed: Printed = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -120,6 +130,10 @@ class PaperTable:
         """Field of a row that holds the paper's pass rate."""
         return _PASS_FIELDS[self.threshold]
 
+    def field(self, key: str) -> str:
+        """Return the field of ``PoseRow`` that a config's figure is of."""
+        return self.pass_field if key == "pass" else key
+
     def methods(self, entries: Sequence[Entry]) -> dict[str, Entry]:
         """Return the methods by what the paper calls them, or by their own name.
 
@@ -146,12 +160,11 @@ def write_paper_table(table: PaperTable, entries: Sequence[Entry], folder: Path)
         entries = [entry for entry in entries if not entry.refine]
     methods = table.methods(entries)
     rows, doubts = KINDS[table.kind](table, methods, folder)
-    labels = sum(name in _LABELS for name in rows[0])
+    labels = sum(title in _LABELS for title in rows[0])
     display.show_table(title, rows, num_labels=labels)
-    write_csv(folder / TABLE_FILE, rows)
-    notes = [f"- {note}" for note in (*_notes(table, entries), *doubts)]
-    text = "\n".join([f"# {title}", "", tables.markdown_text(rows), *notes])
-    write_whole(folder / TEXT_FILE, f"{text}\n".encode())
+    write_csv(folder / TABLE_FILE, rows, header_of(rows))
+    notes = [*_notes(table, entries), *doubts]
+    write_page(folder / TEXT_FILE, "table", title=title, table=markdown(rows), notes=notes)
 
 
 def _recipe(entries: Sequence[Entry]) -> list[str]:
@@ -185,7 +198,7 @@ def _starts_untrained(config: Mapping[str, Any]) -> bool:
     return backbone.get("_target_") == _UNTRAINED and backbone.get("weights_path") is None
 
 
-Laid = tuple[list[tables.Row], list[str]]
+Laid = tuple[list[Row], list[str]]
 """Rows, and the doubts about them."""
 
 
@@ -195,7 +208,10 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     The first method with a result is what Δ is against, of refined poses the first refined. The
     reference rows stand at the end.
     """
-    table = figures([replace(entry, name=label) for label, entry in methods.items()])
+    table = compared([replace(entry, name=label) for label, entry in methods.items()])
+    texts: dict[tuple[str, str], Row] = {}
+    for value in values_of(table):
+        texts.setdefault((value.method, value.object), {})[value.measure] = value.summary
     measured = [entry for entry in methods.values() if entry.reports]
     objects = list(dict.fromkeys(name for entry in measured for name in entry.objects))
     if not objects:  # nothing was measured: the paper's figures and why there are no others
@@ -204,51 +220,42 @@ def pose_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) ->
     for name in objects:
         for label in dict.fromkeys([*methods, *layout.recomputed, *layout.paper]):
             known = layout.paper.get(label, {})
-            own = layout.recomputed.get(label, {})
+            recomputed = layout.recomputed.get(label, {})
             # The paper's mean is over its own objects.
             is_other_mean = name == MEAN and set(known) != set(objects)
             printed = {} if is_other_mean else known.get(name, {})
             entry = methods.get(label)
             if entry is not None and name in entry.objects:
-                found = tables.select(table, method=label, object=name)
-                rows.append(_pose_row(layout, label, name, _texts(found), printed))
+                rows.append(_pose_row(layout, label, name, texts[label, name], printed))
             elif entry is not None:
                 reason = f"{label}: {entry.failure or 'not measured on it'}"
                 rows.append(_pose_row(layout, reason, name, {}, printed))
-            elif name in known or name in own:
-                texts = {_field(layout, k): _number(v) for k, v in own.get(name, {}).items()}
-                rows.append(_pose_row(layout, label, name, texts, printed))
+            elif name in known or name in recomputed:
+                numbers = recomputed.get(name, {}).items()
+                cells = {layout.field(key): _number(number) for key, number in numbers}
+                rows.append(_pose_row(layout, label, name, cells, printed))
     for name in objects if measured else ():
-        for reference, by_object in measured[0].reports[0].references.items():
+        for by_object in measured[0].reports[0].references.values():
             if name in by_object:
-                texts = _texts(row_figures(reference, by_object[name]))
-                rows.append(_pose_row(layout, reference, name, texts, {}))
+                row = by_object[name]
+                cells = {value.measure: value.text for value in row_values(row)}
+                rows.append(_pose_row(layout, row.method, name, cells, {}))
     return rows, noise(table)
 
 
-def _texts(table: Iterable[tables.Figure]) -> tables.Row:
-    return {one.measure: summary(one) for one in table}
-
-
-def _field(layout: PaperTable, key: str) -> str:
-    """Return the field of ``PoseRow`` that a config's figure is of."""
-    return layout.pass_field if key == "pass" else key
-
-
 def _pose_row(
-    layout: PaperTable, method: str, name: str, texts: tables.Row, printed: Mapping[str, float]
-) -> tables.Row:
+    layout: PaperTable, method: str, name: str, texts: Row, printed: Mapping[str, float]
+) -> Row:
     """Return a row: the text of every measure, what the paper prints of it, and Δ."""
     row = {_METHOD: method, _OBJECT: name}
     for key in ("pass", "auc_10cm", _STRICT, "median_rotation_deg"):
-        measure = _field(layout, key)
-        row[tables.heading(measure)] = texts.get(measure, "")
+        measure = layout.field(key)
+        title = heading(measure)
+        row[title] = texts.get(measure, "")
         if key in ("pass", "auc_10cm"):
-            row[f"{_PAPER}: {tables.heading(measure)}"] = _number(printed.get(key))
+            row[f"{_PAPER}: {title}"] = _number(printed.get(key))
         if key in ("pass", _STRICT):
-            row[f"{tables.DELTA}{tables.heading(measure)}"] = texts.get(
-                f"{tables.DELTA}{measure}", ""
-            )
+            row[f"{DELTA}{title}"] = texts.get(f"{DELTA}{measure}", "")
     return row
 
 
@@ -263,102 +270,91 @@ def shading_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path)
     first refined, whose own Δ is to the first of all; its interval is Student's t of the
     differences of equal seeds.
     """
-    measured = {label: _shading(label, entry) for label, entry in methods.items()}
-    table = [one for own in measured.values() for one in own]
-    rows: list[tables.Row] = [
+    measures = layout.pass_field, _STRICT
+    tables = {label: _shading(label, entry, measures) for label, entry in methods.items()}
+    rows: list[Row] = [
         {_METHOD: _failed(label, methods[label]), _OBJECT: "", _MEASURE: ""}
-        for label, own in measured.items()
-        if not own
+        for label, table in tables.items()
+        if table.empty
     ]
-    panels = {}
-    for name in dict.fromkeys(one.object for one in table):
-        for measure in (layout.pass_field, _STRICT):
-            firsts: dict[str, dict[float, list[tables.Figure]]] = {}  # by how poses are refined
-            pooled: list[tables.Figure] = []
-            head = {_OBJECT: name, _MEASURE: tables.heading(measure)}
-            for label in dict.fromkeys(one.method for one in tables.select(table, object=name)):
-                own = tables.select(table, method=label, object=name, measure=measure)
-                rates = {one.condition: tables.select(own, condition=one.condition) for one in own}
-                levels = {share: SHADING.heading(share) for share in rates}
-                means = {levels[share]: _mean(rates[share]) for share in rates}
-                rows.append({_METHOD: label, **head, **means})
-                refine = methods[label].refine
-                if firsts:
-                    baseline = firsts.get(refine) or next(iter(firsts.values()))
-                    changes = {levels[s]: _change(rates[s], baseline.get(s, [])) for s in rates}
-                    rows.append({_METHOD: f"{tables.DELTA}{label}", **head, **changes})
-                firsts.setdefault(refine, rates)
-                printed = layout.paper.get(label, {}).get(name, {})
-                if printed and measure == layout.pass_field:
-                    texts = {share: _number(value) for share, value in printed.items()}
-                    rows.append({_METHOD: f"{label}, {_PAPER}", **head, **texts})
-                pooled += map(_pooled, rates.values())
-            panels[f"{name}: {tables.heading(measure)}"] = tables.rate_curves(
-                pooled, SHADING.per_unit
-            )
+    everything, panels = pd.concat(list(tables.values())), {}
+    for name, measure in product(everything["object"].unique(), measures):
+        table = everything[everything[["object", "measure"]].eq([name, measure]).all(axis=1)]
+        head = {_OBJECT: name, _MEASURE: heading(measure)}
+        firsts: dict[str, pd.DataFrame] = {}  # by how poses are refined
+        for label, own in table.groupby("method", sort=False):
+            rates = 100 * own.pivot(index="seed", columns="share", values="rate")
+            rows.append({_METHOD: label, **head, **_by_share(rates, _mean)})
+            refine = methods[label].refine
+            if firsts:
+                change = rates - firsts.get(refine, next(iter(firsts.values())))
+                changes = _by_share(change[rates.columns], _change)
+                rows.append({_METHOD: f"{DELTA}{label}", **head, **changes})
+            firsts.setdefault(refine, rates)
+            printed = layout.paper.get(label, {}).get(name, {})
+            if printed and measure == layout.pass_field:
+                numbers = {share: _number(value) for share, value in printed.items()}
+                rows.append({_METHOD: f"{label}, {_PAPER}", **head, **numbers})
+        panels[f"{name}: {heading(measure)}"] = rate_curves(_pooled(table), SHADING.per_unit)
     if panels:
         figure = rates_figure(panels, SHADING.axis, 2)
         write_png(folder / "table_shading.png", figure_image(figure))
     return rows, []
 
 
-def _shading(label: str, entry: Entry) -> list[tables.Figure]:
-    """Return what a method's runs have measured; of one network a part, the mean, too.
+def _shading(label: str, entry: Entry, measures: Sequence[str]) -> pd.DataFrame:
+    """Return the rates of a method's runs by object, measure, share and seed.
 
-    A run's file may hold other methods, and its own twice, as the network's and refined.
+    A run's file may hold other methods, and its own twice, as the network's and refined. Of one
+    network a part, there is the mean as well.
     """
-    found: dict[object, tables.Figure] = {}
+    columns = ["object", "share", "num_instances", *measures]
+    tables = [pd.DataFrame(columns=["seed", *columns])]
     for run in entry.runs:
         report = run.report.refined if run.report and entry.refine else run.report
-        for row in tables.read_csv(run.folder / SHADING.table_file):
-            if report is None or row["method"] != report.name:
-                continue
-            for measure in (column.field for column in COLUMNS if row.get(column.field)):
-                key = row["object"], measure, float(row["share"]), run.seed
-                found[key] = tables.Figure(
-                    label, row["object"], measure, float(row[measure]), float(row["share"]),
-                    (run.seed,), int(row["num_instances"]),
-                )  # fmt: skip
-    table = list(found.values())
-    objects = {one.object for one in table}
-    if len(objects) < 2 or MEAN in objects:
-        return table
-    alike: dict[object, list[tables.Figure]] = {}
-    for one in table:
-        alike.setdefault((one.measure, one.condition, one.seeds), []).append(one)
-    # The mean is over what all parts have.
-    whole = [own for own in alike.values() if len(own) == len(objects)]
-    return table + [replace(_pooled(own), object=MEAN) for own in whole]
+        path = run.folder / f"{SHADING.name}.csv"
+        if report is not None and path.is_file():
+            table = pd.read_csv(path)
+            own = table[table["method"] == report.name].reindex(columns=columns)
+            tables.append(own.assign(seed=str(run.seed)))
+    keys = ["object", "measure", "share", "seed"]
+    rates = pd.concat([table for table in tables if len(table)] or tables)
+    rates = rates.melt(["seed", *columns[:3]], list(measures), "measure", "rate")
+    rates = rates.dropna(subset="rate").drop_duplicates(keys, keep="last")
+    objects = rates["object"].unique()
+    if len(objects) > 1 and MEAN not in objects:
+        groups = rates.groupby(keys[1:], sort=False)
+        mean = groups.agg(rate=("rate", "mean"), num_instances=("num_instances", "sum"))
+        # The mean is over what all parts have.
+        whole = mean[groups.size() == len(objects)].reset_index()
+        rates = pd.concat([rates, whole.assign(object=MEAN)])
+    return rates.assign(method=label)
 
 
-def _pooled(rates: Sequence[tables.Figure]) -> tables.Figure:
-    """Return the mean of rates, as one over all their instances."""
-    return replace(
-        rates[0],
-        value=float(np.mean([one.value for one in rates])),
-        num_instances=sum(one.num_instances for one in rates),
-    )
+def _pooled(rates: pd.DataFrame) -> Iterator[Value]:
+    """Return the mean of the rates of all seeds, as one over all their instances."""
+    for (method, share), own in rates.groupby(["method", "share"], sort=False):
+        rate = float(own["rate"].mean())
+        low, high = interval(rate, int(own["num_instances"].sum()))
+        yield Value(method, "", value=rate, condition=share, low=low, high=high)
 
 
-def _mean(rates: Sequence[tables.Figure]) -> str:
-    values = [100 * float(one.value or 0) for one in rates]
-    deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.1f}{deviation}"
+def _by_share(points: pd.DataFrame, text: Callable[[pd.Series[float]], str]) -> Row:
+    """Return a text of the numbers of all seeds at every share."""
+    return {SHADING.heading(share): text(column.dropna()) for share, column in points.items()}
 
 
-def _change(rates: Sequence[tables.Figure], baseline: Sequence[tables.Figure]) -> str:
+def _mean(rates: pd.Series[float]) -> str:
+    return f"{rates.mean():.1f}" + (f" ± {rates.std():.1f}" if len(rates) > 1 else "")
+
+
+def _change(points: pd.Series[float]) -> str:
     """Return the mean difference to the baseline and, of several seeds, its 95 % interval."""
-    before = {one.seeds: one.value for one in baseline}
-    pairs = [(one.value, before[one.seeds]) for one in rates if one.seeds in before]
-    if not pairs:
-        return ""
-    points = 100 * np.subtract(*np.array(pairs, np.float64).T)
-    count = len(points)
-    text = f"{points.mean():+.1f}"
+    count, mean = len(points), points.mean()
     if count < 2:
-        return text
-    half = t.ppf(0.975, count - 1) * points.std(ddof=1) / math.sqrt(count)
-    return f"{text} [{points.mean() - half:+.1f}, {points.mean() + half:+.1f}]"
+        return f"{mean:+.1f}" if count else ""
+    half = t.ppf(0.975, count - 1) * points.std() / math.sqrt(count)
+    return f"{mean:+.1f} [{mean - half:+.1f}, {mean + half:+.1f}]"
 
 
 def parameter_rows(layout: PaperTable, methods: Mapping[str, Entry], folder: Path) -> Laid:
@@ -410,7 +406,7 @@ def _printed(layout: PaperTable, label: str, measure: str) -> str:
     return _number(layout.paper.get(label, {}).get(_NETWORK, {}).get(measure))
 
 
-def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[tables.Row]]:
+def _costs(methods: Mapping[str, Entry]) -> tuple[dict[str, dict[str, Any]], list[Row]]:
     """Return what each method's network costs, and rows of those of which nobody knows."""
     paths = {label: entry.runs[0].folder / COST_FILE for label, entry in methods.items()}
     costs = {label: read_json(path) for label, path in paths.items() if path.is_file()}

@@ -7,10 +7,10 @@ and in :data:`dopepp.experiment.config.protocols.QuantityName`.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +22,8 @@ from jaxtyping import Float, Int
 from dopepp.core.files import write_csv, write_png
 from dopepp.drawing.curves import figure_image, rates_figure
 from dopepp.experiment.config.protocols import QuantityName
-from dopepp.experiment.results import display, tables
+from dopepp.experiment.results import display
+from dopepp.experiment.results.frame import PassRate, Row, Value, interval, pivot, rate_curves
 from dopepp.geometry.camera import project_keypoints
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.metrics.pose import MEAN, Gathered, PoseMetrics
@@ -121,8 +122,8 @@ def break_down(
     metrics: Mapping[str, PoseMetrics],
     quantity: QuantityName,
     num_bins: int,
-    rates: Sequence[tables.PassRate],
-) -> tuple[list[Bin], list[tables.Figure]]:
+    rates: Sequence[PassRate],
+) -> tuple[list[Bin], list[Value]]:
     """Measure rates per bin, over the instances of all objects together.
 
     Of the accumulators of the methods on one test set, the last one scores all objects, and its
@@ -131,45 +132,50 @@ def break_down(
     Returns:
         The bins, in ascending order, and bin by bin what each method reaches in them: how many
         instances, the rates, the median rotation of those that were matched (degrees, to the
-        nearest symmetry) and the share that was missed. A figure's condition is its bin's middle.
+        nearest symmetry) and the share that was missed. The condition is the middle of a bin.
     """
     gathered = {name: [one.instances(part) for part in one.parts] for name, one in metrics.items()}
-    values = {
+    numbers = {
         name: np.concatenate([QUANTITIES[quantity].of(one) for one in own])
         for name, own in gathered.items()
     }
-    everything = next(reversed(values.values()))
-    numbers = bin_numbers(everything, num_bins)
-    groups = [everything[numbers == number] for number in range(int(numbers.max(initial=-1)) + 1)]
+    everything = next(reversed(numbers.values()))
+    bin_of = bin_numbers(everything, num_bins)
+    groups = [everything[bin_of == number] for number in range(int(bin_of.max(initial=-1)) + 1)]
     bins = [Bin(float(one.min()), float(one.max()), float(np.median(one))) for one in groups]
-    table = [
-        figure
+    values = [
+        value
         for one in bins
         for name, own in gathered.items()
-        for figure in _in_bin(one, name, values[name], own, rates)
+        for value in _in_bin(one, name, numbers[name], own, rates)
     ]
-    return bins, table
+    return bins, values
 
 
 def _in_bin(
     one: Bin,
     method: str,
-    values: Values,
+    numbers: Values,
     gathered: Sequence[Gathered],
-    rates: Sequence[tables.PassRate],
-) -> Iterator[tables.Figure]:
+    rates: Sequence[PassRate],
+) -> Iterator[Value]:
     """Measure one method in one bin; a rate of no instance does not exist."""
-    chosen = torch.from_numpy((values >= one.low) & (values <= one.high))
-    num = int(chosen.sum())
+    chosen = torch.from_numpy((numbers >= one.low) & (numbers <= one.high))
     rotations = torch.cat([own.errors.rotation_s_deg for own in gathered])[chosen]
-    yield tables.Figure(method, MEAN, "num_instances", num, one.middle)
+    num = len(rotations)
+    value = Value(method, MEAN, condition=one.middle)
+    yield value._replace(measure="num_instances", value=num)
     for rate in rates:
         passed = torch.cat([rate.passed(own) for own in gathered])[chosen]
-        value = int(passed.sum()) / num if num else None
-        yield tables.Figure(method, MEAN, rate.field, value, one.middle, num_instances=num)
-    yield tables.Figure(method, MEAN, "median_rotation_deg", finite_median(rotations), one.middle)
-    missed = float((~rotations.isfinite()).double().mean()) if num else None
-    yield tables.Figure(method, MEAN, "miss_rate", missed, one.middle)
+        share = int(passed.sum()) / num if num else math.nan
+        low, high = interval(share, num)
+        yield value._replace(measure=rate.field, value=share, low=low, high=high)
+    median = finite_median(rotations)
+    yield value._replace(
+        measure="median_rotation_deg", value=math.nan if median is None else median
+    )
+    missed = float((~rotations.isfinite()).double().mean())
+    yield value._replace(measure="miss_rate", value=missed)
 
 
 def record_breakdown(
@@ -177,45 +183,46 @@ def record_breakdown(
     metrics: Mapping[str, PoseMetrics],
     quantity: QuantityName,
     num_bins: int,
-    rates: Sequence[tables.PassRate],
+    rates: Sequence[PassRate],
 ) -> None:
     """Print a table and write ``by_QUANTITY.csv`` and ``by_QUANTITY.png``; see :func:`break_down`.
 
     A test set without an instance that counts gives a warning instead.
     """
-    bins, table = break_down(metrics, quantity, num_bins, rates)
+    bins, values = break_down(metrics, quantity, num_bins, rates)
     if not bins:
         _log.warning("by=%s: the test set has no instance that counts, so no bin", quantity)
         return
     what = QUANTITIES[quantity]
     by_middle = {one.middle: one for one in bins}
 
-    def shown(one: tables.Figure) -> tables.Row:
-        own = by_middle[one.condition]
+    def shown(value: Value) -> Row:
+        own = by_middle[value.condition]
         ends = dict.fromkeys(f"{end:.{what.decimals}f}" for end in (own.low, own.high))
         row = {what.heading: " … ".join(ends)}
-        if one.measure == "num_instances":
-            return {**row, one.heading: one.text}
-        if one.measure == "miss_rate":
+        if value.measure == "num_instances":
+            return {**row, value.heading: value.text}
+        if value.measure == "miss_rate":
             return row
-        prefix = f"{one.method} " if len(metrics) > 1 else ""
-        interval = [f"{100 * end:.0f}" for end in one.interval or ()]
-        text = f"{one.text} [{', '.join(interval)}]" if interval else one.text
-        return {**row, f"{prefix}{one.heading}": text}
+        prefix = f"{value.method} " if len(metrics) > 1 else ""
+        span = f" [{100 * value.low:.0f}, {100 * value.high:.0f}]" if value.ends else ""
+        return {**row, f"{prefix}{value.heading}": f"{value.text}{span}"}
 
-    def record(one: tables.Figure) -> dict[str, object]:
-        own = by_middle[one.condition]
-        row = {"method": one.method, "from": own.low, "to": own.high, "median": own.middle}
-        ends = (f"{one.measure}_low", f"{one.measure}_high")
-        return {**row, one.measure: one.value, **dict(zip(ends, one.interval or (), strict=False))}
+    def recorded(value: Value) -> dict[str, object]:
+        own = by_middle[value.condition]
+        row = {"method": value.method, "from": own.low, "to": own.high, "median": own.middle}
+        ends = {"low": value.low, "high": value.high} if value.ends else {}
+        named = {f"{value.measure}_{end}": number for end, number in ends.items()}
+        return {**row, value.measure: value.plain, **named}
 
-    rows = tables.pivot(table, attrgetter("condition"), shown)
-    display.show_table(f"by {quantity}: rates with 95 % intervals", rows)
-    records = tables.pivot(table, attrgetter("condition", "method"), record)
+    display.show_table(
+        f"by {quantity}: rates with 95 % intervals", pivot(values, ["condition"], shown)
+    )
     path = run_dir / f"by_{quantity}"
-    write_csv(path.with_suffix(".csv"), records)
+    write_csv(path.with_suffix(".csv"), pivot(values, ["condition", "method"], recorded))
     panels = {
-        rate.title: tables.rate_curves(tables.select(table, measure=rate.field)) for rate in rates
+        rate.title: rate_curves([value for value in values if value.measure == rate.field])
+        for rate in rates
     }
     # Between two bins lie no instances; the line stands in the middle of the gap.
     gaps = [(one.high + following.low) / 2 for one, following in pairwise(bins)]

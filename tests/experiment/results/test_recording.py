@@ -16,11 +16,8 @@ from dopepp.data.formats.bop.results import PoseResult, read_results, write_resu
 from dopepp.data.formats.bop.writer import BopWriter
 from dopepp.data.sample import Sample
 from dopepp.data.sources.rendered import rendered_sample
-from dopepp.experiment.results import display
-from dopepp.experiment.results.evaluators import image_id, object_numbers
-from dopepp.experiment.results.report import Report
+from dopepp.experiment.results.measurement import image_id, object_numbers
 from dopepp.experiment.run.evaluate import evaluate
-from dopepp.metrics.row import PoseRow
 from dopepp.parts.catalogue import pivconnector, servoholder
 from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS
@@ -174,13 +171,3 @@ def test_objects_have_their_data_sets_numbers(root, ycb_root):
     assert (ycb["002_master_chef_can"], ycb["003_cracker_box"]) == (1, 2)
     bop.root = None
     assert object_numbers(bop, [piv]) == {"pivconnector": 1}
-
-
-@pytest.mark.parametrize(("num", "everything"), [(1, False), (2, False), (1, True)])
-def test_symmetric_measures_are_shown_where_there_are_symmetries(num, everything, capsys):
-    row = PoseRow("part", "x", 3, 0.5, add_s_01d=0.75, num_symmetries=num)
-    report = Report("x", {"part": row, "mean": row}, {}, {}, None, 3)
-    display.show_report(report, everything)
-    shown = capsys.readouterr().out
-    assert ("ADD-S-0.1d %" in shown) == ("rotation-S" in shown) == (num > 1 or everything)
-    assert "ADD-0.1d %" in shown

@@ -1,0 +1,243 @@
+"""Pages in Markdown: the README of a run or multirun, the text of a comparison, a release's card.
+
+Their texts are jinja2 templates in ``templates/``. A run's README says what was run, what came out,
+what each file is and how to go on; it is written when the run begins and again when it ends,
+however it ends. To explain a further file, add a line to :data:`FILES`.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import socket
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import write_whole
+from dopepp.experiment import program
+from dopepp.experiment.config.run import RunConfig
+from dopepp.experiment.results.folder import BEST_CHECKPOINT, VERSIONS_FILE, read_json
+from dopepp.experiment.results.frame import markdown, shown_rows
+from dopepp.experiment.results.report import Report
+from dopepp.metrics.row import COLUMNS, PoseRow, shown_columns
+from dopepp.models.checkpoint import SUFFIX, read, write_content
+from dopepp.training.callbacks.validation import best_effort
+
+README_FILE: Final = "README.md"
+
+RUNNING: Final = "running"
+FINISHED: Final = "finished"
+INTERRUPTED: Final = "interrupted"
+FAILED: Final = "failed"
+PRUNED: Final = "stopped by the search"
+
+FILES: Final = {
+    "checkpoints/best_tuned.ckpt": "the same as `best.ckpt`, tuned; the one to use",
+    "checkpoints/best.ckpt": "the weights with the best validation",
+    "checkpoints/last.ckpt": "where `resume=` goes on",
+    "checkpoints/previous.ckpt": "the one before, should that be damaged",
+    "metrics.json": "the measurement on the test set, every instance's error included",
+    "metrics.csv": "losses, rates and validation over the steps",
+    "config.yaml": "every option, resolved",
+    "versions.json": "command, commit, packages, hardware, seed and fingerprint of the data",
+    "overlay.png": "test images: truth in green, prediction in yellow",
+    "auc.png": "share of test instances below each error (numbers in `auc.csv`)",
+    "val_overlay.png": "validation images of the last epoch",
+    "val_belief.png": "their belief maps: strongest corner and centroid",
+    "val_auc.png": "their errors (numbers in `val_auc.csv`)",
+    "shading.png": "pass rate with parts of the object covered (`shading.csv`)",
+    "scale.png": "pass rate with the camera nearer or farther (`scale.csv`)",
+    "scale_examples.png": "the same scenes at every scale, drawn as in `overlay.png`",
+    "compare.md": "the methods side by side (numbers in `compare.csv`)",
+    "table.md": "the same in the paper's layout, its figures beside them (`table.csv`)",
+    "lr_finder.png": "loss against learning rate (numbers in `lr_finder.csv`)",
+    "cost.json": "parameters, operations, and times from picture to poses and of the network alone",
+    "frame_rate.png": "frames a second over time, dashed the network alone (`frames.csv`)",
+    "tuning.json": "what tuning has changed",
+    "job.log": "what the job has printed",
+    "wandb": "what Weights & Biases holds of it; `wandb sync` sends it",
+    "tensorboard": "what TensorBoard shows of it",
+    "profile": "where the time went",
+    "nonfinite": "the batch whose loss or gradient was not finite",
+    "failed.json": "why the job failed",
+    "pruned.json": "why the search stopped it",
+}
+"""What a run may leave, in the order of a reader's interest."""
+
+_PICTURES: Final = (
+    "overlay.png", "auc.png", "val_overlay.png", "val_belief.png", "lr_finder.png",
+    "frame_rate.png", "shading.png", "scale.png", "scale_examples.png",
+)  # fmt: skip
+
+MAX_BYTES: Final = 8_000_000
+"""Of a released file: it travels with the package."""
+
+_CARD_FIELDS: Final = (
+    "num_instances", "add_01d", "add_005d", "pass_5cm", "pass_10cm", "auc_10cm",
+    "median_rotation_deg", "median_translation", "miss_rate",
+)  # fmt: skip
+
+
+@cache
+def _templates() -> Environment:
+    folder = Path(__file__).parent / "templates"
+    options: Any = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, **options)
+
+
+def write_page(path: Path, template: str, **content: object) -> None:
+    """Write a page from ``templates/TEMPLATE.md.j2`` and its content."""
+    text = _templates().get_template(f"{template}.md.j2").render(content)
+    write_whole(path, text.encode())
+
+
+class RunReadme:
+    """The README of one training; nothing is written before :meth:`begin`.
+
+    A run that could not begin leaves what stands in its folder as it is. One whose README cannot
+    be written goes on without.
+    """
+
+    def __init__(self, config: RunConfig, run_dir: Path) -> None:
+        self._config, self._folder = config, run_dir
+        self._begun = False
+
+    def begin(self) -> None:
+        """Say that the run is at work, and which process does it."""
+        self._begun = True
+        since = datetime.now().astimezone().isoformat(" ", "seconds")
+        self.end(
+            RUNNING,
+            f"Since {since}, process {os.getpid()} on {socket.gethostname()}. If that process is "
+            "gone, it was killed: resume the run.",
+        )
+
+    def end(self, state: str, reason: str = "", report: Report | None = None) -> None:
+        """Say how the run ended: one of this module's words, why in a line, what was measured."""
+        if not self._begun:
+            return
+        title = f"{self._config.model.name} on {self._config.data.name}: {state}"
+        is_trial = not self._config.keep_checkpoints
+        commands = [] if is_trial else self._next_commands(state, report)
+        _write_readme(self._folder, title, report, reason, commands, is_trial)
+
+    def _next_commands(self, state: str, report: Report | None) -> list[str]:
+        run = shlex.quote(program.shown(self._folder))
+        checkpoint = {} if report is None else report.details
+        best = self._folder / checkpoint.get("checkpoint", BEST_CHECKPOINT)
+        best = shlex.quote(program.shown(best))
+        train, evaluate = program.typed("train"), program.typed("evaluate")
+        lines = [f"{train} resume={run}  # go on"]
+        if state == FINISHED:
+            epochs = 2 * self._config.trainer.max_epochs
+            lines = [
+                f"{evaluate} ckpt_path={best} shading=[0.2,0.4,0.6,0.8] by=[distance]",
+                f"{train} resume={run} trainer.max_epochs={epochs}  # train for longer",
+            ]
+        return [
+            *lines,
+            f"dopepp predict {best} PICTURE.png --K FX FY CX CY",
+            f"dopepp compare {run} OTHER_RUN",
+        ]
+
+
+def write_job_readme(folder: Path, title: str, report: Report | None = None) -> None:
+    """Write the README of what is no training, when it is done; ``title`` says what it was."""
+    _write_readme(folder, title, report)
+
+
+def _write_readme(
+    folder: Path,
+    title: str,
+    report: Report | None,
+    reason: str = "",
+    next_commands: Sequence[str] = (),
+    is_trial: bool = False,
+) -> None:
+    present = read_json(folder / VERSIONS_FILE)
+    calls = [call.get("command") for call in (*present.get("earlier", []), present)]
+    with best_effort(str(folder / README_FILE)):
+        write_page(
+            folder / README_FILE,
+            "run",
+            title=title,
+            reason=reason,
+            commands=[program.line(words) for words in calls if words],
+            report=report,
+            result_table=_result_table,
+            pictures={name: FILES[name] for name in _PICTURES if (folder / name).is_file()},
+            next_commands=next_commands,
+            is_trial=is_trial,
+            files={name: text for name, text in FILES.items() if (folder / name).exists()},
+        )
+
+
+def _result_table(name: str, rows: Sequence[PoseRow]) -> str:
+    """Return the table that the terminal showed, without its title."""
+    measures = shown_columns(rows[0])
+    return markdown(
+        [{name: one.heading, **{row.method: one.text(row) for row in rows}} for one in measures]
+    )
+
+
+def write_multirun_readme(folder: Path, command: Sequence[str], jobs: Mapping[str, str]) -> None:
+    """Write the README of a multirun's folder.
+
+    ``jobs`` tells how each job stands, by its folder's name; it is empty while none has ended.
+    """
+    rows = [{"job": f"[{job}]({job}/)", "state": state} for job, state in jobs.items()]
+    with best_effort(str(folder / README_FILE)):
+        write_page(
+            folder / README_FILE,
+            "multirun",
+            command=program.line(command),
+            has_table=(folder / "compare.md").is_file(),
+            has_picture=(folder / "compare.png").is_file(),
+            jobs=markdown(rows) if rows else "",
+        )
+
+
+def release(checkpoint: Path, results: Path, name: str, folder: Path) -> list[Path]:
+    """Write ``NAME.safetensors`` and its card ``NAME.md``; return both.
+
+    ``results`` is ``metrics.json`` of a run or an evaluation of the checkpoint. A
+    :class:`UserError`: a file is not what it should be, or the release is too large.
+    """
+    if not name.isidentifier():
+        raise UserError(f"name {name!r}", "letters, digits and _", "choose another name")
+    trained = read(checkpoint)
+    report = Report.from_record(read_json(results))
+    parameters = sum(value.numel() for value in trained.state_dict.values())
+    if 2 * parameters > MAX_BYTES:
+        raise UserError(
+            f"{checkpoint} with {2 * parameters:,} bytes of weights in half precision",
+            f"at most {MAX_BYTES:,}", "release a narrower network (model.width)",
+        )  # fmt: skip
+    target, card = folder / f"{name}{SUFFIX}", folder / f"{name}.md"
+    write_content(trained.to_file(), target)
+    reported = [report] if report.refined is None else [report, report.refined]
+    config = trained.data.get("config") or {}
+    write_page(
+        card,
+        "card",
+        name=name,
+        trained=trained,
+        parameters=parameters,
+        preset=(config.get("virtual") or {}).get("preset"),
+        masks=(config.get("masking") or {}).get("probability", 0),
+        refine="" if report.refined is None else " refine=region",
+        report=report,
+        table=markdown([
+            {"object": row.object, "method": row.method}
+            | {one.heading: one.text(row) for one in COLUMNS if one.field in _CARD_FIELDS}
+            for rows in [*(one.rows for one in reported), *report.references.values()]
+            for row in shown_rows(rows).values()
+        ]),
+    )  # fmt: skip
+    return [target, card]

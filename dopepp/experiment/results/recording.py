@@ -1,0 +1,208 @@
+"""Everything that a measurement leaves in its folder: tables, curves, pictures and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dopepp.core.files import write_png
+from dopepp.data.formats.bop.results import UNKNOWN_TIME, PoseResult, results_name, write_results
+from dopepp.data.sample import Source
+from dopepp.drawing.curves import save_accuracy_curves
+from dopepp.drawing.sheet import contact_sheet
+from dopepp.experiment.assembly.renders import scaled_test_renders
+from dopepp.experiment.assembly.sources import held_out_source
+from dopepp.experiment.config.data import DataConfig
+from dopepp.experiment.config.protocols import Protocols
+from dopepp.experiment.results import conditions, display
+from dopepp.experiment.results.breakdown import record_breakdown
+from dopepp.experiment.results.compare import compare_reports
+from dopepp.experiment.results.folder import METRICS_FILE, write_json
+from dopepp.experiment.results.frame import reported_rates
+from dopepp.experiment.results.measurement import (
+    EstimatorMethod,
+    FileMethod,
+    Measured,
+    MeasuredPose,
+    Method,
+    measure,
+    object_numbers,
+)
+from dopepp.experiment.results.report import Report
+from dopepp.inference.estimator import PoseEstimator
+from dopepp.inference.refinement.refiner import Refine
+from dopepp.parts.part import Parts
+from dopepp.recovery.recover import summary
+
+
+def measure_and_record(
+    estimators: Mapping[str, PoseEstimator],
+    parts: Parts,
+    data: DataConfig,
+    run_dir: Path,
+    num_pictures: int,
+    details: Mapping[str, Any] | None = None,
+    *,
+    results: Mapping[str, Path] | None = None,
+    bop_csv: bool = False,
+    all_measures: bool = False,
+    protocols: Protocols | None = None,
+    refine: Refine | None = None,
+) -> list[Report]:
+    """Measure methods on a test set; show and write tables, curves and pictures.
+
+    Estimators go by name, the baseline first where there is one, and so do ``results``, BOP
+    challenge CSVs of other methods. The parts are those that are scored, as the test data have
+    them; ``details`` are further plain facts for ``metrics.json``. ``bop_csv`` writes the poses of
+    each method, ``all_measures`` prints the symmetric measures of every object. With ``refine``,
+    every estimator is measured without and with it; ``metrics.json`` is the last estimator's, with
+    its refined poses' under ``refined``, and a file's where there is no estimator.
+
+    Returns a report per estimator, then per file. A :class:`UserError`: data or a file are wrong.
+    """
+    protocols = protocols or Protocols()
+    source = held_out_source(data, parts, "test")
+    numbers = object_numbers(data, parts)
+    files = {name: FileMethod(path, parts, numbers) for name, path in (results or {}).items()}
+    methods: dict[str, Method] = {
+        **{
+            name: EstimatorMethod(one, parts)
+            for name, one in with_refined(estimators, refine, parts).items()
+        },
+        **files,
+    }
+    # What cannot be measured in the end is refused before anything is.
+    if protocols.shading:
+        conditions.SHADING.check_methods(methods)
+        conditions.check_masks(source)
+    if protocols.scales:
+        conditions.SCALE.check_methods(methods)
+    scaled = {one: scaled_test_renders(data, parts, one) for one in protocols.scales}
+    samples = (source.sample(index, 0) for index in range(len(source)))
+    is_bop = data.root is not None and data.format in ("bop", "webdataset")
+    measured = measure(methods, samples, num_pictures, bop=is_bop and not data.is_rendered("test"))
+    for file in files.values():
+        file.check_used()
+    for report in measured.reports:
+        display.show_report(report, all_measures)
+        if report.name in measured.bop:
+            display.console.print(f"{report.name}: {measured.bop[report.name].in_words()}")
+    _show_silence(methods, measured.silent, source)
+    # What is compared later is the network's own result, unrefined; a file's where no network is.
+    own = of_networks(measured.reports, len(files))
+    refines = refine is not None and bool(estimators)
+    main = own[-2 if refines else -1]
+    main.details.update(details or {})
+    if refines:
+        main.refined = own[-1]
+        share = main.details["made_worse"] = made_worse(main, main.refined)
+        display.console.print(f"refinement made {share:.1%} of the instances worse by over 1 mm")
+    write_json(run_dir / METRICS_FILE, main.to_record())
+    if bop_csv:
+        _write_results(run_dir, measured.poses, data, numbers)
+    _draw(run_dir, measured, len(source))
+    if len(measured.reports) > 1:
+        compare_reports(measured.reports, run_dir, baseline=measured.reports[0].name)
+    rates = reported_rates(data, parts)
+    for quantity in protocols.by:
+        record_breakdown(run_dir, measured.metrics, quantity, protocols.num_bins, rates)
+    if protocols.shading:
+        shaded = conditions.measure_shading(
+            methods, source, protocols.shading, data.eval_seed, measured.reports, num_pictures
+        )
+        conditions.record_condition(run_dir, conditions.SHADING, *shaded, rates)
+    if scaled:
+        levels = conditions.measure_scales(methods, scaled, measured, num_pictures)
+        conditions.record_condition(run_dir, conditions.SCALE, *levels, rates)
+    display.show_files(run_dir)
+    return measured.reports
+
+
+def of_networks(reports: list[Report], num_files: int) -> list[Report]:
+    """Return the estimators' reports of a measurement; the files' where there is no estimator."""
+    return reports[: len(reports) - num_files] or reports
+
+
+def with_refined(
+    estimators: Mapping[str, PoseEstimator], refine: Refine | None, parts: Parts
+) -> dict[str, PoseEstimator]:
+    """Return every estimator, and behind it the same one refining: two rows in every table."""
+    pairs: dict[str, PoseEstimator] = {}
+    for name, one in estimators.items():
+        pairs[name] = one
+        if refine is not None:
+            terms = " + ".join([refine] if isinstance(refine, str) else refine)
+            pairs[f"{name} + {terms}"] = refining(one, refine, parts)
+    return pairs
+
+
+def refining(estimator: PoseEstimator, refine: Refine | None, parts: Parts) -> PoseEstimator:
+    """Return an estimator that refines, or for None the same one.
+
+    A checkpoint of an earlier version, which has no meshes, takes those of ``parts``.
+    """
+    if refine is None:
+        return estimator
+    known = {part.name: part for part in parts}
+    own = [part if part.mesh is not None else known.get(part.name, part)
+           for part in estimator.parts]  # fmt: skip
+    return estimator.refining(refine, own)
+
+
+def made_worse(network: Report, refined: Report) -> float:
+    """Return the share of instances whose ADD refinement has made larger by more than 1 mm."""
+    pairs = [(network.errors[name], errors) for name, errors in refined.errors.items()]
+    worse = np.concatenate([after > before + 0.001 for before, after in pairs])
+    return float(worse.mean()) if len(worse) else 0.0
+
+
+def _draw(run_dir: Path, measured: Measured, num_images: int) -> None:
+    """Draw the accuracy curves of every method and object, and the first images' poses."""
+    reports = measured.reports
+    curves = {
+        f"{report.name} {name}" if len(reports) > 1 else name: errors
+        for report in reports
+        for name, errors in report.errors.items()
+    }
+    save_accuracy_curves(run_dir / "auc", curves, title=f"{num_images} test images")
+    if measured.tiles:
+        write_png(run_dir / "overlay.png", contact_sheet(measured.tiles))
+
+
+def _show_silence(
+    methods: Mapping[str, Method], silent: Mapping[str, Sequence[int]], source: Source
+) -> None:
+    """Print of every estimator on how many images it found nothing, and why."""
+    for name, numbers in silent.items():
+        method = methods[name]
+        if numbers and isinstance(method, EstimatorMethod):
+            reasons = [method.silence(source.sample(number, 0)) for number in numbers]
+            line = summary([one for one in reasons if one is not None], len(source))
+            display.console.print(f"{name}: {line}")
+
+
+def _write_results(
+    run_dir: Path,
+    poses: Mapping[str, Sequence[MeasuredPose]],
+    data: DataConfig,
+    numbers: Mapping[str, int],
+) -> None:
+    """Write every method's poses as a BOP challenge CSV."""
+    dataset, split = data.name, "test"
+    if data.root is not None and not data.is_rendered("test"):
+        dataset, split = data.root.resolve().name, data.image_set("test")
+    for method, found in poses.items():
+        rows = [
+            PoseResult(
+                *one.image,
+                numbers[one.pose.object],
+                one.pose.score,
+                one.pose.T_cam_obj,
+                UNKNOWN_TIME if one.seconds is None else one.seconds,
+            )
+            for one in found
+        ]
+        write_results(run_dir / results_name(method, dataset, split), rows)

@@ -1,0 +1,143 @@
+"""The paper's tables: what becomes a row of what, and what is refused.
+
+The tables themselves are compared to the character in ``test_golden.py``.
+"""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from dopepp.core.errors import UserError
+from dopepp.core.files import read_csv
+from dopepp.drawing.pictures import read_rgb
+from dopepp.experiment.results.compare import compare_paths
+from dopepp.experiment.results.paper import PaperTable
+from dopepp.experiment.run.train import do_job
+from dopepp.experiment.sweep.multirun import CompareJobs
+
+FOLDER = Path(__file__).parents[3] / "conf" / "experiment"
+EXPERIMENTS = sorted(
+    path.stem for path in FOLDER.glob("*.yaml") if path.stem.startswith(("table", "fig"))
+)
+LABELS = {"model=dope": "DOPE", "model=dopepp": "DOPE++"}
+ERRORS = [0.004, 0.06]
+
+
+def end(folder, table):
+    """Return the table that a sweep ends with."""
+    hydra = {"sweep": {"dir": str(folder)}}
+    CompareJobs().on_multirun_end(OmegaConf.create({"hydra": hydra, "table": table}))
+    return read_csv(folder / "table.csv")
+
+
+def test_a_sweep_ends_with_its_table_and_fails_after_it(tmp_path, report_of, write_run):
+    end(tmp_path, {"title": "6"})  # of no jobs: nothing to say
+    write_run(tmp_path / "0", ["model=dopepp"], report_of("dopepp", ERRORS))
+    write_run(tmp_path / "10", ["model=dopepp"])
+    with pytest.raises(SystemExit) as failed:
+        end(tmp_path, {"title": "6"})
+    assert failed.value.code == 1
+    rows = read_csv(tmp_path / "table.csv")
+    assert rows[1]["method"].endswith("unfinished: it left no metrics.json")
+
+
+def test_a_part_with_other_seeds_stands_alone(tmp_path, report_of, write_run):
+    for number, part in enumerate(("bolt", "nut")):
+        result = report_of("x", {part: ERRORS}, test_set=part)
+        write_run(tmp_path / str(number), [f"seed={number}"], result, data={"parts": [part]})
+    assert "mean" not in [row["object"] for row in end(tmp_path, {"title": "Table 2"})]
+
+
+def test_shading_has_a_line_refined_and_none_of_another_checkpoint(tmp_path, report_of, write_run):
+    for number, model in enumerate(("dope", "dopepp")):
+        result = report_of("x", ERRORS, refined=ERRORS)
+        folder = write_run(tmp_path / str(number), [f"model={model}"], result, model=model)
+        rates = {"other": 0.9, "other + region": 0.8, "x": 0.1, "x + region": 0.2 + number / 2}
+        lines = [f"{name},part,0.2,10,{rate},{rate}\n" for name, rate in rates.items()]
+        header = "method,object,share,num_instances,pass_5cm,add_01d\n"
+        (folder / "shading.csv").write_text(header + "".join(lines))
+    table = {"title": "Table 3", "kind": "shading", "labels": LABELS}
+    rows = end(tmp_path, {**table, "paper": {"DOPE": {"part": {"20 %": 14.1, "80 %": 3.0}}}})
+    lenient = [row for row in rows if row["measure"] == "ADD<5cm %"]
+    assert [(row["method"], row["20 %"], row["80 %"]) for row in lenient] == [
+        ("DOPE", "10.0", ""), ("DOPE, the paper", "14.1", "3.0"),
+        ("DOPE + region", "20.0", ""), ("Δ DOPE + region", "+10.0", ""),
+        ("DOPE++", "10.0", ""), ("Δ DOPE++", "+0.0", ""),
+        ("DOPE++ + region", "70.0", ""), ("Δ DOPE++ + region", "+50.0", ""),
+    ]  # fmt: skip
+    assert read_rgb(tmp_path / "table_shading.png").std() > 0
+
+
+def test_costs(composed, tmp_path, write_run):
+    small = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=3", "cost.batch_size=2")
+    for number, name in enumerate(("dope", "dopepp")):
+        folder = write_run(tmp_path / str(number), [f"model={name}"])
+        do_job(composed("experiment=table8_time", f"model={name}", *small), folder)
+    dope, dopepp = end(tmp_path, {"title": "4", "kind": "parameters", "labels": LABELS})
+    assert int(dope["parameters"].replace(",", "")) > int(dopepp["parameters"].replace(",", ""))
+    assert not (tmp_path / "frame_rate.png").exists()
+    dope, dopepp = end(tmp_path, {"title": "8", "kind": "time", "labels": LABELS})
+    assert float(dope["ms/frame"]) > float(dope["network ms"]) > 0
+    assert (tmp_path / "frame_rate.png").exists()
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("scale", ["paper", "laptop"])
+def test_every_experiment_composes(composed, experiment, scale):
+    """Tables of trainings train as the paper does at its scale, and as we do on a laptop."""
+    config = composed(f"experiment={experiment}", f"scale={scale}")
+    table = PaperTable.of(config["table"])
+    assert set(table.labels.values()) & set(table.paper) or not table.paper
+    assert config["model"]["width"] == (0.25 if scale == "laptop" else 1.0)
+    if experiment[:6] not in {f"table{number}" for number in (1, 2, 3, 5, 6, 7)}:
+        return
+    loss = config["model"]["loss"]["_target_"].rpartition(".")[2]
+    if scale == "laptop":
+        assert (config["recipe"], loss) == ("ours", "SpatialCrossEntropy")
+    else:
+        assert (config["recipe"], loss) == ("paper", "MapMSE")
+        assert config["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
+        assert config["scheduler"]["_target_"] is None
+        assert (config["data"]["batch_size"], config["trainer"]["max_epochs"]) == (32, 60)
+
+
+def test_recipes_are_ours_unless_the_papers_are_asked_for(composed):
+    assert composed()["recipe"] == "ours"
+    assert composed("experiment=paper")["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
+    table = composed("experiment=table6_dope_vs_dopepp", "recipe=ours")
+    assert table["model"]["loss"]["_target_"] == "dopepp.models.losses.SpatialCrossEntropy"
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"title": "T", "colour": 1}, r"table\.colour=1; allowed: title, kind"),
+        ({"title": "T", "kind": "pie"}, r"table\.kind='pie'; allowed: poses, shading"),
+        ({"title": "T", "threshold": 0.2}, r"table\.threshold=0\.2; allowed: 0\.05, 0\.1"),
+        ({}, "no table.title"),
+    ],
+)
+def test_impossible_tables(table, message):
+    with pytest.raises(UserError, match=message):
+        PaperTable.of(table)
+
+
+def test_finished_runs_in_another_tables_layout(tmp_path, report_of, write_run):
+    write_run(tmp_path / "sweep" / "0", ["model=dope"], report_of("dope", ERRORS))
+    layout = FOLDER / "table6_dope_vs_dopepp.yaml"
+    out = compare_paths([tmp_path / "sweep"], tmp_path / "out", table=layout)
+    measured = [row for row in read_csv(out / "table.csv") if row["object"] == "part"]
+    assert [row["method"] for row in measured] == ["DOPE", "best constant pose"]
+
+
+@pytest.mark.parametrize("text", ["model: dope\n", "table: Table 6\n", "- table\n"])
+def test_an_experiment_without_a_table_is_refused_before_anything_is_written(
+    text, tmp_path, report_of, write_run
+):
+    write_run(tmp_path / "0", ["model=dope"], report_of("dope", ERRORS))
+    path = tmp_path / "experiment.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match="lays out no table"):
+        compare_paths([tmp_path / "0"], tmp_path / "out", table=path)
+    assert not (tmp_path / "out").exists()
