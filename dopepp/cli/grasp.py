@@ -90,8 +90,7 @@ def propose(
         _require()
         from dopepp.core.files import check_target
         from dopepp.parts.catalogue import load_part
-        from dopepp.robot.grasping.grasps import write_grasps
-        from dopepp.robot.grasping.proposal import propose_grasps
+        from dopepp.robot.grasping.grasps import propose_grasps, write_grasps
 
         check_target(out, (".yaml", ".yml"))
         loaded = load_part(part, unit)

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from dopepp.robot.grasping.arm import Gripper, Joints
 from dopepp.robot.grasping.cell import JOINTS, STEP, Cell
-from dopepp.robot.grasping.planner import Path, Plan
+from dopepp.robot.grasping.planner import Gripper, Joints, Path, Plan
 
 SPEED: Final = 1.5
 """Fastest joint, rad/s, on average over a motion."""

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.parts.part import Part
-from dopepp.robot.grasping.cell import TRAY, Thing
-from dopepp.robot.grasping.solid import convex_pieces
+from dopepp.robot.grasping.cell import TRAY, Thing, convex_pieces
 from dopepp.virtual.body import Body, distractor_shapes, make_body
 
 SPREAD: Final = 0.025

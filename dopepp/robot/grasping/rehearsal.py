@@ -33,9 +33,8 @@ from dopepp.robot.calibration.drawn import draw_view
 from dopepp.robot.calibration.hand_eye import board_pose, calibrate_hand_eye
 from dopepp.robot.calibration.lens import calibrate_lens
 from dopepp.robot.calibration.tool import find_bench, find_tip
-from dopepp.robot.grasping.arm import Arm, Joints
 from dopepp.robot.grasping.cell import JOINTS, TRAY
-from dopepp.robot.grasping.planner import Knowledge
+from dopepp.robot.grasping.planner import Arm, Joints, Knowledge
 
 SIZE: Final[Size] = (640, 480)
 """Of the camera's pictures, pixels."""

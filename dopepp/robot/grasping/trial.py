@@ -18,12 +18,11 @@ from dopepp.geometry.camera import Transform, invert_transform, make_transform, 
 from dopepp.geometry.rotation import rotation_angle
 from dopepp.geometry.symmetry import symmetry_group
 from dopepp.parts.catalogue import load_part
-from dopepp.robot.grasping.arm import Arm, Joints, measure_gripper
 from dopepp.robot.grasping.cell import HOME, TRAY, Cell
 from dopepp.robot.grasping.execution import Execution, Outcome
 from dopepp.robot.grasping.grasps import find_grasps
 from dopepp.robot.grasping.layouts import Layout, Lying
-from dopepp.robot.grasping.planner import Planner, rested
+from dopepp.robot.grasping.planner import Arm, Joints, Planner, measure_gripper, rested
 from dopepp.robot.grasping.rehearsal import (
     MOUNT,
     Calibrated,

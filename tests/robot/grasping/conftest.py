@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dopepp.parts.catalogue import load_part
-from dopepp.robot.grasping.arm import Arm, measure_gripper
+from dopepp.robot.grasping.planner import Arm, measure_gripper
 from dopepp.robot.grasping.task import Source, Task
 from dopepp.robot.grasping.trial import Trials
 

@@ -6,7 +6,7 @@ import trimesh
 
 from dopepp.core.errors import UserError
 from dopepp.parts.part import Mesh, make_part
-from dopepp.robot.grasping.proposal import propose_grasps
+from dopepp.robot.grasping.grasps import propose_grasps
 
 
 def part_of(solid, name="solid"):

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from dopepp.robot.grasping.report import counted, markdown, write_report
+from dopepp.robot.grasping.experiment import counted, markdown, write_report
 from dopepp.robot.grasping.task import Record
 
 
