@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import parse_board
-from dopepp.robot.calibration.drawn import draw_view
-from dopepp.robot.calibration.explanation import explain
-from dopepp.robot.calibration.hand_eye import board_pose, calibrate_hand_eye
+from dopepp.robot.calibration.board import board_pose, draw_view, parse_board
+from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.lens import calibrate_lens
+from dopepp.robot.calibration.quality import explain
 from dopepp.robot.calibration.tool import find_tip
 
 BOARD = parse_board("charuco:9x7:25:18")

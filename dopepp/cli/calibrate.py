@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dopepp.drawing.pictures import Picture
-    from dopepp.robot.calibration.board import Board, Sighting
-    from dopepp.robot.calibration.explanation import Explanation
-    from dopepp.robot.calibration.hand_eye import BoardPose, HandEye
+    from dopepp.robot.calibration.board import Board, BoardPose, Sighting
+    from dopepp.robot.calibration.files import Reading
+    from dopepp.robot.calibration.hand_eye import HandEye
     from dopepp.robot.calibration.lens import LensCalibration
-    from dopepp.robot.calibration.robot_poses import Reading
+    from dopepp.robot.calibration.quality import Explanation
     from dopepp.robot.calibration.tool import Bench
 
 BOARD: Final = "e.g. charuco:8x11:20:15, chess:7x10:25, circles:4x11:40 (columns × rows, mm)"
@@ -102,8 +102,7 @@ def tcp(
     force: Force = False,
 ) -> None:
     """Find a tool's tip from poses of the flange in which it touches one point."""
-    from dopepp.robot.calibration.files import write_calibration
-    from dopepp.robot.calibration.robot_poses import read_robot_poses
+    from dopepp.robot.calibration.files import read_robot_poses, write_calibration
     from dopepp.robot.calibration.tool import find_tip
 
     with report_errors():
@@ -148,8 +147,12 @@ def bench(
     From touched points: origin at the first, x towards the second, z up. From a board: its first
     point and its columns, z out of the board.
     """
-    from dopepp.robot.calibration.files import transform_record, write_calibration
-    from dopepp.robot.calibration.robot_poses import check_unit, read_points
+    from dopepp.robot.calibration.files import (
+        check_unit,
+        read_points,
+        transform_record,
+        write_calibration,
+    )
     from dopepp.robot.calibration.tool import find_bench
 
     with report_errors():
@@ -186,12 +189,10 @@ def handeye(
     """Find where the camera is, from pictures of a board and the robot's poses."""
     from dopepp.core.files import check_target
     from dopepp.geometry.camera_file import read_camera
-    from dopepp.robot.calibration.board import parse_board
-    from dopepp.robot.calibration.explanation import explain
-    from dopepp.robot.calibration.faults import check_poses
-    from dopepp.robot.calibration.files import write_calibration
-    from dopepp.robot.calibration.hand_eye import board_pose, calibrate_hand_eye, check_mount
-    from dopepp.robot.calibration.robot_poses import matched, read_robot_poses
+    from dopepp.robot.calibration.board import board_pose, parse_board
+    from dopepp.robot.calibration.files import matched, read_robot_poses, write_calibration
+    from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, check_mount
+    from dopepp.robot.calibration.quality import check_poses, explain
 
     with report_errors():
         check_target(out, (".yaml", ".yml"))
@@ -213,7 +214,7 @@ def handeye(
 
 
 def _reading(unit: str, angles: str, quaternion: str, direction: str) -> Reading:
-    from dopepp.robot.calibration.robot_poses import Reading, check_unit
+    from dopepp.robot.calibration.files import Reading, check_unit
 
     for name, value, allowed in (
         ("--angles", angles, ("rad", "deg")),
@@ -280,7 +281,7 @@ def _chosen_views(source: str, board: Board) -> tuple[list[Sighting], tuple[int,
 
     from dopepp.core.interrupts import Interruption, interruptible
     from dopepp.inference.sources import open_sources
-    from dopepp.robot.calibration.views import LOOKS_PER_S, Views
+    from dopepp.robot.calibration.lens import LOOKS_PER_S, Views
 
     views, size, looked = Views(0), None, 0
     with suppress(Interruption), interruptible(""):
@@ -314,10 +315,8 @@ def _bench_of_board(
     """Find the bench from pictures of a board on it; return their names, too."""
     from dopepp.core.yaml import read_yaml
     from dopepp.geometry.camera_file import read_camera
-    from dopepp.robot.calibration.board import parse_board
-    from dopepp.robot.calibration.files import read_transform
-    from dopepp.robot.calibration.hand_eye import board_pose
-    from dopepp.robot.calibration.robot_poses import matched, read_robot_poses
+    from dopepp.robot.calibration.board import board_pose, parse_board
+    from dopepp.robot.calibration.files import matched, read_robot_poses, read_transform
     from dopepp.robot.calibration.tool import bench_of_board
 
     if camera is None or hand_eye is None:

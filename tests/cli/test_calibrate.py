@@ -13,8 +13,7 @@ from dopepp.cli import app
 from dopepp.core.files import write_png
 from dopepp.geometry.camera import camera_matrix, invert_transform, make_transform
 from dopepp.geometry.camera_file import Camera, read_camera
-from dopepp.robot.calibration.board import parse_board
-from dopepp.robot.calibration.drawn import draw_view
+from dopepp.robot.calibration.board import draw_view, parse_board
 from dopepp.robot.calibration.files import (
     read_transform,
     transform_record,

@@ -1,7 +1,8 @@
-"""Calibration boards: printed at true scale, found on pictures.
+"""Calibration boards: printed at true scale, found on pictures, with their poses.
 
 A board's frame has its origin at the first point, x along the columns, y along the rows and z
-into the board. To add a kind, write its points, its picture and its finder below.
+into the board. :func:`draw_view` renders pictures of a board to rehearse a calibration. To add a
+kind, write its points, its picture and its finder below.
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_whole
 from dopepp.drawing.pictures import Picture
+from dopepp.geometry.camera import Transform, make_transform
+from dopepp.geometry.camera_file import Camera
 
 PX_PER_MM: Final = 10
 """Of a printed board: 254 dots per inch, so that sizes in tenths of millimetres are exact."""
@@ -38,6 +42,17 @@ SPELLING: Final = (
 DICTIONARY: Final = "5X5_100"
 
 
+PIXEL_NOISE: Final = 0.1
+"""Of a found point, pixels, where the picture itself shows less."""
+
+OVERSAMPLED: Final = 2
+
+BACKGROUND: Final = 110
+
+
+Transforms = Float[np.ndarray, "poses 4 4"]
+
+
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """A board on a picture.
@@ -51,6 +66,25 @@ class Sighting:
     name: str
     points: Float[np.ndarray, "n 3"]
     pixels: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """A board's pose on a picture.
+
+    Attributes:
+        name: The picture's.
+        T_cam_board: The pose.
+        covariance: Of a turn about the board's origin and a shift, camera axes (radians, metres).
+        error_px: RMS reprojection error, pixels.
+        distance: From the camera to the middle of the points, metres.
+    """
+
+    name: str
+    T_cam_board: Transform
+    covariance: Float[np.ndarray, "6 6"]
+    error_px: float
+    distance: float
 
 
 @dataclass(frozen=True)
@@ -212,3 +246,103 @@ def _check(board: Board, text: str) -> None:
 
 def _refused(text: str, allowed: str) -> UserError:
     return UserError(f"board {text!r:.100}", allowed, "e.g. charuco:8x11:20:15")
+
+
+def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
+    """Find a board's pose from its points on a picture of a calibrated camera.
+
+    A :class:`UserError`: the points give no pose.
+    """
+    points, pixels = sighting.points, sighting.pixels
+    lens = camera.coefficients
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, pixels, camera.K, lens, flags=cv2.SOLVEPNP_IPPE
+    )
+    found = [
+        cv2.solvePnPRefineLM(points, pixels, camera.K, lens, turn.copy(), shift.copy())
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    projected = [cv2.projectPoints(points, *one, camera.K, lens) for one in found]
+    errors = [float(np.square(one[0][:, 0] - pixels).sum()) for one in projected]
+    if not errors or not np.isfinite(min(errors)):
+        raise UserError(
+            f"{sighting.name}: a board without a pose",
+            "a board seen from the front",
+            "leave it out",
+        )
+    best = int(np.argmin(errors))
+    turn, shift = found[best]
+    R = cv2.Rodrigues(turn)[0]
+    T = make_transform(R, shift.ravel())
+    count = len(points)
+    noise = max(PIXEL_NOISE**2, errors[best] / max(1, 2 * count - 6))
+    jacobian = _pose_jacobian(points, T, camera)
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
+    distance = float((T[:3, :3] @ points.mean(axis=0) + T[:3, 3])[2])
+    return BoardPose(sighting.name, T, covariance, float(np.sqrt(errors[best] / count)), distance)
+
+
+def _pose_jacobian(
+    points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
+) -> Float[np.ndarray, "m 6"]:
+    """Return how pixels move with a turn about the origin and a shift, camera axes."""
+    step = np.concatenate([np.full(3, 1e-5), np.full(3, 1e-6)])
+    columns = []
+    for k in range(6):
+        sides = []
+        for sign in (-1, 1):
+            delta = np.zeros(6)
+            delta[k] = sign * step[k]
+            moved = displaced(T[None], delta[None])[0]
+            turn = cv2.Rodrigues(moved[:3, :3])[0]
+            sides.append(
+                cv2.projectPoints(points, turn, moved[:3, 3], camera.K, camera.coefficients)[0]
+            )
+        columns.append((sides[1] - sides[0]).ravel() / (2 * step[k]))
+    return np.stack(columns, axis=1)
+
+
+def displaced(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
+    """Turn poses about their own origins and shift them."""
+    moved = T.copy()
+    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
+    moved[:, :3, 3] += step[:, 3:]
+    return moved
+
+
+def draw_view(
+    board: Board,
+    T_cam_board: Transform,
+    camera: Camera,
+    rng: np.random.Generator,
+    noise: float = 4.0,
+) -> Picture:
+    """Draw a board at a pose, with the camera's lens and noise (grey levels).
+
+    Every pixel looks along its ray at the board's plane; two by two rays a pixel.
+    """  # fmt: skip
+    assert camera.size is not None
+    width, height = camera.size
+    steps = (np.arange(OVERSAMPLED) + 0.5) / OVERSAMPLED - 0.5
+    u = (np.arange(width)[:, None] + steps).ravel()
+    v = (np.arange(height)[:, None] + steps).ravel()
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(pixels, camera.K, camera.coefficients)[:, 0]
+    R, t = T_cam_board[:3, :3], T_cam_board[:3, 3]
+    # A point of the board, (x, y, 0), is seen along R[:, :2] (x, y) + t.
+    homography = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t]))
+    on_board = np.column_stack([rays, np.ones(len(rays))]) @ homography.T
+    at = 1000 * PX_PER_MM * on_board[:, :2] / on_board[:, 2:]
+    at = (at + board.first_px - 0.5).astype(np.float32).reshape(len(v), len(u), 2)
+    page = cv2.GaussianBlur(board.drawing(), (0, 0), 0.4 * PX_PER_MM * _mm_per_pixel(camera, t))
+    drawn = cv2.remap(
+        page, at[..., 0], at[..., 1], cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=BACKGROUND,
+    )  # fmt: skip
+    grey = drawn.reshape(height, OVERSAMPLED, width, OVERSAMPLED).mean(axis=(1, 3))
+    grey = 20 + 0.8 * grey + rng.normal(0, noise, grey.shape)
+    return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _mm_per_pixel(camera: Camera, t: np.ndarray) -> float:
+    return float(1000 * t[2] / camera.K[0, 0])

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
@@ -29,17 +28,11 @@ from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, invert_transform, make_transform
-from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import Sighting
+from dopepp.robot.calibration.board import BoardPose, Transforms, displaced
 
 Mount = Literal["hand", "bench"]
 
-Transforms = Float[np.ndarray, "poses 4 4"]
-
 MIN_POSES: Final = 3
-
-PIXEL_NOISE: Final = 0.1
-"""Of a found point, pixels, where the picture itself shows less."""
 
 ROBOT_NOISE: Final = (0.0005, 0.0005)
 """Of a robot's pose to begin with: radians and metres; what the poses show replaces it."""
@@ -50,25 +43,6 @@ in two million of those that do not, with six degrees of freedom."""
 
 MEDIAN_CHI2: Final = 5.348
 """Median of chi-squared with six degrees of freedom."""
-
-
-@dataclass(frozen=True, eq=False)
-class BoardPose:
-    """A board's pose on a picture.
-
-    Attributes:
-        name: The picture's.
-        T_cam_board: The pose.
-        covariance: Of a turn about the board's origin and a shift, camera axes (radians, metres).
-        error_px: RMS reprojection error, pixels.
-        distance: From the camera to the middle of the points, metres.
-    """
-
-    name: str
-    T_cam_board: Transform
-    covariance: Float[np.ndarray, "6 6"]
-    error_px: float
-    distance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,60 +78,6 @@ def check_mount(mount: str) -> Mount:
     if mount == "bench":
         return "bench"
     raise UserError(f"--mount {mount}", "hand or bench", "say where the camera is")
-
-
-def board_pose(sighting: Sighting, camera: Camera) -> BoardPose:
-    """Find a board's pose from its points on a picture of a calibrated camera.
-
-    A :class:`UserError`: the points give no pose.
-    """
-    points, pixels = sighting.points, sighting.pixels
-    lens = camera.coefficients
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        points, pixels, camera.K, lens, flags=cv2.SOLVEPNP_IPPE
-    )
-    found = [
-        cv2.solvePnPRefineLM(points, pixels, camera.K, lens, turn.copy(), shift.copy())
-        for turn, shift in zip(turns, shifts, strict=True)
-    ]
-    projected = [cv2.projectPoints(points, *one, camera.K, lens) for one in found]
-    errors = [float(np.square(one[0][:, 0] - pixels).sum()) for one in projected]
-    if not errors or not np.isfinite(min(errors)):
-        raise UserError(
-            f"{sighting.name}: a board without a pose",
-            "a board seen from the front",
-            "leave it out",
-        )
-    best = int(np.argmin(errors))
-    turn, shift = found[best]
-    R = cv2.Rodrigues(turn)[0]
-    T = make_transform(R, shift.ravel())
-    count = len(points)
-    noise = max(PIXEL_NOISE**2, errors[best] / max(1, 2 * count - 6))
-    jacobian = _pose_jacobian(points, T, camera)
-    covariance = np.linalg.inv(jacobian.T @ jacobian) * noise
-    distance = float((T[:3, :3] @ points.mean(axis=0) + T[:3, 3])[2])
-    return BoardPose(sighting.name, T, covariance, float(np.sqrt(errors[best] / count)), distance)
-
-
-def _pose_jacobian(
-    points: Float[np.ndarray, "n 3"], T: Transform, camera: Camera
-) -> Float[np.ndarray, "m 6"]:
-    """Return how pixels move with a turn about the origin and a shift, camera axes."""
-    step = np.concatenate([np.full(3, 1e-5), np.full(3, 1e-6)])
-    columns = []
-    for k in range(6):
-        sides = []
-        for sign in (-1, 1):
-            delta = np.zeros(6)
-            delta[k] = sign * step[k]
-            moved = _moved(T[None], delta[None])[0]
-            turn = cv2.Rodrigues(moved[:3, :3])[0]
-            sides.append(
-                cv2.projectPoints(points, turn, moved[:3, 3], camera.K, camera.coefficients)[0]
-            )
-        columns.append((sides[1] - sides[0]).ravel() / (2 * step[k]))
-    return np.stack(columns, axis=1)
 
 
 def calibrate_hand_eye(
@@ -255,12 +175,12 @@ def refined(
     whitening = np.linalg.inv(np.linalg.cholesky(_covariances(M, X, Y, seen, robot)))
 
     def residuals(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, "numbers"]:
-        moved = _moved(np.stack([X, Y]), step.reshape(2, 6))
+        moved = displaced(np.stack([X, Y]), step.reshape(2, 6))
         return np.asarray((whitening @ _residuals(M, B, *moved)[..., None]).ravel())
 
     scale = np.tile(np.repeat([1e-3, 1e-3], 3), 2)
     found = least_squares(residuals, np.zeros(12), x_scale=scale, loss="soft_l1", f_scale=3.0)
-    moved = _moved(np.stack([X, Y]), found.x.reshape(2, 6))
+    moved = displaced(np.stack([X, Y]), found.x.reshape(2, 6))
     jacobian = np.asarray(found.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)[:6, :6]
     turn = np.kron(np.eye(2), moved[0][:3, :3])  # to the camera's own axes
@@ -332,14 +252,6 @@ def _distances(
     residuals = _residuals(M, B, X, Y)
     whole = np.linalg.solve(_covariances(M, X, Y, seen, robot), residuals[..., None])[..., 0]
     return np.asarray((residuals * whole).sum(axis=1))
-
-
-def _moved(T: Transforms, step: Float[np.ndarray, "poses 6"]) -> Transforms:
-    """Turn poses about their own origins and shift them."""
-    moved = T.copy()
-    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
-    moved[:, :3, 3] += step[:, 3:]
-    return moved
 
 
 def inverted(T: Transforms) -> Transforms:

@@ -28,9 +28,8 @@ from dopepp.geometry.camera import (
 )
 from dopepp.geometry.camera_file import Camera
 from dopepp.geometry.rotation import Vector, rotation_angle
-from dopepp.robot.calibration.board import parse_board
-from dopepp.robot.calibration.drawn import draw_view
-from dopepp.robot.calibration.hand_eye import board_pose, calibrate_hand_eye
+from dopepp.robot.calibration.board import board_pose, draw_view, parse_board
+from dopepp.robot.calibration.hand_eye import calibrate_hand_eye
 from dopepp.robot.calibration.lens import calibrate_lens
 from dopepp.robot.calibration.tool import find_bench, find_tip
 from dopepp.robot.grasping.cell import JOINTS, TRAY

@@ -13,8 +13,7 @@ from dopepp.geometry.camera import (
     transform,
 )
 from dopepp.geometry.camera_file import Camera
-from dopepp.robot.calibration.board import parse_board
-from dopepp.robot.calibration.drawn import draw_view
+from dopepp.robot.calibration.board import draw_view, parse_board
 
 BOARDS = ["charuco:8x6:20:15", "charuco:7x5:24.5:18:4X4_50", "chess:8x5:20", "circles:4x9:30"]
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.faults import check_poses
-from dopepp.robot.calibration.hand_eye import board_pose
-from dopepp.robot.calibration.robot_poses import Reading, read_robot_poses
+from dopepp.robot.calibration.board import board_pose
+from dopepp.robot.calibration.files import Reading, read_robot_poses
+from dopepp.robot.calibration.quality import check_poses
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 

@@ -4,14 +4,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.explanation import expected_error, explain
-from dopepp.robot.calibration.hand_eye import (
-    board_pose,
-    calibrate_hand_eye,
-    equations,
-    park,
-    shah,
-)
+from dopepp.robot.calibration.board import board_pose
+from dopepp.robot.calibration.hand_eye import calibrate_hand_eye, equations, park, shah
+from dopepp.robot.calibration.quality import expected_error, explain
 
 
 def boards_of(cell):

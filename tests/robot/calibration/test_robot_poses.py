@@ -7,7 +7,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dopepp.core.errors import UserError
-from dopepp.robot.calibration.robot_poses import Reading, matched, read_robot_poses
+from dopepp.robot.calibration.files import Reading, matched, read_robot_poses
 
 TURN = Rotation.from_euler("xyz", [0.3, -0.5, 1.2])
 AT = [0.4, -0.1, 0.3]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dopepp.robot.calibration.board import Sighting, parse_board
-from dopepp.robot.calibration.views import MAX_VIEWS, Views
+from dopepp.robot.calibration.lens import MAX_VIEWS, Views
 
 POINTS = parse_board("charuco:8x6:25:19").points
 
