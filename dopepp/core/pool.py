@@ -1,7 +1,7 @@
 """Pools that apply a function to many items: processes of this machine, or a Ray cluster.
 
-A pool takes the pickled function once and yields an :class:`Outcome` for each item as soon as it is
-done. What the function raises belongs to its item, and so does a lost process: other items go on.
+A pool takes the pickled function once and yields each item with its future as soon as that is done.
+What the function raises belongs to its item, and so does a lost process: other items go on.
 
 ``concurrent.futures.ProcessPoolExecutor`` and loky do not keep these promises. They lose every item
 in progress with one process, do not say what it died of, and leave processes behind when their
@@ -25,28 +25,21 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 from dopepp.core.errors import UserError, require
 
 _log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
 
-THREAD_LIMITS: Final = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
+_LIMITED: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMBA_NUM")
+
+THREAD_LIMITS: Final = tuple(f"{library}_THREADS" for library in _LIMITED)
 """Environment variables that limit the threads of libraries loaded after they are set."""
 
 _ITEMS_PER_WORKER: Final = 2
@@ -57,11 +50,6 @@ _PATIENCE_S: Final = 3.0
 
 _CORES_EVERY_S: Final = 10.0
 """How often the cluster is asked for its number of cores, which may change."""
-
-_CONNECT_S: Final = 5.0
-
-_OBJECT_STORE_BYTES: Final = 200_000_000
-"""Object store of a local cluster; it holds the function, a few megabytes, and results."""
 
 
 def available_cores() -> int:
@@ -93,25 +81,6 @@ class LostWorkerError(RuntimeError):
     """A process, or a machine of the cluster, that died over an item."""
 
 
-@dataclass(frozen=True)
-class Outcome(Generic[Item, Result]):
-    """Result of the function for an item.
-
-    Attributes:
-        error: What the function raised, or a :class:`LostWorkerError`; None if it returned.
-    """
-
-    item: Item
-    value: Result | None = None
-    error: Exception | None = None
-
-    def result(self) -> Result:
-        """Return the function's value or raise its error."""
-        if self.error is not None:
-            raise self.error
-        return self.value  # type: ignore[return-value]
-
-
 class PickledFunction:
     """A function from its pickle, unpickled with the first item, so that a failure belongs to it.
 
@@ -134,6 +103,14 @@ class PickledFunction:
             return pickle.dumps((None, RuntimeError(traceback.format_exc())))
 
 
+def opened(answer: bytes) -> Any:
+    """Return what the function returned, from :class:`PickledFunction`'s answer, or raise."""
+    value, error = pickle.loads(answer)
+    if error is not None:
+        raise error
+    return value
+
+
 class Pool(ABC):
     """Applies a pickled function to items, several at once; a context manager that ends it."""
 
@@ -154,20 +131,12 @@ class Pool(ABC):
     def submit(self, item: object) -> Future[Any]:
         """Hand out an item."""
 
-    def answer(self, future: Future[Any]) -> bytes:
-        """Return what :class:`PickledFunction` returned, from a future that is done.
+    def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Future[Any]]]:
+        """Yield items and their futures in the order in which they are done.
 
-        Raises:
-            LostWorkerError: The worker died.
-        """
-        answer: bytes = future.result()
-        return answer
-
-    def run(self, items: Iterable[Item]) -> Iterator[Outcome[Item, Any]]:
-        """Yield the outcomes of items in the order in which they are done.
-
-        Items are read only as far as there is :meth:`room`, and after the outcomes so far were
-        yielded, because these may decide what comes next.
+        A future raises what the function raised, or a :class:`LostWorkerError`. Items are read only
+        as far as there is :meth:`room`, and after what is done was yielded, because that may decide
+        what comes next.
         """
         waiting, flying = iter(items), dict[Future[Any], Item]()
         while True:
@@ -176,12 +145,7 @@ class Pool(ABC):
             if not flying:
                 return
             for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                item = flying.pop(future)
-                try:
-                    value, error = pickle.loads(self.answer(future))
-                except LostWorkerError as lost:
-                    value, error = None, lost
-                yield Outcome(item, value, error)
+                yield flying.pop(future), future
 
 
 class _Worker(threading.local):
@@ -231,11 +195,11 @@ class ProcessPool(Pool):
         """Return how many items may be handed out at a time."""
         return self._num_workers * _ITEMS_PER_WORKER
 
-    def submit(self, item: object) -> Future[bytes]:
+    def submit(self, item: object) -> Future[Any]:
         """Hand out an item."""
         return self._threads.submit(self._apply, item)
 
-    def _apply(self, item: object) -> bytes:
+    def _apply(self, item: object) -> Any:
         worker = self._worker
         is_new = worker.process is None
         process = worker.process = worker.process or self._start()
@@ -244,7 +208,7 @@ class ProcessPool(Pool):
                 # Not an argument of the process, whose start would wait until megabytes are read.
                 worker.connection.send_bytes(self._content)
             worker.connection.send(item)
-            return worker.connection.recv_bytes()
+            answer = worker.connection.recv_bytes()
         except (EOFError, OSError) as error:
             worker.process = None
             process.join(_PATIENCE_S)
@@ -253,6 +217,7 @@ class ProcessPool(Pool):
             raise LostWorkerError(
                 f"a worker process died ({how}); if memory was short, use fewer --workers"
             ) from error
+        return opened(answer)
 
     def _start(self) -> SpawnProcess:
         context = get_context("spawn")
@@ -308,7 +273,7 @@ class ClusterPool(Pool):
     """Tasks of a Ray cluster; the same results on any number of machines.
 
     Every machine must see the same files under the same paths and have the same dopepp. Ray repeats
-    the tasks of a machine that is lost.
+    the tasks of a machine that is lost. ``num_tasks`` counts the tasks done by the node's id.
 
     Args:
         content: Pickled function of one item.
@@ -317,9 +282,6 @@ class ClusterPool(Pool):
         asked_by: The choice that needs Ray, for messages.
         option: The option that holds the address, for messages.
         task_options: Options of ``ray.remote`` for a task, e.g. ``num_gpus`` (default: one core).
-
-    Attributes:
-        num_tasks: Number of tasks done so far, by the node's id.
 
     Raises:
         UserError: Ray is not installed, or there is no cluster at the address.
@@ -361,21 +323,25 @@ class ClusterPool(Pool):
             self._room, self._asked_at = max(cores, 1) * _ITEMS_PER_WORKER, time.monotonic()
         return self._room
 
-    def submit(self, item: object) -> Future[tuple[bytes, str]]:
+    def submit(self, item: object) -> Future[Any]:
         """Hand out an item."""
-        future: Future[tuple[bytes, str]]
-        future = self._apply.remote(self._content, self._content[0].hex(), item).future()
-        return future
+        result: Future[Any] = Future()
 
-    def answer(self, future: Future[tuple[bytes, str]]) -> bytes:
-        """Return the function's answer and count the task."""
-        try:
-            answer, node = future.result()
-        except self._ray.exceptions.RayError as error:
-            reason = " ".join(str(error).split())
-            raise LostWorkerError(f"Ray: {type(error).__name__}: {reason[:300]}") from error
-        self.num_tasks[node] += 1
-        return answer
+        def finish(answered: Future[tuple[bytes, str]]) -> None:
+            try:
+                answer, node = answered.result()
+                self.num_tasks[node] += 1
+                result.set_result(opened(answer))
+            except self._ray.exceptions.RayError as error:
+                reason = " ".join(str(error).split())
+                lost = LostWorkerError(f"Ray: {type(error).__name__}: {reason[:300]}")
+                result.set_exception(lost)
+            except Exception as error:  # the function's
+                result.set_exception(error)
+
+        answered = self._apply.remote(self._content, self._content[0].hex(), item).future()
+        answered.add_done_callback(finish)
+        return result
 
 
 def _connect(address: str | None, num_workers: int, asked_by: str, option: str) -> Any:
@@ -390,7 +356,7 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
             "address": "local",
             "num_cpus": num_workers,
             "include_dashboard": False,
-            "object_store_memory": _OBJECT_STORE_BYTES,
+            "object_store_memory": 200_000_000,  # bytes, for the function and results
             "_node_ip_address": "127.0.0.1",
         }
     else:
@@ -398,7 +364,7 @@ def _connect(address: str | None, num_workers: int, asked_by: str, option: str) 
     try:
         if address is not None:  # Ray itself would try for many minutes
             host, _, port = address.rpartition(":")
-            socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
+            socket.create_connection((host, int(port)), timeout=5.0).close()
         ray.init(**options)
     except (OSError, ValueError, OverflowError, RuntimeError) as error:
         raise UserError(

@@ -27,7 +27,6 @@ from dopepp.core.interrupts import StoppedError, stopped
 from dopepp.core.pool import (
     ClusterPool,
     LostWorkerError,
-    Outcome,
     Pool,
     ProcessPool,
     available_cores,
@@ -264,8 +263,8 @@ def render_dataset(
         with open_pool(pickle.dumps(RenderTasks(job, root))) as pool:
             # Renders and, between them, finalizes; then the finalizes of what was rendered last.
             for tasks in (run.tasks(pool.batch_size), run.finalizes()):
-                for outcome in pool.run(tasks):
-                    run.note(outcome)
+                for task, future in pool.run(tasks):
+                    run.note(task, *future.result())
                     on_progress(run.num_there, run.report.num_images)
     except LostWorkerError as error:
         raise StoppedError(str(error)) from error
@@ -299,9 +298,8 @@ class _Run:
             number = self._complete.popleft()
             yield Task(number, self._chunks[number].required, finalizes=True)
 
-    def note(self, outcome: Outcome[Task, tuple[float, float]]) -> None:
-        """Count an outcome, or raise its error."""
-        task, (render_s, write_s) = outcome.item, outcome.result()
+    def note(self, task: Task, render_s: float, write_s: float) -> None:
+        """Count a task that is done."""
         if task.finalizes:
             return
         self.report.render_s += render_s

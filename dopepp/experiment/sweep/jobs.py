@@ -164,9 +164,11 @@ def on_ray(address: str | None, num_cpus: float, num_gpus: float) -> Runner:
 def _run(pool: Pool, overrides: Mapping[int, list[str]]) -> Ended:
     """Yield the results of jobs, or the loss of their process."""
     with pool:
-        for outcome in pool.run(overrides.items()):
-            lost = outcome.error if isinstance(outcome.error, LostWorkerError) else None
-            yield outcome.item[0], lost or outcome.result()
+        for (number, _), future in pool.run(overrides.items()):
+            try:
+                yield number, future.result()
+            except LostWorkerError as error:
+                yield number, error
 
 
 def on_slurm(folder: str, cluster: str, max_num_timeout: int, sbatch: Mapping[str, Any]) -> Runner:

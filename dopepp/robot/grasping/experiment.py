@@ -144,10 +144,11 @@ def run_trials(task: Task, count: int, workers: int) -> Iterator[Record]:
             yield from attempts(number)
         return
     with ProcessPool(pickle.dumps(attempts), min(workers, count)) as pool:
-        for outcome in pool.run(range(count)):
-            if isinstance(outcome.error, LostWorkerError):
-                raise RunError(str(outcome.error)) from outcome.error
-            yield from outcome.result()
+        for _, future in pool.run(range(count)):
+            try:
+                yield from future.result()
+            except LostWorkerError as error:
+                raise RunError(str(error)) from error
 
 
 class _Attempts:

@@ -73,9 +73,9 @@ def test_both_nodes_work_and_a_lost_node_costs_nothing(two_nodes, small_job, tmp
     second = two_nodes.add_node(num_cpus=1, object_store_memory=80_000_000)
     done = []
     with ClusterPool(pickle.dumps(RenderTasks(job, tmp_path)), two_nodes.address, 1) as pool:
-        for outcome in pool.run(Task(0, range(i, i + 8)) for i in range(0, 160, 8)):
-            outcome.result()
-            done += outcome.item.indices
+        for task, future in pool.run(Task(0, range(i, i + 8)) for i in range(0, 160, 8)):
+            future.result()
+            done += task.indices
             if len(done) == 40:
                 two_nodes.remove_node(second, allow_graceful=False)
     assert sorted(done) == list(range(160))

@@ -19,7 +19,7 @@ from rich.console import Console
 from dopepp.core.errors import UserError
 from dopepp.core.files import partial_path
 from dopepp.core.interrupts import StoppedError
-from dopepp.core.pool import PickledFunction, Pool
+from dopepp.core.pool import PickledFunction, Pool, opened
 from dopepp.data.formats import RECORD_FILE
 from dopepp.data.formats.ndds.writer import NddsWriter
 from dopepp.data.jobs.job import WRITERS, make_job, named_part
@@ -47,12 +47,15 @@ class InlinePool(Pool):
     def room(self) -> int:
         return 1
 
-    def submit(self, item: object) -> Future[bytes]:
+    def submit(self, item: object) -> Future[object]:
         if self._left == 0:
             raise KeyboardInterrupt
         self._left = None if self._left is None else self._left - 1
-        future: Future[bytes] = Future()
-        future.set_result(self._function(item))
+        future: Future[object] = Future()
+        try:
+            future.set_result(opened(self._function(item)))
+        except Exception as error:
+            future.set_exception(error)
         return future
 
 
@@ -271,7 +274,7 @@ def test_a_part_can_be_given_a_name(tmp_path):
         (["lighting.tint=0.1", "lighting.tint=0.2"], "after another --set"),
         (["lighting.tint=0.1", "lighting=1"], "after another --set"),
         (["width=64", "width.x=1"], "after another --set"),
-        (["lighting.tint=blue"], "'blue' for tint"),
+        (["lighting.tint=blue"], "lighting.tint='blue'"),
     ],
 )
 def test_changes_that_cannot_be_made(changes, message):
@@ -283,7 +286,7 @@ def test_changes_reach_the_preset(small_job):
     preset = small_job(changes=["lighting.num_lights=[2,3]", "min_visible_fraction=0.25"])
     assert preset.factory.preset.lighting.num_lights == (2, 3)
     assert preset.factory.preset.min_visible_fraction == 0.25
-    assert preset.record["preset"]["lighting"]["num_lights"] == [2, 3]
+    assert tuple(preset.record["preset"]["lighting"]["num_lights"]) == (2, 3)
     json.dumps(preset.record, allow_nan=False)
 
 
