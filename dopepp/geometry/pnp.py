@@ -27,6 +27,8 @@ from dopepp.geometry.refine import (
     MIN_POINTS,
     NO_GATE,
     Correspondences,
+    column_mean,
+    copy_pose,
     degenerate,
     normal_equations,
     refine_pose,
@@ -243,11 +245,21 @@ def _concluded(
     for k in range(3):
         moved[k] = R[k, 0] * centre[0] + R[k, 1] * centre[1] + R[k, 2] * centre[2]
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, size * t - moved
+    for k in range(3):
+        T[k, 3] = size * t[k] - moved[k]
+        for m in range(3):
+            T[k, m] = R[k, m]
     pixels = np.empty(whitening.shape)
-    pixels[:] = to_px
+    for i in range(len(pixels)):
+        for k in range(2):
+            for m in range(2):
+                pixels[i, k, m] = to_px[k, m]
     reproject(object_points, rays, pixels, R, t, residuals)
-    error = math.sqrt((residuals**2).sum() / len(rays))
+    squared = 0.0
+    for i in range(len(rays)):
+        for k in range(2):
+            squared += residuals[i, k] ** 2
+    error = math.sqrt(squared / len(rays))
     carry = np.zeros((6, 6))
     for k in range(3):
         carry[k, k], carry[3 + k, 3 + k] = 1.0, size
@@ -337,7 +349,7 @@ def _improved(
     R, t = np.empty((3, 3)), np.empty(3)
     for s in costs.argsort()[:NUM_STARTS]:
         for tilt in range(2 if is_plate else 1):
-            R[:], t[:] = rotations[s], starts[s, 3:]
+            copy_pose(rotations[s], starts[s, 3:], R, t)
             if tilt:
                 _mirror(R, t, normal)
             refine_pose(object_points, rays, whitening, R, t, GATE)
@@ -346,7 +358,8 @@ def _improved(
             reproject(object_points, rays, whitening, R, t, residuals)
             cost = _truncated_cost(residuals)
             if cost < best:
-                best, best_R[:], best_t[:] = cost, R, t
+                best = cost
+                copy_pose(R, t, best_R, best_t)
                 for i in range(len(rays)):
                     agree[i] = residuals[i, 0] ** 2 + residuals[i, 1] ** 2 <= GATE**2
     return best
@@ -387,7 +400,9 @@ def _principal_axes(points: Array) -> tuple[Array, Array]:
     # At least three rows give three axes.
     centred = np.zeros((n, 3))
     for axis in range(3):
-        centred[:, axis] = points[:, axis] - points[:, axis].mean()
+        mean = column_mean(points, axis)
+        for i in range(n):
+            centred[i, axis] = points[i, axis] - mean
     _, extents, axes = np.linalg.svd(centred, False)
     return extents, axes
 

@@ -89,7 +89,10 @@ def refine_pose(
         moved_cost = _robust_cost(moved_residuals, gate)
         if moved_cost < cost:
             arrived = cost - moved_cost <= CONVERGED * cost + ROUNDING
-            R[:], t[:], residuals[:], cost = moved_R, moved_t, moved_residuals, moved_cost
+            cost = moved_cost
+            copy_pose(moved_R, moved_t, R, t)
+            for i in range(n):
+                residuals[i, 0], residuals[i, 1] = moved_residuals[i, 0], moved_residuals[i, 1]
             if arrived:
                 return
             damping = max(damping / 10, LEAST_DAMPING)
@@ -123,6 +126,15 @@ def reproject(
 
 
 @compiled()
+def copy_pose(R: Array, t: Array, to_R: Array, to_t: Array) -> None:
+    """Write a pose over another; assigned slices would take a second to compile."""
+    for r in range(3):
+        to_t[r] = t[r]
+        for c in range(3):
+            to_R[r, c] = R[r, c]
+
+
+@compiled()
 def _robust_cost(residuals: Array, gate: float) -> float:
     """Return Σ r²/(r² + g²); an infinite or unknown r counts as 1."""
     cost = 0.0
@@ -150,7 +162,10 @@ def normal_equations(
     d(Exp(ω) p)/dω = −[p]×, a row a becomes −a [p]× = p × a with p = R x_obj. The weights are the
     derivative of r²/(r² + g²) by r², up to g². Points behind the camera take no part.
     """
-    hessian[:], gradient[:] = 0.0, 0.0
+    for c in range(6):
+        gradient[c] = 0.0
+        for d in range(6):
+            hessian[c, d] = 0.0
     rows, own = np.empty((2, 6)), np.empty(6)
     for i in range(len(rays)):
         squared = residuals[i, 0] ** 2 + residuals[i, 1] ** 2
@@ -277,13 +292,23 @@ def _spreads(
     n = len(object_points)
     extent = 0.0
     for axis in range(3):
-        extent = max(extent, np.ptp(object_points[:, axis]))
+        lowest = highest = object_points[0, axis]
+        for i in range(n):
+            lowest = min(lowest, object_points[i, axis])
+            highest = max(highest, object_points[i, axis])
+        extent = max(extent, highest - lowest)
     centred, spread, sigma = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
     for axis in range(3):
-        values = object_points[:, axis]
-        centred[:, axis] = (values - values.mean()) / extent  # NaN for a single place
+        mean = column_mean(object_points, axis)
+        for i in range(n):
+            centred[i, axis] = (object_points[i, axis] - mean) / extent  # NaN for a single place
     for i in range(n):
-        sigma[i] = (whitening[i, 0, 0] * whitening[i, 1, 1]) ** -0.5
+        deviation = (whitening[i, 0, 0] * whitening[i, 1, 1]) ** -0.5
+        place = i
+        while place > 0 and sigma[place - 1] > deviation:
+            sigma[place] = sigma[place - 1]
+            place -= 1
+        sigma[place] = deviation
         for axis in range(2):
             spread[i, axis] = to_px[axis, 0] * rays[i, 0] + to_px[axis, 1] * rays[i, 1]
     distinct = 0.0
@@ -294,7 +319,26 @@ def _spreads(
             new &= abs(dx) > SAME_PIXEL or abs(dy) > SAME_PIXEL
         distinct += new
     for axis in range(2):
-        spread[:, axis] -= spread[:, axis].mean()
+        mean = column_mean(spread, axis)
+        for i in range(n):
+            spread[i, axis] -= mean
     solid = np.linalg.svd(centred, False)[1] if np.isfinite(centred).all() else np.zeros(3)
     flat = np.linalg.svd(spread, False)[1] if np.isfinite(spread).all() else np.zeros(2)
-    return extent, solid[0], solid[1], distinct, flat[0], flat[1], np.median(sigma)
+    return (
+        extent,
+        solid[0],
+        solid[1],
+        distinct,
+        flat[0],
+        flat[1],
+        0.5 * (sigma[(n - 1) // 2] + sigma[n // 2]),
+    )
+
+
+@compiled()
+def column_mean(rows: Array, column: int) -> float:
+    """Return the mean of a column."""
+    total = 0.0
+    for i in range(len(rows)):
+        total += rows[i, column]
+    return total / len(rows)

@@ -94,8 +94,8 @@ def fit_peaks(
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
     for i in range(count):
         _own_cells(i, windows, cells, position, scores, sigma, MARGIN, own[i])
-        squared, used, _ = _step(
-            windows[i], own[i], theta[i], 0.0, sigma, work, room, hessian[i], False
+        squared, used = _linearised(
+            windows[i], own[i], theta[i], 0.0, sigma, work, room[0], hessian[i]
         )
         noise += squared * scores[i] ** 2
         freedom += max(used - 6.0, 0.0)
@@ -104,10 +104,8 @@ def fit_peaks(
         relative = noise / scores[i] ** 2
         _fit_logarithm(windows[i], logarithms[i], own[i], sigma, relative, work, room, theta[i])
         for _ in range(STEPS if theta[i].any() else 0):
-            _, _, move = _step(
-                windows[i], own[i], theta[i], relative, sigma, work, room, hessian[i], True
-            )
-            if move < ARRIVED:
+            _linearised(windows[i], own[i], theta[i], relative, sigma, work, room[0], hessian[i])
+            if _step(theta[i], hessian[i], room) < ARRIVED:
                 break
         u, v, sound = _mode(windows[i], theta[i])
         position[i, 0], position[i, 1] = cells[i, 0] + u, cells[i, 1] + v
@@ -167,7 +165,8 @@ def mean_vectors(
                     toward[i, 0] += weight * u
                     toward[i, 1] += weight * v
         if total > 0.0:
-            toward[i] /= total
+            toward[i, 0] /= total
+            toward[i, 1] /= total
 
 
 @compiled()
@@ -252,20 +251,19 @@ def _fit_logarithm(
 
 
 @compiled()
-def _step(
+def _linearised(
     window: Array,
     own: Array,
     theta: Array,
     noise: float,
     sigma: float,
     work: Array,
-    room: Array,
+    gradient: Array,
     hessian: Array,
-    move: bool,
-) -> tuple[float, float, float]:
-    """Take a Gauss–Newton step on b with a prior on the shape.
+) -> tuple[float, float]:
+    """Write the normal equations of b with a prior on the shape.
 
-    Returned are Σ residual² before it, the number of cells, and the largest move of a parameter.
+    Returned are Σ residual² and the number of cells.
     """
     side = len(window)
     half = side // 2
@@ -285,14 +283,22 @@ def _step(
                 used += 1.0
                 _add(work, x - half, model * model, model * residual)
         _end_row(work, y - half)
-    _system(work, theta, noise, sigma, hessian, room[0])
+    _system(work, theta, noise, sigma, hessian, gradient)
+    return squared, used
+
+
+@compiled()
+def _step(theta: Array, hessian: Array, room: Array) -> float:
+    """Take the Gauss–Newton step whose gradient is the room's first row; return its length.
+
+    That is the largest move of a parameter.
+    """
+    solve_inside(hessian, room[0], 0.0, room[1], room[4:])
     farthest = 0.0
-    if move:
-        solve_inside(hessian, room[0], 0.0, room[1], room[4:])
-        for k in range(6):
-            theta[k] += room[1, k]
-            farthest = max(farthest, abs(room[1, k]))
-    return squared, used, farthest
+    for k in range(6):
+        theta[k] += room[1, k]
+        farthest = max(farthest, abs(room[1, k]))
+    return farthest
 
 
 @compiled()

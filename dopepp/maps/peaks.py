@@ -141,7 +141,8 @@ def _strongest(belief: Array, threshold: float, score: Array, cells: Array) -> i
                 continue
             k = count - 1
             while k > 0 and score[k - 1] < value:
-                score[k], cells[k] = score[k - 1], cells[k - 1]
+                score[k] = score[k - 1]
+                cells[k, 0], cells[k, 1] = cells[k - 1, 0], cells[k - 1, 1]
                 k -= 1
             score[k], cells[k, 0], cells[k, 1] = value, x, y
     return count

@@ -256,13 +256,16 @@ def _predict(
                     continue
                 usable[k] = min(usable[k] + 1, CANDIDATES)
                 for later in range(usable[k] - 1, place, -1):
-                    likeliest[k, later], arms[k, later] = (
-                        likeliest[k, later - 1],
-                        arms[k, later - 1],
-                    )
-                likeliest[k, place], arms[k, place] = value, position[k, m] - centroid[i]
+                    likeliest[k, later] = likeliest[k, later - 1]
+                    for axis in range(2):
+                        arms[k, later, axis] = arms[k, later - 1, axis]
+                likeliest[k, place] = value
+                for axis in range(2):
+                    arms[k, place, axis] = position[k, m, axis] - centroid[i, axis]
         deviation[i] = _best_triple(arms, likeliest, usable, area_px, expected[i])
-        expected[i] += centroid[i]
+        for k in range(NUM_CORNERS):
+            for axis in range(2):
+                expected[i, k, axis] += centroid[i, axis]
     return expected, deviation
 
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from dopepp.core.compiled import Array, compiled
+from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.geometry.camera import CameraMatrix, crop_camera, resize_camera
 
 SMALLEST_PX: Final = 12
@@ -205,24 +205,29 @@ def _count(
 def _tables(counts: Array, tables: Array) -> None:
     """Write the logarithm of the ratio for every tile and colour; ``counts`` are blurred."""
     tiles = counts.shape[1]
+    known, near = np.empty((2, STEPS**3), np.float32), np.empty((2, STEPS**3), np.float32)
     for side in range(2):
+        for k in range(STEPS**3):
+            known[side, k] = UNSEEN
         for i in range(tiles):
             for j in range(tiles):
-                _blur(counts[side, i, j].reshape(STEPS, STEPS, STEPS))
-    known = np.full((2, STEPS**3), np.float32(UNSEEN))
+                _blur(counts[side, i, j])
+                for k in range(STEPS**3):
+                    known[side, k] += counts[side, i, j, k]
+        factor = KNOWN / _sum(known[side])
+        for k in range(STEPS**3):
+            known[side, k] *= factor
     for i in range(tiles):
         for j in range(tiles):
-            known += counts[:, i, j]
-    for side in range(2):
-        known[side] *= KNOWN / known[side].sum()
-    near = np.empty_like(known)
-    for i in range(tiles):
-        for j in range(tiles):
-            near[:] = known
-            for a in range(max(0, i - 1), min(tiles, i + 2)):
-                for b in range(max(0, j - 1), min(tiles, j + 2)):
-                    near += np.float32(0.5 ** (abs(a - i) + abs(b - j))) * counts[:, a, b]
-            level = math.log(near[1].sum() / near[0].sum())
+            for side in range(2):
+                for k in range(STEPS**3):
+                    near[side, k] = known[side, k]
+                for a in range(max(0, i - 1), min(tiles, i + 2)):
+                    for b in range(max(0, j - 1), min(tiles, j + 2)):
+                        share = np.float32(0.5 ** (abs(a - i) + abs(b - j)))
+                        for k in range(STEPS**3):
+                            near[side, k] += share * counts[side, a, b, k]
+            level = math.log(_sum(near[1]) / _sum(near[0]))
             for k in range(STEPS**3):
                 odds = level + math.log(near[0, k] / near[1, k])
                 tables[i, j, k] = min(max(odds, -MOST), MOST)
@@ -236,22 +241,31 @@ def _look_up(bins: Array, rows: Array, columns: Array, tables: Array, odds: Arra
 
 
 @compiled()
-def _blur(counts: Array) -> None:
-    """Blur by (1, 2, 1)/4 along all three channels."""
-    for a in range(STEPS):
-        for b in range(STEPS):
-            _blur_row(counts[a, b])
-            _blur_row(counts[a, :, b])
-    for a in range(STEPS):
-        for b in range(STEPS):
-            _blur_row(counts[:, a, b])
+def _sum(row: Array) -> Scalar:
+    total = np.float32(0.0)
+    for k in range(len(row)):
+        total += row[k]
+    return total
 
 
 @compiled()
-def _blur_row(row: Array) -> None:
-    before = row[0]
+def _blur(counts: Array) -> None:
+    """Blur a histogram by (1, 2, 1)/4 along all three channels."""
+    for a in range(STEPS):
+        for b in range(STEPS):
+            rows = (((a * STEPS + b) * STEPS, 1), (a * STEPS * STEPS + b, STEPS))
+            for first, stride in rows:  # numba would compile a call for each constant stride
+                _blur_row(counts, first, stride)
+    for a in range(STEPS):
+        for b in range(STEPS):
+            _blur_row(counts, a * STEPS + b, STEPS * STEPS)
+
+
+@compiled()
+def _blur_row(counts: Array, first: int, stride: int) -> None:
+    before = counts[first]
     for i in range(STEPS):
-        own = row[i]
-        after = row[min(i + 1, STEPS - 1)]
-        row[i] = 0.25 * before + 0.5 * own + 0.25 * after
+        own = counts[first + i * stride]
+        after = counts[first + min(i + 1, STEPS - 1) * stride]
+        counts[first + i * stride] = 0.25 * before + 0.5 * own + 0.25 * after
         before = own

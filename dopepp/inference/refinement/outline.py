@@ -294,7 +294,9 @@ def _walk(
                 continue
             if count == len(rows):
                 longer = np.empty((2 * count, 7))
-                longer[:count] = rows
+                for k in range(count):
+                    for c in range(7):
+                        longer[k, c] = rows[k, c]
                 rows = longer
             # Halfway on the picture is not halfway in space.
             zi, zj = arms[i, 2] + distance, arms[j, 2] + distance

@@ -158,46 +158,89 @@ def _terms(
     ``independent`` is how many measurements a point stands for where errors are small, ``alike``
     how many points have one error where they are not.
     """
-    known = information > LEAST_INFORMATION
-    if not known.any():
+    left, known, weights = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
+    num_known = 0
+    for i in range(len(rows)):
+        weights[i] = 0.0
+        if information[i] > LEAST_INFORMATION:
+            weights[i] = information[i] * independent
+            num_known += 1
+    if not num_known:
         return
-    left, step = np.empty(len(rows)), np.empty(6)
-    weights = np.where(known, information, 0.0) * independent
+    matrix, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     for _ in range(REWEIGHTINGS):
-        H[:], g[:] = 0.0, 0.0
         _add(rows, means, weights, H, g)
         own = H[6, 6] + 1.0 / OFFSET_PX**2
-        last = H[6, :6] / own
-        solve_damped(
-            H[:6, :6] + prior_H - np.outer(last, H[6, :6]), last * g[6] - g[:6] - prior_g,
-            DAMPING, step,
-        )  # fmt: skip
-        offset = g[6] / own - (last * step).sum()
+        for c in range(6):
+            last = H[6, c] / own
+            gradient[c] = last * g[6] - g[c] - prior_g[c]
+            for d in range(6):
+                matrix[c, d] = H[c, d] + prior_H[c, d] - last * H[6, d]
+        solve_damped(matrix, gradient, DAMPING, step)
+        drawn = 0.0
+        for c in range(6):
+            drawn += H[6, c] / own * step[c]
+        offset, place = g[6] / own - drawn, 0
         for i in range(len(rows)):
             rest = means[i] - offset
             for c in range(6):
                 rest -= rows[i, c] * step[c]
             left[i] = rest * rest
+            if information[i] > LEAST_INFORMATION:
+                known[place] = left[i]
+                place += 1
         # The median of a squared normal variable is 0.455 of its variance.
-        spread = np.median(left[known]) / 0.455
+        spread = _median(known[:num_known]) / 0.455
         # Less than a pixel is noise; more is a shadow, a highlight, an error of the mesh.
         share = min(independent, 1.0 / max(alike * min(1.0, spread), 1.0))
         for i in range(len(rows)):
-            if known[i]:
+            if information[i] > LEAST_INFORMATION:
                 variance = 1.0 / information[i] + spread
                 weights[i] = share / variance / (1.0 + left[i] / (GATE**2 * variance)) ** 2
-    H[:], g[:] = 0.0, 0.0
     _add(rows, means, weights, H, g)
 
 
 @compiled()
+def _median(values: Array) -> float:
+    """Return the median by Hoare's selection, which reorders the values."""
+    half = len(values) // 2
+    low, high = 0, len(values) - 1
+    while low < high:
+        pivot, i, j = values[half], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < half:
+            low = i
+        if half < i:
+            high = j
+    if len(values) % 2:
+        return float(values[half])
+    below = values[0]
+    for i in range(half):
+        below = max(below, values[i])
+    return float((below + values[half]) / 2)
+
+
+@compiled()
 def _add(rows: Array, means: Array, weights: Array, H: Array, g: Array) -> None:
-    """Add the normal equations of points that move by their row and by one in the offset."""
+    """Write the normal equations of points that move by their row and by one in the offset."""
     own = np.ones(7)
+    for c in range(7):
+        g[c] = 0.0
+        for d in range(7):
+            H[c, d] = 0.0
     for i in range(len(rows)):
         if weights[i] == 0.0:
             continue
-        own[:6] = rows[i]
+        for c in range(6):
+            own[c] = rows[i, c]
         for c in range(7):
             g[c] += weights[i] * own[c] * means[i]
             for d in range(c + 1):
