@@ -56,20 +56,6 @@ def test_transforms_invert():
     assert_allclose(transform(invert_transform(T), transform(T, points)), points, atol=1e-12)
 
 
-@pytest.mark.parametrize("scale", [0.25, 0.5, 0.8, 1.5, 2.0])
-def test_resize_rule_is_opencvs(scale):
-    """A blob's centre of mass moves with cv2.resize as u → s(u + ½) − ½ says."""
-    x, y = np.array([37.3, 61.9])
-    grid_y, grid_x = np.mgrid[:120, :120]
-    blob = np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / (2 * 5.0**2))
-    side = round(120 * scale)
-    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    resized = cv2.resize(blob, (side, side), interpolation=method)
-    rows, columns = np.mgrid[:side, :side]
-    centre = np.array([(resized * columns).sum(), (resized * rows).sum()]) / resized.sum()
-    assert_allclose(resize_points(np.array([x, y]), scale, scale), centre, atol=0.02)
-
-
 def test_resized_camera_sees_the_resized_points():
     rng = np.random.default_rng(3)
     points = rng.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 1], (20, 3))

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import time
 
 import cv2
@@ -113,27 +112,13 @@ OPENCV_XML = """<?xml version="1.0"?>
   <data>-0.125 0.0625 1e-3 -2e-3 0.03125</data></distCoeffs>
 </opencv_storage>
 """
-BOP = json.dumps(
-    {"cx": 318.75, "cy": 242.5, "depth_scale": 0.1, "fx": 601.25, "fy": 602.5, "height": 480,
-     "width": 640}
-)  # fmt: skip
-NDDS = json.dumps(
-    {
-        "camera_settings": [
-            {
-                "name": "camera",
-                "intrinsic_settings": {
-                    "fx": 601.25,
-                    "fy": 602.5,
-                    "cx": 318.75,
-                    "cy": 242.5,
-                    "s": 0,
-                },
-                "captured_image_size": {"width": 640, "height": 480},
-            }
-        ]
-    }
-)
+BOP = """{"cx": 318.75, "cy": 242.5, "depth_scale": 0.1, "fx": 601.25, "fy": 602.5,
+  "height": 480, "width": 640}"""
+NDDS = """{"camera_settings": [{
+  "name": "camera",
+  "intrinsic_settings": {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5, "s": 0},
+  "captured_image_size": {"width": 640, "height": 480}
+}]}"""
 # Of COLMAP, (0.5, 0.5) is the centre of the top-left pixel.
 COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n1 {}\n"
 ROWS = "601.25 0 318.75\n0 602.5 242.5\n0 0 1\n"
@@ -231,17 +216,6 @@ def test_its_lens_projects_as_opencvs(tmp_path):
     lens = np.array(camera.distortion)
     pixel = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), camera.K, lens)[0]
     assert_allclose(pixel[0, 0], expected, atol=1e-9)
-
-
-def test_reads_what_dopepp_writes(tmp_path):
-    from dopepp.data.formats.ndds.writer import camera_settings
-
-    four = {"fx": 601.25, "fy": 602.5, "cx": 318.75, "cy": 242.5}
-    content = camera_settings({"width": 640, "height": 480, "intrinsics": four})
-    path = tmp_path / "_camera_settings.json"
-    path.write_text(json.dumps(content))
-    assert_array_equal(read_camera(path).K, K)
-    assert read_camera(path).size == ANY
 
 
 BAD = {

@@ -4,7 +4,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import least_squares
 
 from dopepp.geometry.camera import (
     camera_matrix,
@@ -341,36 +340,3 @@ def test_a_covariance_that_is_a_circle_is_a_sigma():
     assert by_sigma.T_cam_obj is not None
     assert by_covariance.T_cam_obj is not None
     assert_allclose(by_sigma.T_cam_obj, by_covariance.T_cam_obj, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["box", "can", "plate"])
-def test_known_covariances_do_as_well_as_a_start_at_the_truth(name):
-    """Against scipy's robust least squares, which is told the truth to start from."""
-    rng = np.random.default_rng(11)
-    cuboid, passed = CUBOIDS[name], np.zeros(2)
-    for _ in range(30):
-        truth, sigma = look_at(cuboid, rng), covariances(rng, 9)
-        root = np.linalg.cholesky(sigma)
-        pixels = project(transform(truth, cuboid), K) + (root @ rng.normal(size=(9, 2, 1)))[..., 0]
-        if rng.random() < 0.4:
-            pixels[rng.integers(8)] += rng.choice([-1, 1], 2) * rng.uniform(20, 60, 2)
-        result = solve_pnp(cuboid, pixels, K, covariance_px=sigma)
-        best = refined_from(truth, cuboid, pixels, np.linalg.inv(root))
-        passed += add(result.T_cam_obj, truth, cuboid) < 0.1, add(best, truth, cuboid) < 0.1
-    assert passed[0] >= passed[1] - 2
-
-
-def refined_from(
-    T: np.ndarray, cuboid: np.ndarray, pixels: np.ndarray, whitening: np.ndarray
-) -> np.ndarray:
-    def moved(step: np.ndarray) -> np.ndarray:
-        turn = rotation_vector_to_matrix(step[:3])
-        return make_transform(turn @ T[:3, :3], T[:3, 3] + step[3:])
-
-    def residuals(step: np.ndarray) -> np.ndarray:
-        off = project(transform(moved(step), cuboid), K) - pixels
-        return np.asarray(np.linalg.norm((whitening @ off[..., None])[..., 0], axis=1))
-
-    # "soft" enough to be the gate's neighbour: Cauchy's loss at three deviations.
-    solution = least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=3.0, x_scale="jac")
-    return moved(solution.x)

@@ -82,26 +82,6 @@ def test_what_trimesh_makes_of_it(write, refused, name):
         assert len(read_mesh(path, "cm").faces) == ours
 
 
-def test_trimesh_takes_relative_indices_from_the_end_of_an_obj_file(write):
-    path = write("a.obj", obj("f -4 -3 -2\n") + "v 9 9 9\nf 1 3 4\n")
-    theirs = trimesh.load_mesh(path, process=False)
-    assert theirs.vertices[theirs.faces[0]].tolist() == [[1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    ours = read_mesh(path, "m")
-    assert ours.vertices[ours.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
-
-
-def test_trimesh_splits_vertices_where_normals_differ(write):
-    box = BOX.copy()
-    normals = box.face_normals.tolist()
-    text = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices.tolist())
-    text += "".join(f"vn {x} {y} {z}\n" for x, y, z in normals)
-    for number, face in enumerate((box.faces + 1).tolist(), start=1):
-        text += "f " + " ".join(f"{corner}//{number}" for corner in face) + "\n"
-    path = write("a.obj", text)
-    assert len(trimesh.load_mesh(path, process=False).vertices) == 36
-    assert len(read_mesh(path, "mm").vertices) == 8
-
-
 def test_trimesh_puts_the_triangles_of_quads_in_another_order(write):
     """A mesh's hash, which checkpoints and render caches know it by, depends on the order."""
     path = write("a.ply", ply_faces(*QUADS))

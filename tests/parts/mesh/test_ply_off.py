@@ -1,6 +1,7 @@
 """PLY and OFF files: dialects, headers and lists that lie, and polygons cut into fans."""
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -20,40 +21,42 @@ TRIANGLES = BOX.faces.tolist()
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 MIXED = [*QUADS[:3], [2, 3, 7], [2, 7, 6], *QUADS[4:]]
 CODES = {"uchar": "B", "int": "i", "uint": "I", "ushort": "H", "int32": "i", "uint8": "B"}
+CODES |= {"float": "f", "double": "d"}
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+Columns = Sequence[tuple[str, str, Sequence[float]]]
+EXTRA: Columns = [("uchar", "red", [7] * 8), ("double", "quality", [1.5] * 8)]
 
 
 def ply(
     form: str,
     faces: list[list[int]],
     *,
+    columns: Columns = (),
+    texture: bool = False,
     extra: bool = False,
-    uv: tuple[str, str] | None = None,
     types: tuple[str, str] = ("uchar", "int"),
     promised: tuple[int, int] | None = None,
     count: int | None = None,
     newline: str = "\n",
 ) -> bytes:
-    """Write a box, with further columns and a further table before, between and behind."""
-    order = FORMATS[form]
+    """Write a box with further columns (kind, name, values) per vertex.
+
+    With ``extra``, further columns and a further table stand before, between and behind.
+    """
+    order, columns = FORMATS[form], [*(EXTRA if extra else ()), *columns]
     num_vertices, num_faces = promised or (8, len(faces))
     header = ["ply", f"format {form} 1.0", "comment by hand", "obj_info none"]
-    header += ["comment TextureFile t.png"] if uv else []
+    header += ["comment TextureFile t.png"] if texture else []
     header += ["element camera 1", "property list uchar float view"] if extra else []
     header += [f"element vertex {num_vertices}"] + [f"property float {axis}" for axis in "xyz"]
-    header += ["property uchar red", "property double quality"] if extra else []
-    header += [f"property float {name}" for name in uv or ()]
+    header += [f"property {kind} {name}" for kind, name, _ in columns]
     header += [f"element face {num_faces}", f"property list {types[0]} {types[1]} vertex_indices"]
     header += ["property list uchar float weights", "property uchar flags"] if extra else []
     header += ["end_header"]
     rows: list[tuple[str, tuple[float, ...]]] = [("B2f", (2, 0.5, 0.25))] if extra else []
-    for number, vertex in enumerate(BOX.vertices):
-        values = (
-            *vertex.tolist(),
-            *((7, 1.5) if extra else ()),
-            *((number / 8, 0.25) if uv else ()),
-        )
-        rows.append(("3f" + ("Bd" if extra else "") + ("2f" if uv else ""), values))
+    for number, vertex in enumerate(BOX.vertices.tolist()):
+        values = (values[number] for _, _, values in columns)
+        rows.append(("3f" + "".join(CODES[kind] for kind, *_ in columns), (*vertex, *values)))
     for number, face in enumerate(faces):
         weights = [0.5] * (number % 3)
         code = f"{CODES[types[0]]}{len(face)}{CODES[types[1]]}"
@@ -89,7 +92,8 @@ def test_line_ends_of_every_system(write, form, newline):
 def test_a_texture_and_its_coordinates_by_any_name(tmp_path, write, form, names):
     pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "t.png")
-    content = ply(form, TRIANGLES, uv=names, extra=True)
+    columns = [("float", names[0], np.arange(8) / 8), ("float", names[1], [0.25] * 8)]
+    content = ply(form, TRIANGLES, columns=columns, texture=True, extra=True)
     loaded = read_mesh(write("a.ply", content), "mm")
     np.testing.assert_allclose(loaded.uv, np.stack([np.arange(8) / 8, np.full(8, 0.25)], axis=1))
     np.testing.assert_array_equal(loaded.texture, pixels)
@@ -152,7 +156,8 @@ def test_damage_is_named(refused, old, new, message):
 
 
 def test_a_missing_texture_and_a_folded_polygon_are_named(refused):
-    missing = ply("ascii", TRIANGLES, uv=("u", "v"))
+    columns = [("float", name, [0.5] * 8) for name in "uv"]
+    missing = ply("ascii", TRIANGLES, columns=columns, texture=True)
     refused("a.ply", missing, "TextureFile 't.png' .*does not exist")
     folded = ply("binary_little_endian", [[0, 3, 1, 2], *QUADS[1:]])
     refused("a.ply", folded, "a polygon that is not convex, face 0")
@@ -247,31 +252,10 @@ def test_a_damaged_off_file_is_named(refused, old, new, message):
 
 def coloured(form: str, kind: str, values: np.ndarray, normals: bool = False) -> bytes:
     """A box whose vertices have colours of a kind, and normals."""
-    kinds = {"uchar": "B", "ushort": "H", "float": "f"}
-    names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
-    names += "".join(f"property float {name}\n" for name in ("nx", "ny", "nz")) if normals else ""
-    header = (
-        f"ply\nformat {form} 1.0\nelement vertex 8\nproperty float x\nproperty float y\n"
-        f"property float z\n{names}element face {len(TRIANGLES)}\n"
-        "property uchar red\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = []
-    for vertex, colour in zip(BOX.vertices, values, strict=True):
-        numbers = [*vertex, *colour, *(vertex if normals else ())]
-        rows.append((f"3f3{kinds[kind]}" + ("3f" if normals else ""), numbers))
-    rows += [("BB3i", [9, 3, *face]) for face in TRIANGLES]
-    if form == "ascii":
-        lines = (" ".join(f"{value:g}" for value in numbers) for _, numbers in rows)
-        return (header + "\n".join(lines) + "\n").encode()
-    whole = kind != "float"
-    packed = (
-        struct.pack(
-            FORMATS[form] + code,
-            *(int(v) if (whole and 3 <= i < 6) or code == "BB3i" else v for i, v in enumerate(row)),
-        )
-        for code, row in rows
-    )
-    return header.encode() + b"".join(packed)
+    values = values if kind == "float" else values.astype(int)
+    columns = [*zip([kind] * 3, ("red", "green", "blue"), values.T.tolist(), strict=True)]
+    directions = zip(["float"] * 3, ("nx", "ny", "nz"), BOX.vertices.T.tolist(), strict=True)
+    return ply(form, TRIANGLES, columns=[*columns, *(directions if normals else ())])
 
 
 SHADES = np.arange(24).reshape(8, 3) * 10
@@ -281,37 +265,31 @@ SHADES = np.arange(24).reshape(8, 3) * 10
 @pytest.mark.parametrize(
     ("kind", "scale"), [("uchar", 1), ("ushort", 1), ("ushort", 257), ("float", 1 / 255)]
 )
-def test_vertices_keep_colours_and_normals(form, kind, scale, tmp_path):
-    path = tmp_path / "box.ply"
-    path.write_bytes(coloured(form, kind, SHADES * scale, normals=True))
-    mesh = read_mesh(path, unit="mm")
+def test_vertices_keep_colours_and_normals(form, kind, scale, write):
+    mesh = read_mesh(write("box.ply", coloured(form, kind, SHADES * scale, normals=True)), "mm")
     np.testing.assert_array_equal(mesh.colours, SHADES)
     np.testing.assert_allclose(mesh.normals, BOX.vertices)
     assert mesh.texture is None
 
 
-def test_one_grey_everywhere_is_nobodys_choice_and_one_colour_is(tmp_path):
-    path = tmp_path / "box.ply"
-    for shade, expected in (((102, 102, 102), None), ((230, 175, 40), (230, 175, 40))):
-        path.write_bytes(coloured("ascii", "uchar", np.tile(shade, (8, 1))))
-        colours = read_mesh(path, unit="mm").colours
-        assert (None if colours is None else tuple(colours[3])) == expected
-
-
-def test_a_colour_that_is_rounded_beyond_its_range_is_its_end(tmp_path):
-    path, values = tmp_path / "box.ply", np.zeros((8, 3))
-    values[2] = 1 + 1e-4, -1e-4, 0.5
-    path.write_bytes(coloured("binary_little_endian", "float", values))
-    assert read_mesh(path, unit="mm").colours[2].tolist() == [255, 0, 128]
+@pytest.mark.parametrize(
+    ("kind", "shade", "expected"),
+    [
+        ("uchar", (102, 102, 102), None),  # one grey everywhere is nobody's choice
+        ("uchar", (230, 175, 40), [230, 175, 40]),
+        ("float", (1 + 1e-4, -1e-4, 0.5), [255, 0, 128]),  # rounded beyond its range
+    ],
+)
+def test_one_grey_everywhere_is_no_colour_and_rounding_is_none(kind, shade, expected, write):
+    content = coloured("ascii", kind, np.tile(shade, (8, 1)))
+    colours = read_mesh(write("box.ply", content), "mm").colours
+    assert (None if colours is None else colours[3].tolist()) == expected
 
 
 @pytest.mark.parametrize(
     ("kind", "shade", "most"), [("uchar", 256, "255"), ("float", 1.5, "1"), ("float", -0.1, "1")]
 )
-def test_what_is_no_colour_is_refused(kind, shade, most, tmp_path):
-    path = tmp_path / "box.ply"
-    values = np.zeros((8, 3))
-    values[5, 1] = shade
-    path.write_bytes(coloured("ascii", kind, values))
-    with pytest.raises(UserError, match=f"a vertex colour that is not from 0 to {most}"):
-        read_mesh(path, unit="mm")
+def test_what_is_no_colour_is_refused(kind, shade, most, refused):
+    values = np.where(np.arange(24).reshape(8, 3) == 16, shade, 0)
+    content = coloured("ascii", kind, values)
+    refused("box.ply", content, f"a vertex colour that is not from 0 to {most}")
