@@ -23,9 +23,9 @@ import numpy as np
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from dopepp.core.checks import check_number
 from dopepp.core.errors import UserError
 from dopepp.core.files import write_whole
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture, read_photo
 from dopepp.drawing.sheet import belief_tiles, contact_sheet
 from dopepp.geometry.camera import LEAST_VIEW_DEG, MOST_VIEW_DEG, CameraMatrix, camera_matrix
@@ -185,7 +185,7 @@ def _camera(kind: str, given: Sequence[Any], width: int, height: int) -> Camera:
     """Return the camera of a picture, as the page tells it."""
     view, fx, fy, cx, cy, file = given
     if kind == VIEW:
-        check_number("field of view", view, LEAST_VIEW_DEG, MOST_VIEW_DEG, "degrees")
+        check("field of view", view, float, Range(LEAST_VIEW_DEG, MOST_VIEW_DEG, "degrees"))
         focal = width / 2 / math.tan(math.radians(view) / 2)
         K = camera_matrix(focal, focal, (width - 1) / 2, (height - 1) / 2)
         return Camera(None, K, (), "the field of view")

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from dopepp.core.checks import check_range
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Span, check
 from dopepp.drawing.pictures import Picture, Size, read_image
 from dopepp.geometry.camera import (
     ANYWHERE,
@@ -228,7 +228,7 @@ def _depths(
         scale = min(1.0, math.sqrt(MAX_PIXELS / (size[0] * size[1])))
         nearest = reach / min(size)
         return nearest, max(nearest, reach * scale / seen.smallest_px)
-    check_range("distances", tuple(distances), 0.001, 1000.0, "metres")
+    check("distances", distances, tuple[float, float], Span(0.001, 1000.0, "metres"))
     return distances
 
 

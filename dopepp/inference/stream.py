@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
-from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.camera_file import Camera, Crop
 from dopepp.geometry.camera_formats import Size
@@ -76,8 +76,8 @@ def stream(
         RunError: A camera stopped delivering.
     """
     _check(options)
-    stride = check_integer("stride", options.get("stride", 1), 1, 1_000_000)
-    least = check_number("least_score", options.get("least_score", 0.0), 0, 1)
+    stride = check("stride", options.get("stride", 1), int, Range(1, 1_000_000))
+    least = check("least_score", options.get("least_score", 0.0), float, Range(0, 1))
     shapes = {part.name: make_shape(part) for part in estimator.solid_parts}
     for one in open_sources([source], options.get("topic")):
         lens = Lens(one_camera(K, camera, one), options.get("K_size"), options.get("crop"))

@@ -22,8 +22,8 @@ import numpy as np
 import scipy  # its parts load when they are used
 from jaxtyping import Float
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import (
     CameraMatrix,
@@ -212,7 +212,7 @@ class PoseTracker:
                 "a tracker of an estimator that does not refine", "refine='region'",
                 "load it with PoseEstimator.load(path, refine='region')",
             )  # fmt: skip
-        self.detect_every = check_integer("detect_every", detect_every, 1, 1_000_000)
+        self.detect_every = check("detect_every", detect_every, int, Range(1, 1_000_000))
         self._estimator = estimator
         self._cuboid_of = {part.name: part.cuboid for part in estimator.parts}
         self._diameters = {part.name: part.diameter for part in estimator.parts}

@@ -17,7 +17,6 @@ from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError, require
 from dopepp.core.pool import (
     THREAD_LIMITS,
@@ -27,6 +26,7 @@ from dopepp.core.pool import (
     ProcessPool,
     available_cores,
 )
+from dopepp.core.validation import Range, check
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import FAILURE_FILE, write_json
 
@@ -126,7 +126,7 @@ def on_joblib(n_jobs: int) -> Runner:
 
     A :class:`UserError`: the number is out of range, or joblib is not installed.
     """
-    check_integer("hydra.launcher.n_jobs", n_jobs, 1, _MOST)
+    check("hydra.launcher.n_jobs", n_jobs, int, Range(1, _MOST))
     require("joblib", "hydra/launcher=joblib", "joblib")
 
     def run(jobs: Jobs, overrides: Mapping[int, list[str]]) -> Ended:

@@ -34,8 +34,8 @@ from optuna import distributions
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from dopepp.core.checks import check_integer
 from dopepp.core.errors import UserError
+from dopepp.core.validation import Range, check
 from dopepp.experiment.config.run import below, flat
 from dopepp.experiment.results import display
 from dopepp.experiment.results.folder import (
@@ -91,8 +91,8 @@ def search(
             "leave one of the two out",
         )
     options: Any = OmegaConf.to_container(config.search, resolve=True)
-    wanted = check_integer("search.num_trials", options["num_trials"], 1, MOST)
-    at_a_time = check_integer("search.num_parallel", options["num_parallel"], 1, _MAX_PARALLEL)
+    wanted = check("search.num_trials", options["num_trials"], int, Range(1, MOST))
+    at_a_time = check("search.num_parallel", options["num_parallel"], int, Range(1, _MAX_PARALLEL))
     space = read_space(loader, options["space"], arguments)
     for example in examples(space):
         loader.load_sweep_config(config, example)

@@ -17,10 +17,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from dopepp.core.checks import check_integer, check_number
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import check_target, write_csv, write_picture, write_whole
 from dopepp.core.pool import LostWorkerError, ProcessPool, available_cores
+from dopepp.core.validation import Range, check
 from dopepp.parts.catalogue import load_part
 from dopepp.robot.grasping.cell import Cell, convex_pieces
 from dopepp.robot.grasping.film import show
@@ -70,8 +70,8 @@ def check_task(task: Task, poses: str, count: int) -> Task:
     ):
         if value not in allowed:
             raise UserError(f"{name} {value}", ", ".join(allowed), "pass one of these")
-    check_integer("-n", count, 1, MAX_TRIALS)
-    check_number("--yaw", task.yaw_deg, 0.0, 180.0, "degrees")
+    check("-n", count, int, Range(1, MAX_TRIALS))
+    check("--yaw", task.yaw_deg, float, Range(0.0, 180.0, "degrees"))
     sources = parse_sources(poses)
     needed = any(one.kind == "network" for one in sources)
     if needed and task.network is None:
