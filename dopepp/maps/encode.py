@@ -41,14 +41,18 @@ def encode(
     map_size: tuple[int, int],
     geometry: MapGeometry,
 ) -> tuple[Beliefs, Fields]:
-    """Draw the target maps of a batch.
+    """Draw the target maps of a batch: 9·C belief and 16·C field channels.
 
     Beliefs are Gaussians of peak 1, their maximum taken over instances. A keypoint off the map or
-    not finite is absent and leaves its channel as it is. Fields are unit vectors from a corner to
-    its instance's centroid; where discs overlap, the nearest corner's vector stands.
+    not finite is absent. Fields are unit vectors from a corner to its instance's centroid; where
+    discs overlap, the nearest corner's vector stands.
 
-    Keypoints are input pixels; an object's index −1 marks padding. The map's size is (height,
-    width) in cells. The result has 9·C belief and 16·C field channels.
+    Args:
+        keypoints: Input pixels.
+        object_index: Objects of the instances; −1 marks padding.
+        num_objects: Number of objects C.
+        map_size: (height, width) of the maps, cells.
+        geometry: Relation of the maps to the input.
     """
     height, width = map_size
     batch, instances = object_index.shape

@@ -134,8 +134,7 @@ def mean_vectors(
     """Write the mean of the vectors in each corner's disc, nearer ones weighted more.
 
     Where discs overlap, cells carry the vector of the nearest corner. The weights 1 − (d/radius)²
-    fall to 0 at the edges of discs, which no position is exact enough to tell. ``vectors`` are the
-    corner's two channels of the field; the radius is in cells.
+    fall to 0 at the edges of discs, which no position is exact enough to tell.
     """
     height, width = vectors.shape[1:]
     half = math.ceil(radius)
@@ -347,10 +346,7 @@ def _system(
 
 @compiled()
 def _mode(window: Array, theta: Array) -> tuple[float, float, bool]:
-    """Return where a fitted Gaussian is highest, and whether it is a peak within its own cells.
-
-    If it is none, the middle of the window's highest cells stands for it.
-    """
+    """Return a fit's top, or the middle of the highest cells, and whether it is a peak."""
     half = len(window) // 2
     across, down, count = 0.0, 0.0, 0
     for v in range(-2, 3):

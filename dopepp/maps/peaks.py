@@ -41,9 +41,8 @@ class Peaks:
         covariance_px: Of the position, pixels²: the variance by which the peak is wider than a
             perfect one, and that of the fit. A network trained with a proper loss returns the
             target Gaussian blurred by its own uncertainty, so variances subtract.
-        toward: Mean of the field's vectors around a corner's peak; zeros for a centroid. A field
-            trained with squared error is the mean of unit vectors, so the more they spread, the
-            shorter it is.
+        toward: Mean of the field's vectors around a corner's peak; the more they spread, the
+            shorter it is. Zeros for a centroid.
         found: False where a channel has fewer peaks than slots.
     """
 
@@ -66,9 +65,7 @@ def find_peaks(
     A peak is a cell not below its eight neighbours. Of equal cells, as on the flat top of a clamped
     belief, it is the one with the highest neighbourhood, which is the middle one; if these are
     equal too, the first in raster order. Its position is that of a Gaussian fitted around it.
-
-    With a field, which has 16 channels of each object, the belief has nine of each; without it,
-    peaks have no vectors.
+    Without a ``field``, which has 16 channels to nine of the belief, peaks have no vectors.
     """
     maps = _on_host(belief)
     height, width = maps.shape[2:]

@@ -36,10 +36,7 @@ class Identity(Attention):
 
 
 class SE(Attention):
-    """Squeeze-and-excitation (Hu et al. 2018): features · σ(MLP(mean over the map)).
-
-    The MLP's hidden layer is narrower by the factor ``reduction``.
-    """
+    """Squeeze-and-excitation (Hu et al. 2018): features · σ(MLP(mean over the map))."""
 
     def __init__(self, channels: int, reduction: int = 16) -> None:
         super().__init__()
@@ -55,11 +52,9 @@ class SE(Attention):
 class CBAM(Attention):
     """The paper's attention (Eq. 5, 6): first by channel, then by place.
 
-    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map, one MLP for both (Eq. 5). Place:
-    features · σ(conv([mean; maximum])) over the channels (Eq. 6).
-
-    The MLP's hidden layer is narrower by the factor ``reduction``; the side of the spatial
-    convolution is odd, the paper's is 3.
+    Channel: features · σ(MLP(mean) + MLP(maximum)) over the map (Eq. 5). Place: features ·
+    σ(conv([mean; maximum])) over the channels (Eq. 6). ``reduction`` narrows the MLP's hidden
+    layer; the spatial convolution's ``kernel_size`` is odd.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel_size: int = 3) -> None:

@@ -67,9 +67,8 @@ class VGG19(_Chain):
     Args:
         width: Factor on every channel count; 1 is the paper's.
         batch_norm: Put batch norm behind every convolution, in place of its bias.
-        weights_path: A ``state_dict`` of torchvision's ``vgg19`` (keys ``features.N.weight`` and
-            ``features.N.bias``) to start the VGG layers from. It is where training starts, not part
-            of the architecture, so checkpoints do not repeat it.
+        weights_path: A ``state_dict`` of torchvision's ``vgg19`` to start the VGG layers from. It
+            is where training starts, not part of the architecture: checkpoints do not repeat it.
 
     Raises:
         UserError: An argument is out of range, or the file does not fit.
@@ -133,10 +132,8 @@ class DSC(_Chain):
     """The paper's light backbone of depthwise separable convolutions (Fig. 7).
 
     A 3×3 convolution, then pairs of a depthwise 3×3 and a pointwise 1×1 convolution with ReLU after
-    each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels.
-
-    ``width`` is a factor on every channel count, 1 is the paper's; batch norm stands behind every
-    convolution, in place of its bias.
+    each; three poolings bring 416×416 pixels to 52×52 cells of 128 channels. ``width`` and
+    ``batch_norm`` are those of :class:`VGG19`.
     """
 
     plan: ClassVar[tuple[int | str, ...]] = (
@@ -167,21 +164,18 @@ class DSC(_Chain):
 class Pyramid(Backbone):
     """Residual blocks at strides 4, 8, 16 and 32, summed top-down into stride 8.
 
-    Made for time, on CPUs too: nothing is computed at the picture's own resolution, where half of
+    Made for time, on CPUs too: nothing is computed at the image's own resolution, where half of
     :class:`DSC`'s time goes, and every 3×3 convolution is a full one. 4×4 pixels become 48 channels
-    (Shi et al. 2016, the other way round), then a 3×3 convolution and the residual blocks (He et
-    al. 2016) of each stride; the first block at 8, 16 and 32 halves the size. From the coarsest
-    back to stride 8: a 1×1 convolution, doubling, a sum with the finer stride's features (Lin et
-    al. 2017), then residual blocks again. Batch norm behind every convolution.
+    (Shi et al. 2016), then a 3×3 convolution and the residual blocks (He et al. 2016) of each
+    stride. From the coarsest back to stride 8: a 1×1 convolution, doubling, a sum with the finer
+    stride's features (Lin et al. 2017), then residual blocks again. Batch norm behind every
+    convolution.
 
     Args:
         channels: Channels at strides 4, 8, 16 and 32, each 8–1024.
         blocks: Number of residual blocks there on the way down, each 1–16.
         top_down: Number of residual blocks at strides 16 and 8 on the way back, each 0–16.
         width: Factor on every channel count.
-
-    Raises:
-        UserError: An argument is out of range.
     """
 
     cell_multiple = 4

@@ -129,10 +129,7 @@ class _Header:
 
 
 def read(path: Path) -> Checkpoint:
-    """Read a checkpoint and compare its weights with its own spec.
-
-    Args:
-        path: A file that training or ``dopepp release`` has written, or ``pretrained/NAME``.
+    """Read a checkpoint, a file or ``pretrained/NAME``, and compare its weights with its own spec.
 
     Raises:
         UserError: The file is missing, damaged, foreign, too large, of another version, names
@@ -195,10 +192,7 @@ def parse_description(payload: object) -> Checkpoint:
 
 
 def _check_plain(payload: Mapping[Any, Any]) -> None:
-    """Refuse values that are not plain, nested too deep or too many.
-
-    A list that holds one other list many times, and so on, takes no memory until it is printed.
-    """
+    """Refuse values that are not plain, nested too deep or, repeated ones counted, too many."""
     counts: dict[int, int] = {}
     for name, value in payload.items():
         try:
@@ -209,10 +203,7 @@ def _check_plain(payload: Mapping[Any, Any]) -> None:
 
 
 def _count(value: object, depth: int, counts: dict[int, int]) -> int:
-    """Return the number of plain values in a value, repeated ones as often as they occur.
-
-    ``counts`` are those of the containers that were counted before, by identity.
-    """
+    """Return the number of plain values in a value; ``counts`` has those of containers by id."""
     if type(value) not in (dict, list, tuple):
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:
             raise ValueError(f"an integer of {value.bit_length()} bits")
@@ -249,12 +240,10 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
     """Compare the weights with the network of the spec, built without memory on ``meta``."""
     with torch.device("meta"):
         network = build_network(checkpoint.spec)
-    if checkpoint.stride != network.stride or network.num_objects != len(checkpoint.parts):
-        raise UserError(
-            f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts",
-            f"stride {network.stride} and {network.num_objects} parts, as the spec has it",
-            _FIX,
-        )
+    got = f"stride {checkpoint.stride} and {len(checkpoint.parts)} parts"
+    needed = f"stride {network.stride} and {network.num_objects} parts"
+    if got != needed:
+        raise UserError(got, f"{needed}, as the spec has it", _FIX)
     expected, weights = network.state_dict(), checkpoint.state_dict
     odd = sorted(expected.keys() ^ weights.keys()) or [
         name for name, value in expected.items() if not _same_kind(weights[name], value)
@@ -262,11 +251,10 @@ def _check_weights(checkpoint: Checkpoint, size: int) -> None:
     # A tensor may be a view that repeats a few stored numbers to any size: the file must hold all.
     stored = 0 if odd else sum(value.numel() * value.element_size() for value in weights.values())
     if odd or stored > size:
-        raise UserError(
-            f"weights that do not fit the spec's network, first {odd[0] if odd else 'their size'}",
-            f"the {len(expected)} tensors of that network",
-            "write the file with train.py, or use the spec it was trained with",
-        )
+        first = odd[0] if odd else "their size"
+        got = f"weights that do not fit the spec's network, first {first}"
+        fix = f"{_FIX}, or use the spec it was trained with"
+        raise UserError(got, f"the {len(expected)} tensors of that network", fix)
 
 
 def _same_kind(value: object, expected: Tensor) -> bool:
@@ -294,11 +282,7 @@ def released_paths() -> dict[str, Path]:
 
 
 def find(path: Path) -> Path:
-    """Return the file that a path stands for: ``pretrained/NAME`` is a released checkpoint.
-
-    Raises:
-        UserError: No checkpoint of that name was released.
-    """
+    """Return the file of a path; a :class:`UserError` for an unknown ``pretrained/NAME``."""
     if path.parent != Path(FOLDER) or path.exists():
         return path
     known = released_paths()
@@ -315,21 +299,14 @@ def _read_released(path: Path) -> tuple[dict[str, Any], int]:
         got, allowed = f"{path} without a description under {KEY!r}", "a file of `dopepp release`"
         raise UserError(got, f"{allowed} or `dopepp export`", "get the file again")
     payload = parse_json(metadata[KEY], f"{path}, description under {KEY!r}")
-    weights = {
-        name: value.float() if value.is_floating_point() else value
-        for name, value in tensors.items()
-    }
-    size = sum(value.numel() * value.element_size() for value in weights.values())
-    return {"state_dict": weights, KEY: payload}, size
+    for name, value in tensors.items():
+        tensors[name] = value.float() if value.is_floating_point() else value
+    size = sum(value.numel() * value.element_size() for value in tensors.values())
+    return {"state_dict": tensors, KEY: payload}, size
 
 
 def write_content(content: Mapping[str, Any], path: Path, half: bool = True) -> None:
-    """Write a safetensors file whose description names no local path.
-
-    Args:
-        content: Result of :meth:`Checkpoint.to_file`.
-        path: File to write.
-        half: Whether to write the weights in half precision.
+    """Write a safetensors file of :meth:`Checkpoint.to_file`; it names no local path.
 
     Raises:
         UserError: A weight does not fit into half precision.
@@ -350,11 +327,9 @@ def _half(name: str, value: Tensor) -> Tensor:
         return value
     half = value.to(torch.float16)
     if not half.isfinite().all():
-        raise UserError(
-            f"{name} with values up to {float(value.abs().max()):g}",
-            f"finite weights of at most {torch.finfo(torch.float16).max:g}",
-            "train again: such weights come from a run that diverged",
-        )
+        got = f"{name} with values up to {float(value.abs().max()):g}"
+        allowed = f"finite weights of at most {torch.finfo(torch.float16).max:g}"
+        raise UserError(got, allowed, "train again: such weights come from a run that diverged")
     return half
 
 

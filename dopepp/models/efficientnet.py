@@ -1,8 +1,8 @@
-"""EfficientNet-Lite0 as a backbone, with what ImageNet's photographs taught it.
+"""EfficientNet-Lite0 as a backbone, with features that ImageNet's photographs taught it.
 
 A network of renders has seen no photograph. Layers that were learned from a million of them and
-stay as they are have (Hinterstoisser et al. 2018, "On Pre-Trained Image Features and Synthetic
-Images for Deep Learning").
+stay frozen have (Hinterstoisser et al. 2018, "On Pre-Trained Image Features and Synthetic Images
+for Deep Learning").
 """
 
 from __future__ import annotations
@@ -54,10 +54,9 @@ class EfficientNetLite(Backbone):
         channels: Channels on the way back, 8–1024.
         top_down: Number of residual blocks at strides 16 and 8 on the way back, each 0–16.
         width: Factor on these channels; those on the way down are ImageNet's.
-        frozen: What is learned no further: the layers down to this stride, 8, 16 or 32; 0: none.
-        weights_path: A ``state_dict`` of EfficientNet-PyTorch's names to start the way down from,
-            or ``imagenet`` for the one of the extra of that name. It is where training starts, not
-            part of the architecture, so checkpoints do not repeat it.
+        frozen: Freeze the layers down to this stride, 8, 16 or 32; 0: none.
+        weights_path: A ``state_dict`` with EfficientNet-PyTorch's names to start the way down from,
+            or ``imagenet`` for the one of the extra of that name; checkpoints do not repeat it.
 
     Raises:
         UserError: An argument is out of range, the extra is missing, or the file does not fit.
@@ -151,11 +150,7 @@ class EfficientNetLite(Backbone):
 
 
 class InvertedResidual(nn.Module):
-    """1×1 to more channels, depthwise, 1×1 to fewer (Sandler et al. 2018), without a last ReLU6.
-
-    Added to its input where the shape stays. An ``expansion`` of 1 leaves the first convolution
-    out.
-    """
+    """1×1 to more channels, depthwise, 1×1 to fewer (Sandler et al. 2018); added if shapes fit."""
 
     def __init__(
         self, in_channels: int, out_channels: int, kernel_size: int, stride: int, expansion: int

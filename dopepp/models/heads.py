@@ -56,11 +56,9 @@ class Head(nn.Module):
 
     Stage 1 reads the features; every later one reads them together with the belief maps (after the
     activation, so that both losses feed it the same thing) and the field of the stage before. For C
-    objects there are 9·C belief and 16·C field channels. ``make_branch`` is called with input
-    channels, output channels and the stage's number (from 0).
-
-    Attributes:
-        cell_multiple: The feature map's height and width must be multiples of this.
+    objects there are 9·C belief and 16·C field channels. ``make_branch`` takes input channels,
+    output channels and the stage's number (from 0). ``cell_multiple`` is what the feature map's
+    height and width must be multiples of.
     """
 
     cell_multiple: int = 1
@@ -111,13 +109,11 @@ class Head(nn.Module):
 
 
 class Cascade(Head):
-    """DOPE's cascade: six stages, from the second on with 7×7 convolutions.
+    """DOPE's cascade of 1–12 stages: six in DOPE, from the second on with 7×7 convolutions.
 
     Stage 1: three 3×3 convolutions (128), 1×1 to 512, 1×1 to the maps. Later stages: five 7×7
-    (128), 1×1 (128), 1×1 to the maps. ReLU after all but the last.
-
-    ``stages`` are 1–12, DOPE's are 6; ``width`` is a factor on the channel counts, 1 is the
-    paper's; batch norm stands behind every convolution but the last, in place of its bias.
+    (128), 1×1 (128), 1×1 to the maps. ReLU after all but the last. ``width`` is a factor on the
+    channel counts; batch norm stands behind every convolution but the last, in place of its bias.
     """
 
     def __init__(
@@ -160,10 +156,9 @@ class MultiScale(Head):
     """The paper's MultiScaleDOPEstage (§3.3), 1 to 12 of them.
 
     ``width`` is a factor on the channel counts, 1 is 128 channels; batch norm stands behind every
-    convolution but those of maps, in place of its bias. ``maps`` is what the three scales hand to
-    the fusion: ``plain`` for maps of 9 or 16 channels each, as §3.3 has them; ``learned`` for the
-    same, and each scale's maps are answers of their own, before the fused ones, that the loss sees
-    as well; None for features.
+    convolution but those of maps. ``maps`` is what the three scales hand to the fusion: ``plain``
+    for maps of 9 or 16 channels each, as §3.3 has them; ``learned`` for the same, which the loss
+    sees as well, before the fused ones; None for features.
     """
 
     cell_multiple = 4
@@ -192,11 +187,10 @@ class MultiScale(Head):
 class MultiScaleBranch(Branch):
     """One branch of a MultiScaleDOPEstage: three scales down, then top-down fusion.
 
-    Down: five 3×3 convolutions at full scale, three to one half, three to one quarter (the first
-    of the three with stride 2). Up: convset at a quarter, 1×1, ×2 nearest, concatenated with the
-    half scale; the same again into full scale; convset; 1×1 to the maps. ReLU after every
-    convolution but those of maps: without one between them a convset's five would be one linear
-    map. Maps and batch norm are as in :class:`MultiScale`.
+    Down: five 3×3 convolutions at full scale, three to one half, three to one quarter. Up: convset
+    at a quarter, 1×1, ×2 nearest, concatenated with the half scale; the same again into full scale;
+    convset; 1×1 to the maps. ReLU after every convolution but those of maps: without one between
+    them a convset's five would be one linear map.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What all network parts share: convolution blocks, their width and initialisation, activations.
+"""Convolution blocks, their width and initialisation, and activations of all network parts.
 
 An activation turns a head's belief output into a belief map that peaks at 1. To add one, name it in
 :data:`ACTIVATIONS`; the loss that it is paired with publishes that name.
@@ -99,9 +99,8 @@ def initialise(module: nn.Module) -> None:
     """Draw every convolution and linear weight from He's normal law for ReLU; biases start at 0.
 
     The variance 2 / fan_in (He et al. 2015, Eq. 10) keeps the activations' scale through a network
-    without batch norm as deep as the DOPE cascade.
-
-    Weights on ``meta`` hold nothing; to draw them, PyTorch would import its whole compiler.
+    without batch norm as deep as the DOPE cascade. Weights on ``meta`` hold nothing; to draw them,
+    PyTorch would import its whole compiler.
     """
     for layer in module.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)) and not layer.weight.is_meta:

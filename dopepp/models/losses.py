@@ -35,8 +35,7 @@ class MapLoss(nn.Module, ABC):
     ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
         """Return the loss and its terms, detached; each is summed over the stages.
 
-        The terms are computed in float32 also under autocast: sums over exponentials lose their
-        digits in 16 bits.
+        They are float32 also under autocast: sums over exponentials lose their digits in 16 bits.
         """
         summed = self._summed(stages, belief_target, field_target)
         terms = {name: value.mean() for name, value in summed.items()}

@@ -40,11 +40,8 @@ class PoseNetwork(nn.Module):
     """RGB images to belief maps and vector fields: backbone, attention and head.
 
     The normalisation is part of the network, so training, inference and exported files cannot
-    disagree about it.
-
-    Attributes:
-        stride: Pixels per map cell, along each axis.
-        size_multiple: Image height and width must be multiples of this.
+    disagree about it. ``stride`` is pixels per map cell, ``size_multiple`` what image height and
+    width must be multiples of.
     """
 
     mean: Tensor
@@ -71,8 +68,11 @@ class PoseNetwork(nn.Module):
     def forward(self, images: Images) -> list[heads.Stage]:
         """Return the belief logits and vector field of every stage.
 
-        Images are RGB, 0–255, uint8 or floating point; of a shape that does not fit the network
-        they are a :class:`UserError`.
+        Args:
+            images: RGB, 0–255, uint8 or floating point.
+
+        Raises:
+            UserError: The shape does not fit the network.
         """
         height, width = images.shape[-2:]
         fits = images.ndim == 4 and images.shape[1] == 3
@@ -88,8 +88,7 @@ class PoseNetwork(nn.Module):
     def for_inference(self) -> PoseNetwork:
         """Return a copy for evaluation, batch norm multiplied into the convolutions before it.
 
-        Its maps are the same but for rounding; it takes fewer passes over the features and cannot
-        be trained. The network itself stays as it is.
+        Its maps are the same but for rounding; it takes fewer passes and cannot be trained.
         """
         network = copy.deepcopy(self).eval()
         for chain in [one for one in network.modules() if isinstance(one, nn.Sequential)]:
@@ -107,14 +106,10 @@ class PoseNetwork(nn.Module):
 
 
 def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, float]:
-    """Count a network's parameters and its multiply–accumulates for one image.
+    """Return a network's parameters and 10⁹ multiply–accumulates for one (width, height) image.
 
-    The forward pass runs on the ``meta`` device, where tensors have a shape and no values, so it
-    takes milliseconds and leaves the network and its batch-norm statistics alone. Convolutions and
-    matrix products are counted; what is done per element (normalisation, activation) is not.
-
-    Returns the number of parameters, and GMACs (10⁹ multiply–accumulates, half the GFLOPs) of an
-    image of (width, height) pixels.
+    The forward pass runs on the ``meta`` device, so it takes milliseconds and leaves the network
+    and its statistics alone. Convolutions and matrix products are counted, elementwise work is not.
     """
     tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
     shapes = {name: tensor.to("meta") for name, tensor in tensors.items()}
@@ -134,9 +129,10 @@ def network_cost(network: nn.Module, input_size: tuple[int, int]) -> tuple[int, 
 
 
 def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
-    """Build the network that a spec describes (see :mod:`dopepp.models.registry` for its nodes).
+    """Build the network that a spec describes.
 
-    A :class:`UserError`: a key is missing or unknown, a target is not allowed, or an argument is.
+    Raises:
+        UserError: A key is missing or unknown, or a target or an argument is not allowed.
     """
     _check_keys(spec)
     activation, num_objects = spec["activation"], spec["num_objects"]
@@ -154,10 +150,7 @@ def build_network(spec: Mapping[str, Any]) -> PoseNetwork:
 
 
 def check_spec(spec: Mapping[str, Any]) -> None:
-    """Check that a spec names nothing but allowed targets, without building any of them.
-
-    A :class:`UserError`: a key is missing or unknown, or a target is not allowed.
-    """
+    """Raise a :class:`UserError` if a spec has wrong keys or targets; build nothing."""
     _check_keys(spec)
     registries: dict[str, Registry[Any]] = {
         "backbone": BACKBONES, "attention": ATTENTIONS, "head": HEADS,
@@ -177,8 +170,7 @@ def _check_keys(spec: object) -> None:
 def architecture(spec: Mapping[str, Any]) -> dict[str, Any]:
     """Return a deep copy of a spec without ``weights_path``.
 
-    Pretrained weights are where training started; a checkpoint holds the trained ones, so it must
-    not need, nor make its reader open, a file of somebody else's machine.
+    A checkpoint holds trained weights; its reader must not open a file of somebody else's machine.
     """
     plain: dict[str, Any] = copy.deepcopy(dict(spec))
     if isinstance(plain.get("backbone"), dict):

@@ -29,7 +29,7 @@ MAX_BYTES: Final = 4 * 2**30
 """The largest checkpoint that is read: over six times the full DOPE with Adam's two moments."""
 
 _MAX_PICKLE_BYTES: Final = 16_000_000
-"""Of one pickle: over half a million ADD points. What is built takes at most 80 times as much."""
+"""Over half a million ADD points. What one pickle builds takes at most 80 times as much."""
 
 _MAX_TUPLES: Final = 50_000
 """Ten for each tensor of any optimiser, and few enough to be nested without harm: Python hashes a
@@ -37,11 +37,10 @@ tuple in tuples on the stack of the process."""
 
 _ZIP: Final = b"PK\x03\x04"
 _LEGACY: Final = b"\x80\x02"
-"""What a file begins with: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
+"""Beginning of a file: a zip archive, or, up to torch 1.5, a pickle of protocol 2."""
 
 _NUM_LEGACY_PICKLES: Final = 5
-"""Before the numbers in a file of torch before 1.6: magic number, version, machine, content and the
-storages' keys."""
+"""Magic number, version, machine, content and the storages' keys stand before the numbers."""
 
 _STORAGE_BYTES: Final = {
     f"torch {name}Storage": size
@@ -81,8 +80,8 @@ _FIELDS: Final = {"dtype", "shape", "data_offsets"}
 def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None = None) -> None:
     """Write a torch file so that ``path`` holds the old content or the new, never a part of it.
 
-    The file that was there is kept at ``previous``, or gone if that is None. Where the folder
-    cannot be written (``OSError``), the old file is intact and nothing else is left.
+    The old file is kept at ``previous``, if given. Where the folder cannot be written
+    (``OSError``), the old file is intact and nothing else is left.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,13 +115,18 @@ def write_atomic(payload: Mapping[str, Any], path: Path, previous: Path | None =
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     """Load a torch file that holds a mapping; no code in it runs, tensors come to the CPU.
 
-    Loading takes no more memory than the file, also one of torch before 1.6, has bytes. ``what``
-    says in messages what it should be. A :class:`UserError`: it is missing, damaged, holds
-    something else or more than tensors and plain values, or unpacks to too much.
+    Loading takes no more memory than the file, also one of torch before 1.6, has bytes.
+
+    Args:
+        path: File to load.
+        what: What the file should be, for messages.
+
+    Raises:
+        UserError: The file is missing, damaged, holds something other than tensors and plain
+            values, or unpacks to too much.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}, which is no file", what, "correct the path")
+    _check_file(path, what)
     try:
         with path.open("rb") as file:
             begin = file.read(len(_LEGACY))
@@ -138,50 +142,46 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
         raise
     except Exception as error:  # a damaged or hostile file raises whatever its bytes lead to
         reason = " ".join(str(error).split("\n")[0].split()) or type(error).__name__
-        raise UserError(
-            f"{path}, which torch refuses to load ({reason[:200]})",
-            what,
-            "get the file again; load none that you do not trust",
-        ) from error
+        got = f"{path}, which torch refuses to load ({reason[:200]})"
+        fix = "get the file again; load none that you do not trust"
+        raise UserError(got, what, fix) from error
     if not isinstance(content, dict):
         raise UserError(f"{path} with a {type(content).__name__} in it", what, "pass another file")
     return content
 
 
 def check_container(path: Path, what: str) -> int:
-    """Return a zip archive's unpacked size; it holds no more than the file has bytes.
+    """Return a zip archive's unpacked size, which may not exceed the file's: no compression.
 
-    ``torch.save`` stores without compression, so a file that promises more than it has is a bomb.
-    ``what`` says in messages what it should be. A :class:`UserError`: the file is missing, is not a
-    torch file, is cut short or unpacks to too much.
+    Raises:
+        UserError: The file is missing, no torch file, cut short, or unpacks to too much.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}, which is no file", what, "correct the path")
+    _check_file(path, what)
     try:
         with path.open("rb") as file:
             # Where a zip archive comes second, torch would read what comes first.
             if file.read(len(_ZIP)) != _ZIP:
                 raise zipfile.BadZipFile("something else before the archive")
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
+            size = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-        raise UserError(
-            f"{path}, which is not a torch file or was cut short", what, "copy or write it again"
-        ) from error
-    size = sum(member.file_size for member in members)
+        got = f"{path}, which is not a torch file or was cut short"
+        raise UserError(got, what, "copy or write it again") from error
     limit = min(MAX_BYTES, path.stat().st_size)
     if size > limit:
-        raise UserError(
-            f"{path}, which unpacks to {size} bytes",
-            f"{what} of at most {limit} bytes",
-            "load no file that you do not trust",
-        )
+        got, allowed = f"{path}, which unpacks to {size} bytes", f"{what} of at most {limit} bytes"
+        raise UserError(got, allowed, "load no file that you do not trust")
     return size
 
 
+def _check_file(path: Path, what: str) -> None:
+    if not path.is_file():
+        raise UserError(f"{path}, which is no file", what, "correct the path")
+
+
 def _check_archive(path: Path) -> None:
-    """Hold a zip archive of torch's to what it may contain; else it is a ``ValueError``."""
+    """Compare a zip archive of torch's with what it may contain; else it is a ``ValueError``."""
     with zipfile.ZipFile(path) as archive:
         # torch takes any of two members of one name, and any of two pickles.
         sizes = {member.filename.casefold(): member.file_size for member in archive.infolist()}
@@ -201,10 +201,9 @@ def _check_archive(path: Path) -> None:
 
 
 def _check_legacy(path: Path) -> None:
-    """Hold a file of torch before 1.6 to what it may contain; else it is a ``ValueError``.
+    """Compare a file of torch before 1.6 with what it may contain; else it is a ``ValueError``.
 
-    So are fewer numbers than it says: torch allocates a storage before it reads it (case "a storage
-    of terabytes").
+    torch allocates a storage before it reads the numbers (case "a storage of terabytes").
     """
     with path.open("rb") as file:
         claimed = _claimed_storages(file.read(_MAX_PICKLE_BYTES + 1), _NUM_LEGACY_PICKLES)
@@ -215,8 +214,8 @@ def _check_legacy(path: Path) -> None:
 def _claimed_storages(content: bytes, num_pickles: int = 1) -> dict[str, int]:
     """Return the bytes that each storage claims to have, by its key.
 
-    The content is some pickles one after the other, and whatever follows them. One that is damaged
-    or too long, or does what weights and plain values do not need, is a ``ValueError``.
+    The content is some pickles one after the other, and whatever follows them. A damaged or too
+    long pickle, or one that does more than weights and plain values need, is a ``ValueError``.
     """
     stream, storages = io.BytesIO(content[:_MAX_PICKLE_BYTES]), dict[str, int]()
     try:
@@ -282,7 +281,8 @@ def _storage_reference(value: object) -> tuple[str, str, int]:
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read a file that anybody may have written: tensors by name, on the CPU, and the metadata.
 
-    A file that is missing, damaged or too large, or whose header is, is a :class:`UserError`.
+    Raises:
+        UserError: The file is missing, damaged or too large, or its header is.
     """
     path = Path(path)
     try:
@@ -298,23 +298,22 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         known = all(entry.keys() == _FIELDS for entry in entries.values())
         if not known or not all(0 < len(name) <= _MAX_NAME for name in (*entries, *metadata)):
             raise ValueError(f"an unknown field, or a name not of 1 to {_MAX_NAME} characters")
-    except OSError as error:
-        raise _bad_safetensors(path, str(error.strerror)) from error
-    except UserError as error:
-        raise _bad_safetensors(path, error.got) from error
-    except Exception as error:  # the library's own, and what a foreign header leads to
-        raise _bad_safetensors(path, str(error)) from error
+    except Exception as error:  # also the library's own, and what a foreign header leads to
+        reason = getattr(error, "strerror", None) or getattr(error, "got", None) or str(error)
+        allowed = f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB"
+        got = f"{path}: {' '.join(reason[:300].split())}"
+        raise UserError(got, allowed, "get the file again from its source") from error
     return tensors, metadata
 
 
 def write_safetensors(
     path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write a file, whole or not at all: tensors of any device and strides, metadata as texts.
+    """Write tensors of any device and strides, and texts, whole or not at all.
 
     A header longer than what is read is a ``ValueError``.
     """
-    plain = {name: one.detach().cpu().contiguous().clone() for name, one in tensors.items()}
+    plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(plain, dict(metadata))
     _header(content)
     write_whole(path, content)
@@ -326,11 +325,3 @@ def _header(content: bytes) -> bytes:
     if length > MAX_HEADER_BYTES:
         raise ValueError(f"a header of {length} bytes, over {MAX_HEADER_BYTES}")
     return content[_LENGTH_BYTES : _LENGTH_BYTES + length]
-
-
-def _bad_safetensors(path: Path, got: str) -> UserError:
-    return UserError(
-        f"{path}: {' '.join(got[:300].split())}",
-        f"a whole safetensors file of at most {MAX_SAFETENSORS_BYTES >> 20} MiB",
-        "get the file again from its source",
-    )

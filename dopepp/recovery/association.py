@@ -88,14 +88,18 @@ class KeypointGroup:
 
 
 def direction_evidence(peaks: ObjectPeaks, max_angle: float, coincident_px: float) -> Evidence:
-    """Say how much belief and direction speak for each corner peak to belong to each centroid.
+    """Return how much belief and direction speak for each corner peak to belong to each centroid.
 
     The angle's likelihood is taken over that of any angle, so that a vector without a direction
     speaks for nobody. Unit vectors whose angles deviate by σ have a mean of length exp(−σ²/2).
 
-    At most ``max_angle`` (radians) may lie between them for a corner to belong to a centroid; one
-    within ``coincident_px`` of it has no direction, and any angle will do. Returned are
-    log-likelihood ratios; −∞ where a pair is not allowed.
+    Args:
+        peaks: Corner peaks and centroids.
+        max_angle: Largest angle between a vector and its centroid, radians.
+        coincident_px: Distance from a centroid within which any angle will do.
+
+    Returns:
+        Log-likelihood ratios; −∞ where a pair is not allowed.
     """
     return _direction_evidence(
         peaks.position, peaks.score, peaks.toward, peaks.centroid, peaks.centroid_score, max_angle,
@@ -108,12 +112,10 @@ def associate(
 ) -> list[KeypointGroup]:
     """Group peaks into instances, one per centroid.
 
-    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: that of
-    belief and direction, and that of the distance from where the instance's other corners put it.
-    The latter binds the corners together. A peak that nothing speaks for stays alone.
-
-    ``expected`` is where poses found before put the corners, pixels; NaN for an instance without a
-    pose. Before there are any, triples of corners predict the others.
+    Per corner, peaks are assigned to centroids one-to-one by the greatest total evidence: of belief
+    and direction, and of the distance from where the instance's other corners predict it. A peak
+    without evidence stays alone. ``expected`` is where poses put the corners, pixels, NaN for an
+    instance without a pose; before there are any, triples of corners predict the others.
     """
     deviation = np.full(len(evidence), PREDICTION_PX)
     if expected is None:
@@ -185,10 +187,10 @@ def _gain(
     deviation: Array,
     area_px: float,
 ) -> Array:
-    """Add what the distance from the expected place says; 0 where all speaks against a pair.
+    """Add the evidence of the distance from the expected position; 0 where it is negative.
 
-    It is the ratio of a Gaussian's density there to that of a peak anywhere on the maps. Without
-    an expectation the pair may be anywhere, which is what a ratio of 1 says.
+    It is the ratio of a Gaussian's density there to that of a peak anywhere on the maps, which is 1
+    without an expectation.
     """
     gain = np.zeros(evidence.shape)
     for i, k, m in np.ndindex(evidence.shape):
@@ -207,10 +209,7 @@ def _gain(
 
 @compiled()
 def _unrivalled(gain: Array) -> Array:
-    """Return each instance's best peak of each corner, −1 for none.
-
-    For a corner of which two instances want the same peak, all have :data:`RIVALS`.
-    """
+    """Return instances' best peaks of each corner, −1 for none, or RIVALS where two want one."""
     chosen = np.full(gain.shape[:2], -1, np.int64)
     for k in range(gain.shape[1]):
         for i in range(len(gain)):
@@ -230,10 +229,9 @@ def _unrivalled(gain: Array) -> Array:
 def _predict(
     position: Array, evidence: Array, centroid: Array, area_px: float
 ) -> tuple[Array, Array]:
-    """Find for each centroid the corners that the most and likeliest peaks agree on.
+    """Return the corner positions that the most and likeliest peaks agree on, and their deviation.
 
-    A peak that belongs to nobody may lie anywhere on the maps. Returned are the corners' expected
-    positions, NaN where no three peaks have a say, and the standard deviation from them, pixels.
+    Positions are NaN where no three peaks have a say; deviations are standard deviations, pixels.
     """
     count = len(evidence)
     expected, deviation = np.full((count, NUM_CORNERS, 2), math.nan), np.empty(count)
@@ -273,11 +271,7 @@ def _predict(
 def _best_triple(
     arms: Array, evidence: Array, usable: Array, area_px: float, expected: Array
 ) -> float:
-    """Write the arms of the corners that the best three candidates predict.
-
-    Returned is the standard deviation from them. A corner has so many ``usable`` candidates,
-    likeliest first; their arms are seen from the centroid.
-    """
+    """Write the arms that the best three candidates predict; return their standard deviation."""
     best, best_variance = -math.inf, PREDICTION_PX**2
     diagonals, known = np.empty((4, 2)), np.empty(3, np.int64)
     corners, chosen = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -318,7 +312,7 @@ def _agreement(
 ) -> tuple[float, float]:
     """Return the evidence of all candidates near these diagonals' corners, and their variance.
 
-    The sum may be given up, at whatever it is, once it cannot exceed ``least`` any more.
+    The sum is given up, at whatever it is, once it cannot exceed ``least`` any more.
     """
     size = 0.0
     for d in range(4):

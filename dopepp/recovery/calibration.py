@@ -1,17 +1,12 @@
 """The options of the way from maps to poses, and what validation images teach about them.
 
-``evaluate.py tune=true`` fits a factor on distances and the weights of the score.
-
-Distance: a network's keypoints are means over the poses it holds possible, and the mean of a turned
-figure is a smaller one, so its poses are too far away, each by about the same factor.
-
-Covariance: peaks tell how uncertain each keypoint is, not what is wrong with all of them alike, so
-that poses are farther off than their covariances say, by about the same factor.
-
-Score: how likely a detection's ADD is below a tenth of the diameter, a logistic model of what
-recovery knows about a pose. As long as nobody has fitted it, its weights make the score the mean
-belief. To add a feature, name it in :data:`FEATURES`, compute it in :func:`detection_features`
-and give ``RecoveryOptions`` its weight.
+``evaluate.py tune=true`` fits three things. Distance: a network's keypoints are means over the
+poses it holds possible, and the mean of a turned figure is a smaller one, so its poses are too far
+away by about the same factor. Covariance: peaks tell how uncertain each keypoint is, not what is
+wrong with all of them alike. Score: how likely a detection's ADD is below a tenth of the diameter,
+a logistic model; with the default weights the score is the mean belief. To add a feature, name it
+in :data:`FEATURES`, compute it in :func:`detection_features` and give ``RecoveryOptions`` its
+weight.
 """
 
 from __future__ import annotations
@@ -150,7 +145,7 @@ class RecoveryOptions:
         return replace(self, **{k: v for k, v in defaults.items() if k.startswith("refined_")})  # type: ignore[arg-type]
 
     def of_candidates(self) -> RecoveryOptions:
-        """Return the options that let all through which refinement is to judge."""
+        """Return the options that keep every detection that refinement is to judge."""
         if self.refined_weights == _NETWORK_SCORE:
             return self
         return replace(self, min_score=min(self.min_score, CANDIDATE))
@@ -188,10 +183,7 @@ def rescored(refined: Sequence[Detection], options: RecoveryOptions) -> list[Det
 
 
 def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
-    """Return the features of a detection after refinement; one that was kept has no agreement.
-
-    Its score is still the network's.
-    """
+    """Return the features of a refined detection, whose score is still the network's."""
     sure = float(np.clip(detection.score, _CERTAIN, 1 - _CERTAIN))
     known = detection.agreement or 0.0, detection.support or 0.0
     return np.array([1.0, np.log(sure / (1 - sure)), *known])
@@ -200,10 +192,7 @@ def refined_features(detection: Detection) -> Float[np.ndarray, "features"]:
 def fit_distance_factor(
     estimated: Float[np.ndarray, "n 4 4"], true: Float[np.ndarray, "n 4 4"]
 ) -> float:
-    """Return the median ratio of true to estimated distance; 1 where there are no poses.
-
-    The estimated object-to-camera transforms were found with a factor of 1.
-    """
+    """Return the median ratio of true to estimated distance; 1 without poses."""
     if not len(estimated):
         return 1.0
     distances = [np.linalg.norm(T[:, :3, 3], axis=1) for T in (true, estimated)]
@@ -211,11 +200,11 @@ def fit_distance_factor(
 
 
 def fit_covariance_factor(squared_distances: Float[np.ndarray, "n"]) -> float:
-    """Return the factor on covariances that makes the true poses as far from them as they say.
+    """Return the factor that makes true poses as far from estimates as covariances say.
 
-    The squared Mahalanobis distances of true poses were found with a factor of 1. What nine of ten
-    do not exceed is compared: their tails are heavier than a Gaussian's, and refinement, whose
-    prior this is, must reach the truth. Without any, the factor is 1.
+    Compared is what nine of ten squared Mahalanobis distances, found with a factor of 1, do not
+    exceed: their tails are heavier than a Gaussian's, and refinement, whose prior this is, must
+    reach the truth.
     """
     if not len(squared_distances):
         return 1.0
@@ -256,10 +245,10 @@ def score(
 def fit_weights(
     features: Float[np.ndarray, "n features"], correct: Bool[np.ndarray, "n"]
 ) -> Float[np.ndarray, "features"]:
-    """Fit the weights by maximum likelihood (Newton's method), slightly held back.
+    """Fit the weights by maximum likelihood (Newton's method) with a ridge.
 
-    A detection without an instance is not correct. A ``ValueError``: there are no detections, or
-    none of them is right, or all are.
+    A detection without an instance is not correct. A ``ValueError``: all or no detections are
+    right.
     """
     correct = np.asarray(correct, bool)
     if not correct.any() or correct.all():

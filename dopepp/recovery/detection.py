@@ -149,12 +149,10 @@ def pose_instances(
 def solve_group(group: KeypointGroup, cuboid: Cuboid, K: CameraMatrix) -> PnPResult:
     """Solve PnP with each keypoint weighted by its own covariance.
 
-    A covariance is averaged over its directions. How wide a network's peak is tells how far it is
-    off; its shape does not tell whither: taken at their word, ellipses left ADD-0.1d of a trained
-    network at 76 %, circles gave 85 %. Where shapes are right, circles cost 2 points.
-
-    A network's maps are narrower than its errors; where fewer than two thirds of the keypoints
-    agree on a pose, the deviations are widened and the pose solved again.
+    A covariance is averaged over its directions: how wide a network's peak is tells how far it is
+    off, its shape does not tell whither. A network's maps are narrower than its errors; where fewer
+    than two thirds of the keypoints agree on a pose, the deviations are widened and the pose solved
+    again.
     """
     found = sum(math.isfinite(x) for x in group.position[:, 0].tolist())
     if found < MIN_POINTS:  # as of most centroids that noise makes

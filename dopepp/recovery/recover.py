@@ -76,10 +76,17 @@ def recover(
 ) -> list[Detection]:
     """Recover the poses of all objects on one image from its maps.
 
-    Of C objects there are 9·C belief maps (peaks of 1), 16·C vector-field maps, and nine keypoints
-    each, metres; without names, their indices stand for them. K is the camera matrix of the
-    network's input, pixels, of which ``stride`` make a cell. The options are fields of
-    :class:`RecoveryOptions`. Returned are the detections of all objects, best score first.
+    Args:
+        belief: 9·C belief maps of C objects, peaks of 1.
+        field: 16·C vector-field maps.
+        cuboids: Nine keypoints of each object, metres.
+        K: Camera matrix of the network's input, pixels.
+        stride: Pixels per cell.
+        names: Names of the objects (default: their indices).
+        **options: Fields of :class:`RecoveryOptions`.
+
+    Returns:
+        Detections of all objects, best score first.
     """
     return recover_batch(
         belief[None], field[None], cuboids, np.asarray(K)[None], stride, names, None, **options
@@ -98,10 +105,11 @@ def recover_batch(
 ) -> list[list[Detection]]:
     """Recover the poses on every image of a batch; see :func:`recover`.
 
-    Peaks are found and read on the maps' device; only they come to the host. ``reasons`` takes one
-    for each object or centroid that is left out. A ``ValueError``: the channels do not match
-    the number of cuboids, maps differ in size or have no cells, or there are not as many cameras as
-    images or names as objects. A :class:`UserError`: an option is out of range.
+    ``reasons`` takes one for each object or centroid that is left out.
+
+    Raises:
+        ValueError: Maps, cuboids, cameras and names do not fit each other.
+        UserError: An option is out of range.
     """
     chosen = RecoveryOptions.of(options)
     cuboids, K = np.asarray(cuboids, np.float64), np.asarray(K, np.float64)

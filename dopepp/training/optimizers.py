@@ -37,17 +37,12 @@ _RMS: Final = 0.2
 class Muon(AdamW):
     """Momentum made orthogonal for the weights of convolutions, AdamW for all else.
 
-    A convolution's weight is a matrix, output channels by all the rest. Its step is the momentum
-    (Nesterov's) with all singular values brought near 1 (Jordan et al. 2024), so that directions of
-    small gradients are learned as fast as those of large ones; it is as large as AdamW's, and the
-    same learning rates and decays serve both. Biases and norms take AdamW's step.
-
-    Args:
-        params: What to learn.
-        lr: Learning rate.
-        betas: Decay of the momentum (of both), and of AdamW's squares.
-        eps: Added to AdamW's root mean squares.
-        weight_decay: Decoupled, in learning rates.
+    A convolution's weight is a matrix, output channels by all the rest. Its step is Nesterov's
+    momentum with all singular values brought near 1 (Jordan et al. 2024), so that directions of
+    small gradients are learned as fast as those of large ones; it is as large as AdamW's, so
+    learning rates and decays serve both. Biases and norms take AdamW's step. torch's own Muon needs
+    torch 2.9 and takes matrices only. The arguments are those of AdamW; the first of ``betas`` is
+    also the momentum's.
     """
 
     def __init__(
@@ -92,8 +87,8 @@ class Muon(AdamW):
 def orthogonalised(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
     """Return U·Vᵀ of a matrix U·S·Vᵀ, nearly: the singular values are 0.7–1.2.
 
-    Each round is a polynomial of the small Gram matrix times the one before, and all of them
-    commute, so only the first and the last product are with the matrix itself.
+    All rounds are polynomials of the small Gram matrix, so only the first and the last product are
+    with the matrix itself.
     """
     if matrix.shape[0] > matrix.shape[1]:
         return orthogonalised(matrix.T).T
@@ -117,16 +112,13 @@ def _polynomial(gram: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
 class AveragedWeights(WeightAveraging):
     """Exponential moving average of weights and batch norm statistics, used for validation.
 
-    After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``:
-    it spans about 1 / (1 − decay) steps, and a decay of 0 does not average. The ``state_dict`` of
-    every checkpoint is the average; training goes on with the weights under :data:`TRAINED`.
+    After step n, ``average += (1 − d)·(weights − average)`` with ``d = min(decay, n / (n + 9))``.
+    The ``state_dict`` of every checkpoint is the average; training goes on with the weights under
+    :data:`TRAINED`.
 
     Lightning's ``EMAWeightAveraging`` does not suffice: its checkpoints of a validation have both
     sets of weights the wrong way round, its training ends with the average, so that it cannot be
     resumed exactly, it averages 16-bit weights in 16 bits, and its decay has no ramp.
-
-    Raises:
-        UserError: The decay is not in [0, 1).
     """
 
     def __init__(self, decay: float) -> None:
@@ -201,10 +193,7 @@ class AveragedWeights(WeightAveraging):
 
 
 def go_on_with_trained(checkpoint: dict[str, Any]) -> None:
-    """Make the trained weights of a loaded checkpoint those that training goes on with.
-
-    A run that was begun with an average may go on without one, which then is dropped.
-    """
+    """Make the trained weights of a loaded checkpoint those that training goes on with."""
     if TRAINED in checkpoint:
         checkpoint[_AVERAGED] = checkpoint["state_dict"]
         checkpoint["state_dict"] = checkpoint.pop(TRAINED)

@@ -63,13 +63,16 @@ class PoseSystem(LightningModule):
     """Trains a network on maps and recovers poses from them.
 
     Args:
+        network: The network to train.
+        loss: Its loss.
         parts: The objects, in the order of the network's channels.
         geometry: Of the target maps.
         recovery: Thresholds of the way from maps to poses.
-        make_scheduler: Optimiser and number of steps to a schedule stepped once a batch; None for
-            a constant learning rate.
+        make_optimizer: Builds the optimiser.
+        make_scheduler: Builds a schedule, stepped once a batch, from optimiser and number of steps.
         payload: The self-description stored in every checkpoint under ``dopepp``.
         compile_network: Whether to run the network through ``torch.compile``.
+        symmetry: How symmetric parts are learnt.
     """
 
     def __init__(
@@ -110,10 +113,9 @@ class PoseSystem(LightningModule):
     def targets(self, batch: Batch, stages: Sequence[Stage] | None = None) -> Targets:
         """Return the maps that the network should give, drawn on the batch's device.
 
-        An instance that is too little visible for a metric to count is left out. A symmetric part
-        looks the same in several poses: the maps are of the one nearest a reference orientation
-        (:mod:`~dopepp.training.targets`), or, where two are as good, of the one that the network
-        itself tends to, as its answer to the images shows (``stages``; without it, the first).
+        Instances too little visible for a metric are left out. Of the poses of a symmetric part
+        that look alike, the network's answer to the images (``stages``) may decide
+        (:mod:`~dopepp.training.targets`).
         """
         keypoints = batch.keypoints
         if self.symmetry.active:
@@ -212,7 +214,7 @@ class PoseSystem(LightningModule):
 
 
 def _without_progress(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what describes a schedule itself, of its state."""
+    """Return the part of a schedule's state that describes the schedule itself."""
     return {name: value for name, value in state.items() if name not in _SCHEDULE_PROGRESS}
 
 

@@ -65,10 +65,7 @@ class SymmetryOptions:
 def draw_maps(
     batch: Batch, keypoints: Keypoints, num_objects: int, geometry: MapGeometry
 ) -> Targets:
-    """Draw the maps of the instances that are visible enough for a metric to count them.
-
-    Their keypoints, pixels, are those of the batch, or of poses that look alike.
-    """
+    """Draw the maps of the instances that are visible enough for a metric to count them."""
     height, width = batch.images.shape[-2:]
     map_size = height // geometry.stride, width // geometry.stride
     seen = batch.visible_fraction >= MIN_VISIBLE_FRACTION
@@ -87,7 +84,7 @@ def choose_keypoints(
 
     This is the pose nearest the reference orientation. Where another pose is as good, the one is
     taken whose maps have the lower loss to the network's answer (``stages``); instances are decided
-    one after the other. Without an answer it is always the nearest pose.
+    one after the other.
     """
     choices, allowed = symmetry.equivalents(batch)
     keypoints = choices[:, :, 0].clone()
@@ -128,8 +125,8 @@ class SymmetryHandling:
         longest = max(len(row["transforms"]) for row in rows)
         for row in rows:
             count = len(row["transforms"])
-            padding = [np.eye(4)[None]] * (longest - count)
             row["there"] = np.arange(longest) < count
+            padding = [np.eye(4)[None]] * (longest - count)
             row["transforms"] = np.concatenate([row["transforms"], *padding])
         self.active = options.canonical and any(row["symmetric"] for row in rows)
         self._tables = {

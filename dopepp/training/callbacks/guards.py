@@ -66,10 +66,9 @@ class FiniteSteps(Callback):
 
     Weights, the optimiser's state and batch norm's statistics then stay as they were; the step
     counts as one, so the schedule goes on as planned. With accumulation the whole step is left out.
-    Gradients that only overflow because mixed precision scales them are its scaler's own business:
-    they are neither counted nor reported. ``train/skipped_steps`` counts over the whole run. After
-    ``max_in_a_row`` such steps one after the other the run ends, and leaves the last of their
-    batches in the run folder's ``nonfinite/``.
+    Gradients that only overflow because mixed precision scales them are not counted.
+    ``train/skipped_steps`` counts over the whole run. After ``max_in_a_row`` such steps the run
+    ends, and leaves the last of their batches in the run folder's ``nonfinite/``.
     """
 
     def __init__(self, max_in_a_row: int = 10) -> None:
@@ -178,11 +177,7 @@ class FiniteSteps(Callback):
 
 
 def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Write ``path.pt`` and ``path.png``; a disk that takes neither is reported, not raised.
-
-    The file is a mapping of the facts, plain values, and of the batch's fields, and loads under
-    ``weights_only=True``.
-    """
+    """Write ``path.pt``, for ``torch.load``, and ``path.png``; a full disk is only reported."""
     shown = batch.rows(torch.arange(min(len(batch), _MAX_TILES))).to("cpu")
     images, truths = shown.images.permute(0, 2, 3, 1).numpy(), shown.keypoints.numpy()
     tiles = [
@@ -199,10 +194,9 @@ def _dump_batch(path: Path, batch: Batch, facts: Mapping[str, Any]) -> None:
 class EmptyMaps(Callback):
     """Warns once, with the likely reasons, when no belief is high enough for any detection.
 
-    Maps are empty if no centroid's, or no corner's, belief reaches the threshold of the recovery
-    on any validation image. After ``patience`` such validations in a row (a network of few steps is
-    rightly silent), or at the end of a shorter training, one warning names the three usual causes,
-    the likely ones first, each with what the run shows of it and what to try.
+    Maps are empty if no centroid's, or no corner's, belief reaches the threshold of the recovery on
+    any validation image. The warning comes after ``patience`` such validations in a row (a network
+    of few steps is rightly silent), or at the end of a shorter training.
     """
 
     def __init__(self, patience: int = 3) -> None:

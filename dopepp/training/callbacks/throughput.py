@@ -44,25 +44,12 @@ class Throughput(Callback):
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = 0.0
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return what has been counted of this epoch."""
-        elapsed = self._step_ended - self._started
-        return {"images": self._images, "waited_s": self._waited, "elapsed_s": elapsed}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting an epoch that was cut off."""
-        self._images, self._waited = state_dict["images"], state_dict["waited_s"]
-        self._started, self._step_ended = -float(state_dict["elapsed_s"]), 0.0
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave out the time between a cut-off epoch and its continuation."""
-        pause = time.perf_counter() - self._step_ended
-        self._started, self._step_ended = self._started + pause, self._step_ended + pause
-
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clocks."""
         self._images, self._waited = 0, 0.0
         self._started = self._step_ended = time.perf_counter()
+
+    on_train_start = on_train_epoch_start  # a resumed epoch is measured from there on
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Count the time since the last step ended as waiting."""
@@ -90,10 +77,7 @@ class Throughput(Callback):
 
 
 class RunProgress(TQDMProgressBar):
-    """Adds ``left``, the time until the run's last step, to the bar of the epoch.
-
-    Extrapolated from all steps since the run began or was resumed, their validations included.
-    """
+    """Adds ``left``, the time until the run's last step, extrapolated from all steps so far."""
 
     def __init__(self) -> None:
         super().__init__(refresh_rate=5)  # drawing it costs more than a small network's step
@@ -118,11 +102,7 @@ class RunProgress(TQDMProgressBar):
 
 
 class Operators(PyTorchProfiler):
-    """Profiles torch's operators in a few steps of training and of validation.
-
-    Lightning's own report is of the last recording alone, a validation. The folder gets the report
-    and a trace of each recording.
-    """
+    """Profiles torch operators in all recorded steps; Lightning reports the last recording only."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(dirpath=folder, filename=_FILE, on_trace_ready=self._collect)
@@ -157,10 +137,7 @@ class Operators(PyTorchProfiler):
 
 
 def make_profiler(kind: Literal["simple", "pytorch"] | None, run_dir: Path) -> Profiler | None:
-    """Build the profiler that ``trainer.profiler`` names.
-
-    ``simple`` is of the hooks of the training loop, ``pytorch`` of the operators in a few steps.
-    """
+    """Build the profiler of ``trainer.profiler``: of the loop's hooks, or of torch's operators."""
     if kind == "simple":
         return SimpleProfiler(dirpath=run_dir / FOLDER, filename=_FILE)
     return None if kind is None else Operators(run_dir / FOLDER)

@@ -33,13 +33,10 @@ class PrunedError(Exception):
 class TrialReport(Callback):
     """Reports the objective after each validation and stops a trial that is not worth finishing.
 
-    Optuna's median rule: it is stopped when its best value so far is worse than the median of the
-    other trials' values at the same epoch, once ``after_trials`` are finished, and not in its first
-    ``after_epochs``. The storage is an SQLite file or a database URL, ``monitor`` the logged value
-    that is the objective.
-
-    Attributes:
-        pruned: Why training was stopped; empty where it was not.
+    Optuna's median rule: a trial is stopped when its best value so far is worse than the median of
+    the other trials' values at the same epoch, once ``after_trials`` are finished, and not in its
+    first ``after_epochs``. The storage is an SQLite file or a database URL, ``monitor`` the logged
+    value that is the objective. ``pruned`` is why training was stopped, empty where it was not.
     """
 
     _study: Study

@@ -30,7 +30,6 @@ from dopepp.drawing.pictures import Picture
 from dopepp.drawing.sheet import Tile, belief_tiles, contact_sheet
 from dopepp.geometry.cuboid import NUM_KEYPOINTS
 from dopepp.metrics.pose import MEAN, PoseMetrics
-from dopepp.metrics.row import PoseRow
 from dopepp.parts.part import Part
 from dopepp.training.loggers import GuardedLogger
 from dopepp.training.system import PoseSystem, ValidationOutput
@@ -48,10 +47,9 @@ _OF_MATCHES: Final = ("median_rotation_deg", "median_rotation_s_deg")
 class PoseMetricsCallback(Callback):
     """Logs the pose metrics of every validation as ``val/<metric>``, averaged over objects.
 
-    ``val/selection`` is what the best checkpoint is chosen by: the mean over objects of the exact
-    AUC up to 0.1 m, of ADD, or of ADD-S for an object with symmetries ("ADD(-S)").
-
-    The metrics stay readable on :attr:`metrics` for callbacks further down the list.
+    ``val/selection``, which chooses the best checkpoint, is the mean over objects of the exact AUC
+    up to 0.1 m, of ADD, or of ADD-S for an object with symmetries ("ADD(-S)"). The metrics stay
+    readable on :attr:`metrics` for callbacks further down the list.
     """
 
     metrics: PoseMetrics
@@ -69,18 +67,20 @@ class PoseMetricsCallback(Callback):
         self, trainer: Trainer, system: PoseSystem, outputs: ValidationOutput, batch: Batch, *_: Any
     ) -> None:
         """Recover the batch's poses and compare them with its instances."""
-        detections = system.recover(outputs, batch)
-        truths = batch_instances(batch, system.parts)
+        detections, truths = system.recover(outputs, batch), batch_instances(batch, system.parts)
         width = batch.images.shape[-1]
         cameras = batch.K.double().cpu().numpy()
-        for found, instances, K in zip(detections, truths, cameras, strict=True):
-            self.metrics.update(found, instances, K, width)
+        for image in zip(detections, truths, cameras, strict=True):
+            self.metrics.update(*image, width)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the mean over objects; what does not exist (nothing matched) is left out."""
         rows = self.metrics.compute()
         values = {name: getattr(rows[MEAN], name) for name in LOGGED}
-        values["selection"] = _selection([row for name, row in rows.items() if name != MEAN])
+        objects = [row for name, row in rows.items() if name != MEAN]
+        areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in objects]
+        counted = [area for area in areas if area is not None]
+        values["selection"] = sum(counted) / len(counted) if counted else None
         for name, value in values.items():
             # A selection needs a number even where no object was in the validation images.
             if value is None and name not in _OF_MATCHES:
@@ -88,12 +88,6 @@ class PoseMetricsCallback(Callback):
             if value is not None:
                 on_bar = name == "add_01d"
                 pl_module.log(f"val/{name}", float(value), prog_bar=on_bar, rank_zero_only=False)
-
-
-def _selection(rows: Sequence[PoseRow]) -> float | None:
-    areas = [row.auc_s_10cm if row.num_symmetries > 1 else row.auc_10cm for row in rows]
-    known = [area for area in areas if area is not None]
-    return sum(known) / len(known) if known else None
 
 
 def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Instance]]:
@@ -112,8 +106,8 @@ def batch_instances(batch: Batch, parts: tuple[Part, ...]) -> Iterator[list[Inst
 class EarlyStop(EarlyStopping):
     """Lightning's callback, for runs that are resumed.
 
-    The patience is that of the present config, not the saved one; and a run that has stopped does
-    not train further, unless it now has more patience.
+    The patience is that of the present config; and a run that has stopped does not train further,
+    unless it now has more patience.
     """
 
     @property
@@ -132,15 +126,12 @@ class EarlyStop(EarlyStopping):
 
 
 class AUCCurves(Callback):
-    """Writes ``val_auc.png`` and ``val_auc.csv`` after every validation and logs the picture.
-
-    Must stand after :class:`PoseMetricsCallback`, whose errors it draws.
-    """
+    """Writes and logs ``val_auc`` after validations; must follow :class:`PoseMetricsCallback`."""
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw one curve per object; every process takes part in gathering the errors."""
-        listed: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        metrics = next(one.metrics for one in listed if isinstance(one, PoseMetricsCallback))
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        (metrics,) = (one.metrics for one in callbacks if isinstance(one, PoseMetricsCallback))
         curves = {name: metrics.errors(name) for name in metrics.parts}
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
@@ -209,11 +200,7 @@ class Overlays(ValidationSheet):
 
 
 class BeliefMaps(ValidationSheet):
-    """The images under the network's belief maps: ``val_belief.png``.
-
-    Each image is there twice, with the maxima: the strongest belief of any corner, and of the
-    centroid, over all objects.
-    """
+    """The images under the network's belief maps, corners' and centroid's: ``val_belief.png``."""
 
     name: ClassVar[str] = "belief"
 

@@ -33,10 +33,8 @@ PREVIOUS: Final = "previous.ckpt"
 BEST: Final = "best.ckpt"
 
 _NEEDED: Final = frozenset({"global_step", "loops", "optimizer_states", "callbacks"})
-_NUM_FILES: Final = 4
-"""Last, previous, best, and one that is being written."""
-_WEIGHTS_PER_FILE: Final = 3
-"""The weights and an optimiser's two moments."""
+_NUM_FILES: Final = 4  # last, previous, best, and one that is being written
+_WEIGHTS_PER_FILE: Final = 3  # the weights and an optimiser's two moments
 _ADVICE: Final = {
     errno.ENOSPC: "free some space there",
     errno.EDQUOT: "free some of your share of it",
@@ -47,17 +45,16 @@ _PATHS: Final = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
 class SavingFailedError(RunError):
-    """What a run must leave could not be written, said in one line."""
+    """A checkpoint of a finished run could not be written."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Lightning's checkpoint files, saved atomically and loaded without running code.
 
     A checkpoint that cannot be written (disk full, server away) is kept in memory and written
-    before the next one, so files on disk never refer to one that is not there; a newer version of
-    the same file takes its place. Training goes on meanwhile; :meth:`finish` fails if something is
-    still not written. ``prepare`` is called before each writing; if it raises ``OSError``, nothing
-    is written. Outside of the run's folder nothing is removed; None is no limit.
+    before the next one, so files on disk never refer to a missing one; a newer version of the same
+    file takes its place. ``prepare`` is called before each writing; if it raises ``OSError``,
+    nothing is written. Outside of the run's ``folder`` nothing is removed.
     """
 
     def __init__(
@@ -75,7 +72,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write the file so that a crash leaves either the old or the new one.
+        """Write the file, or keep it in memory; a crash leaves either the old or the new one.
 
         ``storage_options`` are None, or ``{"previous": PATH}`` to keep the old file there.
         """
@@ -102,17 +99,14 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             except OSError as error:
                 # Training goes on to change the tensors that the newest one refers to.
                 self._waiting = {
-                    name: (_copy(one), old) for name, (one, old) in self._waiting.items()
+                    p: (_copy(content), old) for p, (content, old) in self._waiting.items()
                 }
                 return error
             del self._waiting[path]
         return None
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file of the run.
-
-        Which one is named by the state of a callback, so by a checkpoint: it may be anybody's.
-        """
+        """Remove a file of the run; a checkpoint names the file, so it may be anybody's."""
         target = Path(os.fspath(path))
         folder = target.parent.resolve()
         if self._folder is not None and not folder.is_relative_to(self._folder.resolve()):
@@ -126,34 +120,30 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     ) -> dict[str, Any]:
         """Load a file as plain data; a pickled object in it is refused, whoever asks.
 
-        A run's folder may have been moved since: what its callbacks call their files is looked for
-        beside the file itself.
+        A run's folder may have been moved: its callbacks' files are looked for beside the file
+        itself.
         """
         loaded: Mapping[str, Any] = super().load_checkpoint(path, map_location, weights_only=True)
         if self._folder is None:
             return dict(loaded)
-        folder = self._folder / FOLDER
-        callbacks = {
-            name: _moved(state, folder) if isinstance(state, dict) and "dirpath" in state else state
-            for name, state in loaded.get("callbacks", {}).items()
-        }
+        states = loaded.get("callbacks", {})
+        callbacks = {name: _moved(state, self._folder / FOLDER) for name, state in states.items()}
         return {**loaded, "callbacks": callbacks}
 
 
 def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
     """Return the newest whole checkpoint of a run; None if it has not saved any yet.
 
-    Every damaged file is reported in a line. If none is whole, it is a :class:`UserError`.
+    Raises:
+        UserError: All are damaged; each damaged file is reported in a line.
     """
     damaged = []
-    for name in (LAST, PREVIOUS, BEST):
-        path = run_dir / FOLDER / name
-        if not path.exists():
-            continue
+    paths = [run_dir / FOLDER / name for name in (LAST, PREVIOUS, BEST)]
+    for path in filter(Path.exists, paths):
         try:
             checkpoint, step = _read_whole(path)
         except UserError as error:
-            damaged.append(path)
+            damaged.append(path.name)
             _log.warning("left out: %s", error.got)
             continue
         if damaged:
@@ -161,7 +151,7 @@ def newest_checkpoint(run_dir: Path) -> tuple[Path, Checkpoint] | None:
         return path, checkpoint
     if damaged:
         raise UserError(
-            f"{run_dir}, whose checkpoints are all damaged ({', '.join(p.name for p in damaged)})",
+            f"{run_dir}, whose checkpoints are all damaged ({', '.join(damaged)})",
             f"a run with at least one whole file among {LAST}, {PREVIOUS} and {BEST}",
             "restore one of them from a backup, or start anew without resume",
         )
@@ -178,10 +168,10 @@ def saved_step(path: Path) -> int | None:
 
 
 def check_room(run_dir: Path, weight_bytes: int) -> None:
-    """Check that a run can write its checkpoints, as far as that can be known in advance.
+    """Check, as far as possible in advance, that a run can write its checkpoints.
 
-    A folder that cannot be written, or whose disk has too little space for weights of so many
-    bytes, is a :class:`UserError`.
+    Raises:
+        UserError: The folder cannot be written, or has no room for weights of so many bytes.
     """
     folder = run_dir / FOLDER
     probe = folder / ".probe"
@@ -191,19 +181,15 @@ def check_room(run_dir: Path, weight_bytes: int) -> None:
         probe.unlink()
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        raise UserError(
-            f"{folder}, which cannot be written: {error.strerror or error}",
-            "a folder that can be written, for checkpoints",
-            "set output_dir=…, or make it writable",
-        ) from error
-    there = sum(path.stat().st_size for path in folder.glob("*.ckpt"))
+        got = f"{folder}, which cannot be written: {error.strerror or error}"
+        fix = "set output_dir=…, or make it writable"
+        raise UserError(got, "a folder that can be written, for checkpoints", fix) from error
     needed = _NUM_FILES * _WEIGHTS_PER_FILE * weight_bytes
-    if free + there < needed:
-        raise UserError(
-            f"{free / 1e6:,.1f} MB free in {folder}",
-            f"at least {(needed - there) / 1e6:,.1f} MB, for {_NUM_FILES} checkpoints",
-            "free some space, or set output_dir=…",
-        )
+    needed -= sum(path.stat().st_size for path in folder.glob("*.ckpt"))
+    if free < needed:
+        allowed = f"at least {needed / 1e6:,.1f} MB, for {_NUM_FILES} checkpoints"
+        fix = "free some space, or set output_dir=…"
+        raise UserError(f"{free / 1e6:,.1f} MB free in {folder}", allowed, fix)
 
 
 def sweep(run_dir: Path) -> None:
@@ -225,16 +211,13 @@ def _read_whole(path: Path) -> tuple[Checkpoint, int]:
     content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     missing = sorted(_NEEDED - content.keys())
     if bad is not None or missing:
-        raise UserError(
-            f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}",
-            "a checkpoint as training wrote it",
-            "take another one",
-        )
+        got = f"{path}, damaged in {bad}" if bad else f"{path}, without {', '.join(missing)}"
+        raise UserError(got, "a checkpoint as training wrote it", "take another one")
     return checkpoint, int(content["global_step"])
 
 
 def _copy(value: Any) -> Any:
-    """Return a checkpoint whose tensors are its own, on the CPU."""
+    """Return a checkpoint with copies of its tensors, on the CPU."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     if isinstance(value, Mapping):
@@ -242,8 +225,10 @@ def _copy(value: Any) -> Any:
     return [_copy(item) for item in value] if isinstance(value, list) else value
 
 
-def _moved(state: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a ``ModelCheckpoint``'s state with all of its files in a folder."""
+def _moved(state: Any, folder: Path) -> Any:
+    """Return a callback's state, a ``ModelCheckpoint``'s with all of its files in a folder."""
+    if not isinstance(state, dict) or "dirpath" not in state:
+        return state
 
     def place(path: str) -> str:
         return str(folder / Path(path).name) if path else path

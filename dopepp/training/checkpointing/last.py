@@ -49,10 +49,9 @@ Cut = Callable[[dict[str, Any]], None]
 class LastCheckpoint(Checkpoint):
     """Saves ``checkpoints/last.ckpt`` during an epoch, too, and keeps the one before.
 
-    It saves between two batches or before a validation, when ``every_s`` seconds have passed, when
-    a new best checkpoint was saved, at the end, and when a signal asks the run to stop, which it
-    then does. Saving by the clock takes at most ``max_share`` of the time: where it is slow, it
-    happens less often.
+    It saves between two batches or before a validation, when ``every_s`` seconds have passed or a
+    new best checkpoint was saved, at the end, and when a signal asks the run to stop. Saving by the
+    clock takes at most ``max_share`` of the time.
     """
 
     def __init__(self, every_s: float = 60.0, max_share: float = 0.01) -> None:
@@ -104,7 +103,7 @@ class LastCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Batch, batch_idx: int
     ) -> None:
-        """Save what the batches before this one have made of the weights, if it is time."""
+        """Save the state after the batches before this one, if it is time."""
         # Gradients that are being accumulated are in no checkpoint.
         if batch_idx % trainer.accumulate_grad_batches == 0:
             self._save_if_due(trainer, before_batch)
@@ -156,12 +155,10 @@ class LastCheckpoint(Checkpoint):
 
     def _save(self, trainer: Trainer, cut: Cut) -> None:
         folder = Path(trainer.default_root_dir) / files.FOLDER
-        self._cut = cut
-        start = time.monotonic()
+        self._cut, start = cut, time.monotonic()
+        options = {"previous": folder / files.PREVIOUS}
         try:
-            trainer.save_checkpoint(
-                folder / files.LAST, storage_options={"previous": folder / files.PREVIOUS}
-            )
+            trainer.save_checkpoint(folder / files.LAST, storage_options=options)
         finally:
             self._cut = None
         self._saved_at = time.monotonic()
@@ -238,7 +235,7 @@ def _best(trainer: Trainer) -> ModelCheckpoint | None:
 
 
 def _forget_later_best(trainer: Trainer) -> None:
-    """Choose the best checkpoint anew if its file is from after the step that is resumed from.
+    """Choose the best checkpoint anew if its file is newer than the step that is resumed from.
 
     Arithmetic that does not repeat exactly would not find that checkpoint again, and the run would
     end with a best one that none of its metrics are of.
