@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 
 from dopepp.core.errors import UserError
+from dopepp.core.extensions import enable
 from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera import CameraMatrix, Letterbox, project_keypoints
 from dopepp.inference import runtimes
@@ -106,12 +107,17 @@ class PoseEstimator:
         refine: Refine | None = None,
         parts: Sequence[Part] | None = None,
         max_ms: float | None = None,
+        extensions: Sequence[str] = (),
     ) -> PoseEstimator:
         """Load a checkpoint, or what ``dopepp export`` made of one; see the class for the options.
+
+        ``extensions`` are packages of your own whose classes a checkpoint may name
+        (:mod:`dopepp.core.extensions`); they stay enabled in this process.
 
         A :class:`UserError`: the file is missing, is neither of these or not safe to load, its
         extra is missing, or the refinement is not possible.
         """
+        enable(extensions)
         chosen = checked_device(device)
         return cls(*runtimes.load(Path(path), chosen), chosen, refine, parts, max_ms)
 

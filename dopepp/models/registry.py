@@ -5,8 +5,9 @@ is compared with the allow-list before anything is imported, and what it resolve
 again, so neither a path through another module (``dopepp.models.network.os.system``) nor a re-bound
 name gets through; Hydra's own block-list of names can be walked around, an allow-list cannot.
 
-To add a class of your own, import its module and call ``register("package.module.Class")`` of the
-registry of its kind (``BACKBONES.register(…)``).
+A class of a package of your own is allowed once the package is enabled
+(:mod:`dopepp.core.extensions`), or after ``register("package.module.Class")`` of the registry of
+its kind (``BACKBONES.register(…)``).
 """
 
 from __future__ import annotations
@@ -15,24 +16,30 @@ import inspect
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
+from dopepp.core import extensions
 from dopepp.core.errors import UserError
 
 T = TypeVar("T")
 TARGET = "_target_"
+
+_GROUPS: Final = {kind: kind + "s" for kind in ("backbone", "attention", "head")} | {
+    "loss": "losses"
+}
+"""Entry points of enabled packages, by kind (:mod:`dopepp.core.extensions`)."""
 
 
 class Registry(Generic[T]):
     """Builds objects of one kind, and nothing else, from plain nodes.
 
     Messages name the kind, such as ``"backbone"``; every target inherits from ``base`` and is one
-    of the dotted names of allowed classes.
+    of the dotted names of allowed classes, or of those that enabled packages add.
     """
 
     def __init__(self, kind: str, base: type[T], targets: Iterable[str] = ()) -> None:
         self.kind, self.base = kind, base
-        self._targets = set(targets)
+        self._targets, self._group = set(targets), _GROUPS.get(kind)
 
     @classmethod
     def of_module(cls, kind: str, base: type[T], module: ModuleType) -> Registry[T]:
@@ -48,7 +55,8 @@ class Registry(Generic[T]):
     @property
     def targets(self) -> tuple[str, ...]:
         """The allowed dotted names, sorted."""
-        return tuple(sorted(self._targets))
+        added = extensions.found(self._group).values() if self._group else ()
+        return tuple(sorted(self._targets.union(added)))
 
     def register(self, dotted: str) -> None:
         """Allow one more class; it is checked now, so a wrong name fails where it was written.
@@ -64,11 +72,14 @@ class Registry(Generic[T]):
         A :class:`UserError`: the name is not text or not in the allow-list, or it leads to
         something other than the class that the allow-list names.
         """
-        if not isinstance(dotted, str) or dotted not in self._targets:
+        if not isinstance(dotted, str) or dotted not in self.targets:
+            advice = f"register your own {self.kind} in code"
+            if self._group and isinstance(dotted, str) and "." in dotted:
+                advice = extensions.advice(self._group, dotted)
             raise UserError(
                 f"{self.kind} {TARGET} {dotted!r:.200}",
                 ", ".join(self.targets) or "nothing",
-                f"choose one of them, or register your own {self.kind} in code",
+                f"choose one of them, or {advice}",
             )
         return self._load(dotted)
 

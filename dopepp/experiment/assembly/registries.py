@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from lightning.pytorch import Callback
 from lightning.pytorch.loggers import Logger
@@ -16,11 +16,10 @@ from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from dopepp.data.transforms.augment import Photometric
-from dopepp.data.transforms.jitter import CameraJitter
-from dopepp.data.transforms.masking import RandomMask
 from dopepp.models.registry import TARGET, Registry
 from dopepp.training.system import OptimizerFactory, SchedulerFactory
+
+T = TypeVar("T")
 
 OPTIMIZERS: Registry[Optimizer] = Registry(
     "optimizer",
@@ -34,15 +33,6 @@ SCHEDULERS: Registry[LRScheduler] = Registry(
     "scheduler",
     LRScheduler,
     (f"torch.optim.lr_scheduler.{one}LR" for one in ("CosineAnnealing", "Linear", "OneCycle")),
-)
-JITTERS: Registry[CameraJitter] = Registry(
-    "jitter", CameraJitter, ["dopepp.data.transforms.jitter.CameraJitter"]
-)
-MASKINGS: Registry[RandomMask] = Registry(
-    "masking", RandomMask, ["dopepp.data.transforms.masking.RandomMask"]
-)
-AUGMENTATIONS: Registry[Photometric] = Registry(
-    "augmentation", Photometric, ["dopepp.data.transforms.augment.Photometric"]
 )
 CALLBACKS: Registry[Callback] = Registry(
     "callback",
@@ -103,6 +93,7 @@ def scheduler_factory(node: Mapping[str, Any]) -> SchedulerFactory | None:
     return make
 
 
-def build_optional(registry: Registry[Any], node: Mapping[str, Any]) -> Any:
-    """Build a node's object, or None where its choice is ``none`` (no target)."""
+def build_optional(kind: str, base: type[T], node: Mapping[str, Any]) -> T | None:
+    """Build the object of a node that may name one class; None where its choice is ``none``."""
+    registry = Registry(kind, base, [f"{base.__module__}.{base.__qualname__}"])
     return None if node.get(TARGET) is None else registry.build(node)

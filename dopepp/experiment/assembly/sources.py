@@ -1,7 +1,8 @@
 """From the ``data`` config to the DataModule, and to what each split shows.
 
 A split's images are labelled ones in a format of the field, or renders. To add a format, write a
-source and an entry in :data:`FORMATS`.
+source and an entry in :data:`FORMATS`, or an entry point ``dopepp.formats`` to an :data:`Opener` in
+a package of your own (:mod:`dopepp.core.extensions`).
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Final
 
+from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.core.pool import available_cores
 from dopepp.data.datamodule import PoseDataModule
@@ -22,7 +25,10 @@ from dopepp.data.formats.ycb_video.reader import YcbVideoReader
 from dopepp.data.sample import DescribedSource
 from dopepp.data.sources.hybrid import HybridSource, WindowedSource
 from dopepp.data.sources.rendered import RenderedSource, Split
-from dopepp.experiment.assembly.registries import AUGMENTATIONS, JITTERS, MASKINGS, build_optional
+from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.jitter import CameraJitter
+from dopepp.data.transforms.masking import RandomMask
+from dopepp.experiment.assembly.registries import build_optional
 from dopepp.experiment.assembly.renders import (
     held_out_renders,
     kept,
@@ -56,9 +62,9 @@ def build_datamodule(data: DataConfig, parts: Parts, seed: int) -> PoseDataModul
         batch_size=data.batch_size,
         num_workers=available_cores() if data.num_workers is None else data.num_workers,
         seed=seed,
-        jitter=build_optional(JITTERS, data.jitter),
-        masking=build_optional(MASKINGS, data.masking),
-        augment=build_optional(AUGMENTATIONS, data.augment),
+        jitter=build_optional("jitter", CameraJitter, data.jitter),
+        masking=build_optional("masking", RandomMask, data.masking),
+        augment=build_optional("augmentation", Photometric, data.augment),
         backgrounds=backgrounds,
     )
 
@@ -142,10 +148,15 @@ def _real_frames(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
 def labelled_images(data: DataConfig, parts: Parts, seed: int, split: Split) -> DescribedSource:
     """Open a split's labelled images; a :class:`UserError` if ``data.root`` does not hold them."""
     assert data.root is not None
-    if data.format not in FORMATS:
-        formats = ", ".join(FORMATS)
-        raise UserError(f"data.format={data.format}", formats, "choose the images' format")
-    return FORMATS[data.format](data, data.root, parts, seed, split)
+    if data.format in FORMATS:
+        return FORMATS[data.format](data, data.root, parts, seed, split)
+    added = extensions.found("formats")
+    if data.format not in added:
+        formats, advice = ", ".join((*FORMATS, *added)), extensions.advice("formats", data.format)
+        got = f"data.format={data.format}"
+        raise UserError(got, formats, f"choose the images' format, or {advice}")
+    opener: Opener = resolve_name(added[data.format])
+    return opener(data, data.root, parts, seed, split)
 
 
 def synthetic_companions(

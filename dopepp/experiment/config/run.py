@@ -175,6 +175,7 @@ class MeasurementConfig(FalsePositiveTarget):
         refine: ``region`` measures, and tunes, with poses refined on the picture as well, ``depth``
             where the images have depth, a list of the two by both.
         output_dir: Folder of run folders.
+        extensions: Packages of one's own whose code may be used (:mod:`dopepp.core.extensions`).
     """
 
     __pydantic_config__ = STRICT
@@ -186,6 +187,7 @@ class MeasurementConfig(FalsePositiveTarget):
     tune: bool
     refine: str | tuple[str, ...] | None
     output_dir: Any
+    extensions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _ = self.protocols  # refuses a wrong option

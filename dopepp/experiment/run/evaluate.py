@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.experiment import program
 from dopepp.experiment.assembly.parts import build_parts
@@ -85,6 +86,7 @@ def evaluate(config: Mapping[str, Any], run_dir: Path) -> list[Report]:
     """
     program.quiet_lightning()
     asked = EvaluationConfig.of(config)
+    extensions.enable(asked.extensions)
     if asked.ckpt_path is None and asked.results is None:
         allowed = "ckpt_path=… or results=… on the command line"
         raise UserError("no ckpt_path", allowed, "add what is to be measured")

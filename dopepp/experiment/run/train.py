@@ -19,6 +19,7 @@ from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_only
 
+from dopepp.core import extensions
 from dopepp.core.errors import RunError, UserError
 from dopepp.core.interrupts import Interruption
 from dopepp.data.datamodule import PoseDataModule
@@ -75,6 +76,7 @@ def do_job(config: Mapping[str, Any], run_dir: Path) -> object:
     """
     program.quiet_lightning()
     parsed = RunConfig.of(config)
+    extensions.enable(parsed.extensions)
     if parsed.table is not None:
         PaperTable.of(parsed.table)  # a mistake in it shows before the work, not after
     _refuse_parallel_multirun(parsed.trainer)

@@ -1,6 +1,7 @@
 """The renderers to choose from, by name; each is imported when it is asked for.
 
-To add one, write a module with ``render(scene) -> Rendered`` and one line in :data:`RENDERERS`.
+To add one, write a module with ``render(scene) -> Rendered`` and one line in :data:`RENDERERS`, or
+an entry point ``dopepp.renderers`` in a package of your own (:mod:`dopepp.core.extensions`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Final
 
+from dopepp.core import extensions
 from dopepp.core.errors import UserError
 from dopepp.virtual.scene import Rendered, Scene
 
@@ -24,7 +26,9 @@ RENDERERS: Final = {
 
 def find_renderer(name: str) -> Renderer:
     """Return a renderer by name; a UserError where it is unknown or its extra not installed."""
-    if name not in RENDERERS:
-        raise UserError(f"renderer {name!r}", ", ".join(RENDERERS), "choose one of them")
-    render: Renderer = import_module(RENDERERS[name]).render
+    known = RENDERERS if name in RENDERERS else {**extensions.found("renderers"), **RENDERERS}
+    if name not in known:
+        advice = extensions.advice("renderers", name)
+        raise UserError(f"renderer {name!r}", ", ".join(known), f"choose one of them, or {advice}")
+    render: Renderer = import_module(known[name]).render
     return render

@@ -11,6 +11,9 @@ from hydra.experimental.callback import Callback
 from hydra.utils import get_class
 
 from dopepp.core.errors import UserError
+from dopepp.data.transforms.augment import Photometric
+from dopepp.data.transforms.jitter import CameraJitter
+from dopepp.data.transforms.masking import RandomMask
 from dopepp.experiment.assembly import registries
 from dopepp.experiment.assembly.parts import build_parts
 from dopepp.experiment.assembly.registries import SCHEDULERS, optimizer_factory, scheduler_factory
@@ -22,14 +25,15 @@ from dopepp.models.network import ATTENTIONS, BACKBONES, HEADS, LOSSES
 from dopepp.models.registry import Registry
 
 CONF = Path(__file__).parents[3] / "conf"
+TRANSFORMS = "dopepp.data.transforms"
 REGISTRIES: dict[str, Registry[Any]] = {
     "model/backbone": BACKBONES,
     "model/attention": ATTENTIONS,
     "model/head": HEADS,
     "model/loss": LOSSES,
-    "data/jitter": registries.JITTERS,
-    "data/masking": registries.MASKINGS,
-    "data/augment": registries.AUGMENTATIONS,
+    "data/jitter": Registry("jitter", CameraJitter, [f"{TRANSFORMS}.jitter.CameraJitter"]),
+    "data/masking": Registry("masking", RandomMask, [f"{TRANSFORMS}.masking.RandomMask"]),
+    "data/augment": Registry("augmentation", Photometric, [f"{TRANSFORMS}.augment.Photometric"]),
     "optimizer": registries.OPTIMIZERS,
     "scheduler": SCHEDULERS,
     "callbacks": registries.CALLBACKS,
