@@ -1,12 +1,10 @@
-"""What the layouts share: shares of a data set's items, and writers that can be stopped any moment.
+"""Parts that the layouts share: shares of a data set, and writers that survive a kill.
 
-Items are written one by one and finalized chunk by chunk. An item's last file is its marker, so
-what is there is complete; files that a chunk's items share (``scene_gt.json``, a tar shard) are
-assembled when all of them are there, from items that are staged in a hidden folder until then.
+Items are written one by one and finalized chunk by chunk. An item's last file marks the item as
+complete. Files that a chunk's items share (``scene_gt.json``, a tar shard) are assembled from
+items that are staged in a hidden folder.
 
-To add a format, write a folder beside these with a source (:mod:`dopepp.data.sample`) that reports
-to a :class:`~dopepp.data.formats.problems.Problems`, a check (:mod:`dopepp.data.check`), and, if it
-is to be rendered, a :class:`Writer` and one line in ``WRITERS`` of :mod:`dopepp.data.jobs.job`.
+To add a format, see ``docs/adding-a-data-format.md``.
 """
 
 from __future__ import annotations
@@ -27,21 +25,19 @@ from dopepp.data.sample import Sample
 T = TypeVar("T")
 
 STAGING: Final = ".items"
-"""Folder of staged items; readers pass over hidden names."""
+"""Folder of staged items; readers skip hidden names."""
 
 RECORD_FILE: Final = "_dopepp_render.json"
-"""A render job's record in its folder. The underscore is NDDS's mark of a settings file: without
-it, readers of that layout would take the record for an image's annotation."""
+"""A render job's record. The underscore marks a settings file, so NDDS readers skip it."""
 
 _LOCK: Final = "lock"
 _ATTEMPTS: Final = 100
 
 
 class Writer(Protocol):
-    """Writes samples into a folder; made anew in every process from (folder, parts).
+    """Writes samples into a folder; every process makes one from (folder, parts).
 
-    Everything goes through :func:`dopepp.core.files.write_whole` or the like: a file is there
-    completely or not at all. The bytes of an item depend on nothing but (index, sample).
+    A file is there completely or not at all. The bytes of an item depend on (index, sample) only.
     """
 
     name: str
@@ -51,7 +47,7 @@ class Writer(Protocol):
     """Items ``chunk·chunk_size … (chunk + 1)·chunk_size − 1`` are finalized together."""
 
     def prepare(self) -> None:
-        """Write what all of a data set shares, idempotently; a UserError in another's folder."""
+        """Write what all items share, idempotently; a UserError in a folder of other data."""
 
     def write(self, index: int, sample: Sample) -> None:
         """Write one item completely; on return it survives a crash."""
@@ -60,33 +56,32 @@ class Writer(Protocol):
         """Return the indices of the chunk's complete items, finalized or not."""
 
     def finalize(self, chunk: int, indices: Sequence[int]) -> None:
-        """Assemble what the chunk's items share from the items themselves.
+        """Assemble what the chunk's items share: idempotent, atomic, and safe in two processes.
 
-        Idempotent and atomic; two processes may do it at once, and a finalized chunk may be
-        finalized again when later items have been added to it.
+        A finalized chunk may be finalized again after later items have been added to it.
         """
 
 
 def share(num_items: int, part_of: tuple[float, float], name: str) -> slice:
-    """Return which of ``num_items`` items a share given in fractions is.
+    """Return the slice of a share (first, last), given in fractions, of ``num_items`` items.
 
-    Both bounds are rounded alike, so shares that meet in a fraction neither overlap nor leave out.
-    A UserError: no item falls into the share.
+    Both bounds are rounded alike, so adjacent shares neither overlap nor leave an item out.
+
+    Raises:
+        UserError: The share has no item.
     """
     first, last = part_of
     if not 0 <= first < last <= 1:
         raise ValueError(f"part_of must be ascending in [0, 1], got {part_of}")
     chosen = slice(round(first * num_items), round(last * num_items))
     if chosen.start == chosen.stop:
-        raise UserError(
-            f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images",
-            "a folder with more images", "give every split a folder of its own",
-        )  # fmt: skip
+        got = f"{name}: no image in the share {first:.3g} – {last:.3g} of {num_items} images"
+        raise UserError(got, "a folder with more images", "give every split a folder of its own")
     return chosen
 
 
 def read_object(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read a JSON file that a writer adds to; empty where there is none yet."""
+    """Read a JSON object that a writer extends; empty where there is no file yet."""
     content = read_json(path, max_bytes) if path.exists() else {}
     if not isinstance(content, dict):
         raise UserError(f"{path}, no JSON object", "what this writer wrote", "restore or remove it")
@@ -100,12 +95,12 @@ def by_line(content: Mapping[str, object]) -> bytes:
 
 
 def stage(path: Path, content: bytes) -> None:
-    """Write a staged item, also if a finalizer removes the empty folder in the same moment."""
-    retry(lambda: write_whole(path, content))
+    """Write a staged item, also if a finalizer removes the empty folder at that moment."""
+    _retry(lambda: write_whole(path, content))
 
 
 def staged_items(staging: Path, suffix: str) -> list[Path]:
-    """Return the staged items in order, none if a finalizer removes the folder meanwhile."""
+    """Return the staged items in order; none if a finalizer removes the folder meanwhile."""
     try:
         return sorted(staging.glob(f"[0-9]*{suffix}"))
     except FileNotFoundError:
@@ -114,17 +109,16 @@ def staged_items(staging: Path, suffix: str) -> list[Path]:
 
 @contextmanager
 def finalizing(staging: Path) -> Iterator[None]:
-    """Hold a folder of staged items; it goes in the end if nothing is left in it.
+    """Lock a folder of staged items, and remove the folder in the end if it is empty.
 
-    A killed process holds nothing: the system releases its lock. Two that both merge and then
-    remove staged items would otherwise lose what one of them had not seen.
+    So no process removes items that it has not merged. The system releases a killed process's lock.
     """
     path = staging / _LOCK
     while True:
-        descriptor = retry(lambda: _open(path))
+        descriptor = _retry(lambda: _open(path))
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-            # Whoever held it before may have removed the file: then the next one makes another.
+            # The previous holder may have removed the file: then lock the next one.
             if not _is_same(descriptor, path):
                 continue
             yield
@@ -142,17 +136,12 @@ def _open(path: Path) -> int:
     return os.open(path, os.O_RDWR | os.O_CREAT)
 
 
-def retry(act: Callable[[], T]) -> T:
-    """Return what ``act`` does in a folder that it makes and a finalizer may remove at any moment.
-
-    Removed before it is used, the folder is not found; removed between ``mkdir`` and its look at
-    what is in the way, it "exists". What stays in the way is raised in the end.
-    """
+def _retry(act: Callable[[], T]) -> T:
+    """Return the result of ``act``, which makes a folder that a finalizer may remove any moment."""
+    # Removed before its use, the folder is not found; removed within ``mkdir``, it "exists".
     for _ in range(_ATTEMPTS - 1):
-        try:
+        with suppress(FileNotFoundError, FileExistsError):
             return act()
-        except (FileNotFoundError, FileExistsError):
-            continue
     return act()
 
 

@@ -188,20 +188,14 @@ class Oddities:
     def note(self, report: CheckReport, where: Path | str) -> None:
         """Note the oddities and how a reader handles them."""
         if self.inexact:
-            report.note(
-                f"{where}: {self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only; the "
-                "nearest rotation is taken"
-            )
+            got = f"{self.inexact:,} rotations are orthogonal to {bop.INEXACT:g} only"
+            report.note(f"{where}: {got}; the nearest rotation is taken")
         if self.without_fraction:
-            report.note(
-                f"{where}: {self.without_fraction:,} objects without visib_fract; how much of them "
-                "is visible is estimated"
-            )
+            got = f"{self.without_fraction:,} objects without visib_fract"
+            report.note(f"{where}: {got}; how much of them is visible is estimated")
         for number, count in sorted(self.without_model.items()):
-            report.note(
-                f"{where}: object {number} is annotated {count:,} times and has no model; it is "
-                "left out"
-            )
+            got = f"object {number} is annotated {count:,} times and has no model"
+            report.note(f"{where}: {got}; it is left out")
 
 
 @dataclass(frozen=True)

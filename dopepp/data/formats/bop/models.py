@@ -67,15 +67,13 @@ class ModelInfo:
 def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Part]:
     """Make parts from a BOP data set's models, with their symmetries.
 
-    ``objects`` are names in the order wanted; None takes all whose file is there, by number.
+    ``objects`` are names in the wanted order; None takes all objects with a file, by number.
     """
     infos = read_models(Path(root))
     if not infos:
-        raise UserError(
-            f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}",
-            "the root folder of a BOP data set",
-            "check data.root, or unpack the data set's models into it",
-        )
+        got = f"{root}, which has no {INFO_FILE} in {', '.join(MODEL_FOLDERS)}"
+        fix = "check data.root, or unpack the data set's models into it"
+        raise UserError(got, "the root folder of a BOP data set", fix)
     by_name = {info.name: info for info in infos.values()}
     wanted = list(objects or by_name)
     absent = [name for name in wanted if objects is None and not by_name[name].path.is_file()]
@@ -84,40 +82,44 @@ def bop_parts(root: str | Path, objects: Sequence[str] | None = None) -> list[Pa
         wanted = [name for name in wanted if name not in absent]
     for name in wanted:
         if name not in by_name:
-            raise UserError(
-                f"data.objects with {name!r}", ", ".join(by_name), "choose from this list"
-            )
+            got, allowed = f"data.objects with {name!r}", ", ".join(by_name)
+            raise UserError(got, allowed, "choose from this list")
     return [part_of(by_name[name]) for name in wanted]
 
 
 def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
-    """Return which part each BOP object number stands for.
+    """Return the parts by BOP's object numbers.
 
-    Without models in ``root``, parts must be called ``obj_000001`` as BOP's files are.
+    Without models in ``root``, parts must be named ``obj_000001`` as BOP's files are.
     """
     names = {info.name: number for number, info in read_models(root).items()}
     numbered: dict[int, Part] = {}
     for part in parts:
-        number = number_in_name(part.name)
-        if part.name not in names and (names or number is None):
+        number = names.get(part.name) if names else number_in_name(part.name)
+        if number is None:
             raise UserError(
                 f"part {part.name!r} for the data set {root}",
                 ", ".join(names) or f"obj_NNNNNN, as there is no {MODEL_FOLDERS[0]}/{INFO_FILE}",
                 f'choose from these, or write "name": "{part.name}" into {INFO_FILE}',
             )
-        numbered[names[part.name] if number is None or names else number] = part
+        numbered[number] = part
     return numbered
 
 
 def part_of(info: ModelInfo) -> Part:
-    """Read an object's mesh; a :class:`UserError`: it is missing, damaged or not in millimetres."""
+    """Read an object's mesh.
+
+    Raises:
+        UserError: The mesh is missing, damaged or not in millimetres.
+    """
     mesh = read_mesh(info.path, unit="mm")
+    symmetries = info.symmetries_discrete, info.symmetries_continuous
     try:
         part = make_part(
             info.name,
             mesh,
-            symmetries_discrete=info.symmetries_discrete,
-            symmetries_continuous=info.symmetries_continuous,
+            symmetries_discrete=symmetries[0],
+            symmetries_continuous=symmetries[1],
             unit="mm",
         )
     except UserError as error:  # of its size or its triangles; BOP's files have one unit
@@ -172,36 +174,34 @@ def parse_models(path: Path, records: object, problems: Problems = STRICT) -> di
 def _info(place: Place, model: Path, record: object) -> ModelInfo:
     if not isinstance(record, dict):
         place.report(f"{record!r:.60}", "an object with diameter and symmetries")
-    fields = mapping(record)
-    diameter = math.nan
+    fields, diameter = mapping(record), math.nan
     if "diameter" in fields:
         diameter = place["diameter"].scalar(fields["diameter"]) / MM
         if diameter <= 0:
             place["diameter"].report(f"{fields['diameter']!r:.40}", "millimetres above 0")
             diameter = math.nan
     name = place["name"].attempt(lambda: check_name(fields.get("name", model.stem)))
-    return ModelInfo(
-        name or model.stem,
-        model,
-        diameter,
-        _discrete(place["symmetries_discrete"], fields.get("symmetries_discrete")),
-        _continuous(place["symmetries_continuous"], fields.get("symmetries_continuous")),
+    return ModelInfo(name or model.stem, model, diameter, *_symmetries(place, fields))
+
+
+def _symmetries(place: Place, fields: Mapping[str, Any]) -> tuple[Discrete | None, Continuous]:
+    discrete, continuous = SYMMETRY_FIELDS
+    return (
+        _discrete(place[discrete], fields.get(discrete)),
+        _continuous(place[continuous], fields.get(continuous)),
     )
 
 
 def parse_symmetries(name: str, fields: object) -> tuple[Discrete | None, Continuous]:
     """Return the symmetries of an entry like ``models_info.json``'s, given for a part by name.
 
-    A UserError: there is no such entry, or one is no rigid transform or no axis.
+    Raises:
+        UserError: There is no such entry, or one is no rigid transform or no axis.
     """
     place = Place(STRICT, f"data.symmetries.{name}")
     if not isinstance(fields, Mapping) or not {*fields} <= {*SYMMETRY_FIELDS}:
         place.report(f"{fields!r:.80}", f"{' and '.join(SYMMETRY_FIELDS)} as BOP has them")
-    entry = mapping(fields)
-    return (
-        _discrete(place[SYMMETRY_FIELDS[0]], entry.get(SYMMETRY_FIELDS[0])),
-        _continuous(place[SYMMETRY_FIELDS[1]], entry.get(SYMMETRY_FIELDS[1])),
-    )
+    return _symmetries(place, mapping(fields))
 
 
 def _discrete(place: Place, value: object) -> Discrete | None:
@@ -244,35 +244,37 @@ def _rows(place: Place, value: object) -> list[Any]:
 
 
 def write_models(root: Path, parts: Sequence[Part]) -> None:
-    """Write the parts' models, and ``models_info.json`` last, as a sign.
+    """Write the parts' models, numbered by :func:`~dopepp.data.formats.bop.model_numbers`.
 
-    They are numbered as :func:`~dopepp.data.formats.bop.model_numbers` says. A UserError: a
-    part has no mesh, or the folder holds models of other parts.
+    ``models_info.json`` is written last, as a sign.
+
+    Raises:
+        UserError: A part has no mesh, or the folder holds models of other parts.
     """
-    meshes, numbers = [], model_numbers([part.name for part in parts])
     for part in parts:
         if part.mesh is None:
-            raise UserError(
-                f"part {part.name} without a mesh", "parts that were read from a mesh file",
-                "give the part's mesh file",
-            )  # fmt: skip
-        meshes.append(part.mesh)
-    folder = root / MODEL_FOLDERS[0]
+            got, allowed = (
+                f"part {part.name} without a mesh",
+                "parts that were read from a mesh file",
+            )
+            raise UserError(got, allowed, "give the part's mesh file")
+    folder, names = root / MODEL_FOLDERS[0], [part.name for part in parts]
+    numbers = model_numbers(names)
     entries = {str(numbers[part.name]): model_info(part) for part in parts}
     content = (json.dumps(entries, indent=2, ensure_ascii=False) + "\n").encode()
     path = folder / INFO_FILE
     if path.exists():
         if path.read_bytes() != content:
-            raise UserError(
-                f"{path}, written for other parts", f"a folder for {[p.name for p in parts]}",
-                "choose an empty folder",
-            )  # fmt: skip
+            got, allowed = f"{path}, written for other parts", f"a folder for {names}"
+            raise UserError(got, allowed, "choose an empty folder")
         return
-    for number, mesh in zip(numbers.values(), meshes, strict=True):
-        model, texture = folder / f"obj_{number:06d}.ply", folder / f"obj_{number:06d}.png"
-        write_whole(model, ply_bytes(mesh, None if mesh.texture is None else texture.name))
-        if mesh.texture is not None:
-            write_whole(texture, encode_png(mesh.texture))
+    for part in parts:
+        model = folder / f"obj_{numbers[part.name]:06d}.ply"
+        texture = model.with_suffix(".png")
+        assert part.mesh is not None
+        write_whole(model, ply_bytes(part.mesh, texture.name))
+        if part.mesh.texture is not None:
+            write_whole(texture, encode_png(part.mesh.texture))
     write_whole(path, content)
 
 
@@ -295,24 +297,23 @@ def model_info(part: Part) -> dict[str, object]:
     return record
 
 
-def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
-    """Return a mesh as binary PLY.
-
-    Its texture, named ``texture_name``, is written beside it.
-    """
-    textured = texture_name is not None and mesh.uv is not None
-    names = ["x", "y", "z", "nx", "ny", "nz"]
-    import trimesh  # takes a while: only for those who write models
+def ply_bytes(mesh: Mesh, texture_name: str) -> bytes:
+    """Return a mesh as binary PLY; ``texture_name`` is the file of its texture, if it has one."""
+    import trimesh  # slow to import: only for those who write models
 
     # Weighted by the angles of the faces around a vertex, as BOP's are (Thürmer, Wüthrich 1998).
     normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
     columns = [mesh.vertices * MM, np.asarray(normals)]
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    textured = mesh.texture is not None and mesh.uv is not None
     if textured:
         names += ["texture_u", "texture_v"]
         columns.append(np.asarray(mesh.uv))
-    shade = 0 if mesh.colours is None else 3
+    shades = () if mesh.colours is None else ("red", "green", "blue")
     values = np.hstack(columns).astype("<f4")
-    vertices = np.empty(len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", shade)])
+    vertices = np.empty(
+        len(values), [("numbers", "<f4", values.shape[1]), ("colour", "u1", len(shades))]
+    )
     vertices["numbers"] = values
     if mesh.colours is not None:
         vertices["colour"] = mesh.colours
@@ -324,7 +325,7 @@ def ply_bytes(mesh: Mesh, texture_name: str | None = None) -> bytes:
         *([f"comment TextureFile {texture_name}"] if textured else []),
         f"element vertex {len(vertices)}",
         *(f"property float {name}" for name in names),
-        *(f"property uchar {name}" for name in ("red", "green", "blue")[:shade]),
+        *(f"property uchar {name}" for name in shades),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",

@@ -38,7 +38,7 @@ from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import Surface, make_surface
 
 IMAGES_A_SCENE: Final = 1000
-"""As in BOP's own rendered training sets."""
+"""The number in BOP's own rendered training sets."""
 
 SCENE_FILES: Final = {
     "scene_gt.json": "gt",
@@ -53,7 +53,7 @@ NO_BOX = [-1, -1, -1, -1]
 
 
 class BopFolder:
-    """A folder with models, numbered as :func:`model_numbers` says, beside a split of images."""
+    """A folder with models, numbered by :func:`model_numbers`, beside a split of images."""
 
     chunk_size = IMAGES_A_SCENE
 
@@ -62,13 +62,11 @@ class BopFolder:
 
     def prepare(self) -> None:
         """Write the models; a UserError where the split holds images made without them."""
-        info = self.root / MODEL_FOLDERS[0] / INFO_FILE
-        if (self.root / self.split).exists() and not info.exists():
-            raise UserError(
-                f"{self.root}, which has {self.split}/ and no {MODEL_FOLDERS[0]}/{INFO_FILE}",
-                "an empty folder, or one that this layout was begun in",
-                "choose another folder",
-            )
+        info = f"{MODEL_FOLDERS[0]}/{INFO_FILE}"
+        if (self.root / self.split).exists() and not (self.root / info).exists():
+            got = f"{self.root}, which has {self.split}/ and no {info}"
+            allowed = "an empty folder, or one that this layout was begun in"
+            raise UserError(got, allowed, "choose another folder")
         write_models(self.root, self._parts)
 
     @cached_property
@@ -77,9 +75,8 @@ class BopFolder:
 
     def labels(self, sample: Sample) -> Labels:
         """Annotate a sample, see :func:`make_labels`."""
-        return make_labels(
-            sample, model_numbers([part.name for part in self._parts]), self._surfaces
-        )
+        numbers = model_numbers([part.name for part in self._parts])
+        return make_labels(sample, numbers, self._surfaces)
 
 
 class BopWriter(BopFolder):
@@ -172,44 +169,30 @@ def make_labels(
     """Annotate a sample as BOP's toolkit does.
 
     A box is (x, y, width, height) with width and height the differences of the outermost pixels'
-    coordinates (a single pixel has width 0), −1 for an object of which no pixel is visible; the
+    coordinates (a single pixel has width 0), −1 for an object without a visible pixel; the
     silhouette counts beyond the image's border.
 
-    ``object_ids`` are BOP's numbers by label, ``parts`` parts and surfaces by label. The sample has
-    depth, and each instance a mask, as every rendered one.
+    Args:
+        sample: An image with depth and a mask of every instance, as every rendered one.
+        object_ids: BOP's numbers by label.
+        parts: Parts and surfaces by label.
     """
-    visible = [item.mask for item in sample.instances if item.mask is not None]
+    visible = [instance.mask for instance in sample.instances if instance.mask is not None]
     assert sample.depth is not None
-    covered = np.zeros(sample.depth.shape, bool)
-    for mask in visible:
-        covered |= mask
+    covered = np.any([np.zeros(sample.depth.shape, bool), *visible], axis=0)
     depth, scale = depth_units(sample.depth, covered)
-    wholes = [
-        silhouette(SceneObject(surface, item.T_cam_obj, part=part), sample.K, sample.size)
-        for item in sample.instances
-        for part, surface in [parts[item.label]]
-    ]
-    infos = [
-        _info(item, mask, whole, depth)
-        for item, mask, whole in zip(sample.instances, visible, wholes, strict=True)
-    ]
-    return Labels(
-        {"cam_K": np.asarray(sample.K, np.float64).ravel().tolist(), "depth_scale": scale},
-        [_truth(item, object_ids[item.label]) for item in sample.instances],
-        infos,
-        depth,
-        [whole.mask for whole in wholes],
-        visible,
-    )
-
-
-def _truth(instance: Instance, object_id: int) -> Record:
-    T: Transform = np.asarray(instance.T_cam_obj, np.float64)
-    return {
-        "cam_R_m2c": T[:3, :3].ravel().tolist(),
-        "cam_t_m2c": (T[:3, 3] * MM).tolist(),
-        "obj_id": object_id,
-    }
+    truths, infos, masks = [], [], []
+    for instance, mask in zip(sample.instances, visible, strict=True):
+        part, surface = parts[instance.label]
+        T: Transform = np.asarray(instance.T_cam_obj, np.float64)
+        shown = SceneObject(surface, instance.T_cam_obj, part=part)
+        whole = silhouette(shown, sample.K, sample.size)
+        masks.append(whole.mask)
+        infos.append(_info(instance, mask, whole, depth))
+        truth = {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (T[:3, 3] * MM).tolist()}
+        truths.append({**truth, "obj_id": object_ids[instance.label]})
+    camera = {"cam_K": np.asarray(sample.K, np.float64).ravel().tolist(), "depth_scale": scale}
+    return Labels(camera, truths, infos, depth, masks, visible)
 
 
 def _info(

@@ -1,4 +1,4 @@
-"""The files of an NDDS or FAT data set: which belong together, and what they hold.
+"""The files of an NDDS or FAT data set: which belong together, and their content.
 
 An item is ``STEM.json`` with its image ``STEM.png`` or ``STEM.jpg`` beside it; ``STEM`` is
 ``000000`` (NDDS) or ``000000.left`` (FAT), in the folder or anywhere below it. Each folder may hold
@@ -26,8 +26,15 @@ from dopepp.drawing.pictures import DepthMap, Shape, read_image
 from dopepp.geometry.camera import CameraMatrix, camera_matrix
 from dopepp.geometry.rotation import Vector
 
+OBJECT_SETTINGS: Final = "_object_settings.json"
+CAMERA_SETTINGS: Final = "_camera_settings.json"
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+
 MAX_ITEM_BYTES: Final = 16_000_000
-"""Of one image's annotation; a hundred objects take 0.5 MB."""
+"""Largest annotation of an image; a hundred objects take 0.5 MB."""
+
+DEPTH_UNIT: Final = 0.0001
+"""Metres per value of a 16-bit ``.depth.png``: FAT's unit, and the writer's; 0 is unknown."""
 
 _NORM_TOLERANCE: Final = 0.1
 """Of a quaternion's norm from 1."""
@@ -59,20 +66,20 @@ class NddsObject:
 
 
 def read_record(path: Path, problems: Problems = STRICT) -> Mapping[str, Any] | None:
-    """Read an annotation or a settings file, None where that is impossible."""
+    """Read an annotation or a settings file; None where that is impossible."""
     return Place(problems, path).load(max_bytes=MAX_ITEM_BYTES)
 
 
 def objects_of(record: Mapping[str, Any], path: Path, problems: Problems = STRICT) -> Objects:
     """Return the objects of an annotation; each needs a class."""
-    found: Objects = []
+    objects: Objects = []
     place = Place(problems, path, "objects")
     for number, item in enumerate(place.entries(record.get("objects"))):
         label = item.get("class")
         if not isinstance(label, str):
             place[number]["class"].report(f"{label!r:.60}", "a name")
-        found.append((place[number], item, label if isinstance(label, str) else ""))
-    return found
+        objects.append((place[number], item, label if isinstance(label, str) else ""))
+    return objects
 
 
 def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
@@ -81,18 +88,18 @@ def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
     def take(name: str, *shape: int) -> NDArray[np.float64]:
         return place[name].numbers(item.get(name), *shape)
 
+    def take_corners(name: str, axes: int) -> NDArray[np.float64] | None:
+        value = item.get(name)
+        # A writer may have appended the centroid as the ninth point.
+        count = 9 if isinstance(value, list) and len(value) == 9 else 8
+        return None if value in (None, []) else take(name, count, axes)[:8]
+
     quaternion = take("quaternion_xyzw", 4)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > _NORM_TOLERANCE:
         place["quaternion_xyzw"].report(f"no rotation: norm {norm:.4g}", "a quaternion of norm 1")
         quaternion = np.full(4, np.nan)
-    corners_px, cuboid = (
-        # A writer may have appended the centroid as the ninth point.
-        take(name, 9 if isinstance(item[name], list) and len(item[name]) == 9 else 8, axes)[:8]
-        if item.get(name) not in (None, [])
-        else None
-        for name, axes in (("projected_cuboid", 2), ("cuboid", 3))
-    )
+    corners_px, cuboid = take_corners("projected_cuboid", 2), take_corners("cuboid", 3)
     centroid = None if cuboid is None else cuboid.mean(axis=0)
     if item.get("cuboid_centroid") is not None:
         centroid = take("cuboid_centroid", 3)
@@ -100,37 +107,19 @@ def parse_object(item: Mapping[str, Any], place: Place) -> NddsObject:
     if visibility is not None and (visibility > 1 or (visibility < 0 and visibility != -1)):
         place["visibility"].report(f"{visibility:g}", "0 … 1, or −1 for unknown")
         visibility = None
-    return NddsObject(
-        place,
-        str(item.get("class", "")),
-        take("location", 3),
-        quaternion,
-        corners_px,
-        cuboid,
-        centroid,
-        visibility,
-    )
+    label, location = str(item.get("class", "")), take("location", 3)
+    return NddsObject(place, label, location, quaternion, corners_px, cuboid, centroid, visibility)
 
 
 def stated(record: Mapping[str, Any], name: str) -> object:
-    """Return what an annotation states about itself (our writer's ``conventions``), else None."""
+    """Return what an annotation states in the writer's ``conventions``, else None."""
     return mapping(record.get("conventions")).get(name)
 
 
-def has_own_ids(record: Mapping[str, Any]) -> bool:
-    """Tell whether an annotation states that labels in ``.seg.png`` are objects', not classes'."""
-    return stated(record, "segmentation") == "segmentation_id"
-
-
-OBJECT_SETTINGS: Final = "_object_settings.json"
-CAMERA_SETTINGS: Final = "_camera_settings.json"
-IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
-
-
 def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the annotations that have an image and those that have none, sorted.
+    """Return the annotations with an image and those without, sorted.
 
-    Settings (``_*.json``) and hidden files are none.
+    Settings (``_*.json``) and hidden files are no annotations.
     """
     with_image: list[Path] = []
     without: list[Path] = []
@@ -140,8 +129,8 @@ def find_items(folder: Path) -> tuple[list[Path], list[Path]]:
         for name in sorted(present):
             if name.endswith(".json") and not name.startswith(("_", ".")):
                 stem = name.removesuffix(".json")
-                found = any(stem + suffix in present for suffix in IMAGE_SUFFIXES)
-                (with_image if found else without).append(Path(parent, name))
+                has_image = any(stem + suffix in present for suffix in IMAGE_SUFFIXES)
+                (with_image if has_image else without).append(Path(parent, name))
     return with_image, without
 
 
@@ -157,14 +146,14 @@ def image_of(annotation: Path) -> Path | None:
 
 
 class Settings:
-    """The settings files of a data set, each read once and only when it is needed."""
+    """The settings files of a data set, each read once, on first use."""
 
     def __init__(self, root: Path, problems: Problems = STRICT) -> None:
         self._root, self._problems = root, problems
         self._files: dict[Path, Mapping[str, Any] | None] = {}
 
     def read(self, path: Path) -> Mapping[str, Any] | None:
-        """Return what a settings file holds, None where there is none or it is damaged."""
+        """Return the content of a settings file, None where there is none or it is damaged."""
         if path not in self._files:
             is_there = path.is_file()
             self._files[path] = read_record(path, self._problems) if is_there else None
@@ -172,14 +161,11 @@ class Settings:
 
     def _of(self, annotation: Path, name: str) -> tuple[Path, Mapping[str, Any]]:
         """Return the settings of the annotation's folder or else of the data set's, or nothing."""
-        for path in self._places(annotation, name):
+        for path in (annotation.with_name(name), self._root / name):
             content = self.read(path)
             if content is not None:
                 return path, content
         return annotation.with_name(name), {}
-
-    def _places(self, annotation: Path, name: str) -> tuple[Path, Path]:
-        return annotation.with_name(name), self._root / name
 
     def camera(
         self, record: Mapping[str, Any], annotation: Path, problems: Problems = STRICT
@@ -187,25 +173,26 @@ class Settings:
         """Return K: the annotation's own ``camera_data.intrinsics`` or the camera settings'.
 
         Of several cameras in the settings, the one counts whose name ends the stem (FAT's ``left``
-        and ``right``). It is a problem (and NaN) if neither file has them, or if it is unclear
-        which camera's they are.
+        and ``right``). Without one camera, a problem is reported, and K is NaN.
         """
         place = Place(problems, annotation, "camera_data.intrinsics")
-        own = mapping(record.get("camera_data")).get("intrinsics")
-        if isinstance(own, dict):
-            return _intrinsics(own, place)
+        stated_here = mapping(record.get("camera_data")).get("intrinsics")
+        if isinstance(stated_here, dict):
+            return _intrinsics(stated_here, place)
         path, settings = self._of(annotation, CAMERA_SETTINGS)
         side = annotation.name.removesuffix(".json").rpartition(".")[2]
-        cameras = list(_entries(settings, "camera_settings"))
+        cameras = _entries(settings, "camera_settings")
         cameras = [camera for camera in cameras if camera.get("name") == side] or cameras
         if len(cameras) == 1 and isinstance(cameras[0].get("intrinsic_settings"), dict):
             there = Place(problems, path, "camera_settings[].intrinsic_settings")
             return _intrinsics(cameras[0]["intrinsic_settings"], there)
         # A settings file that cannot be read is one problem, not one for every image.
-        places = self._places(annotation, CAMERA_SETTINGS)
-        if not any(place.is_file() and self.read(place) is None for place in places):
-            allowed = f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in "
-            place.report(f"{len(cameras)} cameras' to take", allowed + path.name)
+        files = annotation.with_name(CAMERA_SETTINGS), self._root / CAMERA_SETTINGS
+        if not any(file.is_file() and self.read(file) is None for file in files):
+            allowed = (
+                f"fx, fy, cx, cy there or, of one camera or one named {side!r}, in {path.name}"
+            )
+            place.report(f"{len(cameras)} cameras' to take", allowed)
         return np.full((3, 3), np.nan)
 
     def fixed_transform(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
@@ -213,15 +200,15 @@ class Settings:
 
         It maps the mesh into the object frame. The file holds the transpose, scaled by the mesh's
         unit over the file's (100 for metres and centimetres); the translation is in the file's
-        unit. None where there is none, or nothing that is a rotation, a scale and a translation.
+        unit. None where there is no rotation, scale and translation.
         """
-        for stored in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
-            matrix = stored.T
-            linear = matrix[:3, :3]
+        for matrix in self._arrays(annotation, label, "fixed_model_transform", 4, 4):
+            rigid = matrix.T
+            linear = rigid[:3, :3]
             scale = float(np.cbrt(np.linalg.det(linear)))
             if scale > 0 and np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-2:
-                matrix[:3, :3] = linear / scale
-                return matrix
+                rigid[:3, :3] = linear / scale
+                return rigid
         return None
 
     def dimensions(self, annotation: Path, label: str) -> NDArray[np.float64] | None:
@@ -241,6 +228,11 @@ class Settings:
         listed = self._of(annotation, OBJECT_SETTINGS)[1].get("exported_object_classes")
         return {str(name) for name in listed} if isinstance(listed, list) else None
 
+    def _objects(self, annotation: Path, label: str) -> list[dict[str, Any]]:
+        """Return the entries of a class."""
+        entries = _entries(self._of(annotation, OBJECT_SETTINGS)[1], "exported_objects")
+        return [entry for entry in entries if entry.get("class") == label]
+
     def _arrays(
         self, annotation: Path, label: str, name: str, *shape: int
     ) -> Iterator[NDArray[np.float64]]:
@@ -249,26 +241,15 @@ class Settings:
             with suppress(KeyError, TypeError, ValueError, OverflowError):
                 yield np.array(entry[name], np.float64).reshape(shape)
 
-    def _objects(self, annotation: Path, label: str) -> Iterator[Mapping[str, Any]]:
-        settings = self._of(annotation, OBJECT_SETTINGS)[1]
-        for entry in _entries(settings, "exported_objects"):
-            if entry.get("class") == label:
-                yield entry
 
-
-def _entries(settings: Mapping[str, Any], name: str) -> Iterator[dict[str, Any]]:
-    listed = settings.get(name)
-    rows = listed if isinstance(listed, list) else []
-    return (entry for entry in rows if isinstance(entry, dict))
+def _entries(settings: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    rows = settings.get(name)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
 def _intrinsics(values: Mapping[str, Any], place: Place) -> CameraMatrix:
     """Return K of ``fx``, ``fy``, ``cx`` and ``cy``, pixels; NaN where one is missing."""
     return camera_matrix(*place.numbers([values.get(n) for n in ("fx", "fy", "cx", "cy")], 4))
-
-
-DEPTH_UNIT: Final = 0.0001
-"""Metres per value of a 16-bit ``.depth.png``: FAT's unit, and what we write; 0 is unknown."""
 
 
 def read_depth(record: Mapping[str, Any], annotation: Path, shape: Shape) -> DepthMap | None:
@@ -292,27 +273,31 @@ def read_labels(annotation: Path, shape: Shape) -> NDArray[Any] | None:
     """Read ``STEM.seg.png``; None where there is none, or colours, which no file explains."""
     path = companion(annotation, ".seg.png")
     image = read_image(path) if path.is_file() else None
-    return (
-        None if image is None or image.ndim > 2 else one_channel(Place(STRICT, path), image, shape)
-    )
+    is_map = image is not None and image.ndim == 2
+    return one_channel(Place(STRICT, path), image, shape) if is_map else None
 
 
 def label_values(
-    objects: Objects, own_ids: bool, annotation: Path, settings: Settings
+    objects: Objects, record: Mapping[str, Any], annotation: Path, settings: Settings
 ) -> dict[str, int | None]:
-    """Return the value of each object's pixels in ``STEM.seg.png``, by where the object stands.
+    """Return the value of each object's pixels in ``STEM.seg.png``, by the object's place.
 
-    None where it is unknown or not only this object's. Unless the labels are known to be
-    ``segmentation_id`` (``own_ids``), an object without one may have its class's.
+    None where it is unknown or not only this object's. An object without ``segmentation_id`` may
+    have its class's value, unless the annotation states that the values are ids.
     """
     ids = [item.get("segmentation_id") for _, item, _ in objects]
-    own = [value if isinstance(value, int) and value > 0 else None for value in ids]
+    of_object = [value if isinstance(value, int) and value > 0 else None for value in ids]
     of_class = [settings.class_id(annotation, label) for _, _, label in objects]
-    counts, class_counts = Counter(own), Counter(of_class)
+    counts, class_counts = Counter(of_object), Counter(of_class)
     values: dict[str, int | None] = {}
-    for (place, _, _), value, class_id in zip(objects, own, of_class, strict=True):
+    for (place, _, _), value, class_id in zip(objects, of_object, of_class, strict=True):
         is_alone = counts[value] == 1
-        if value is None and not own_ids:
+        if value is None and not has_object_ids(record):
             value, is_alone = class_id, class_counts[class_id] == 1
         values[place.where] = value if is_alone else None
     return values
+
+
+def has_object_ids(record: Mapping[str, Any]) -> bool:
+    """Tell whether an annotation states that labels in ``.seg.png`` are objects', not classes'."""
+    return stated(record, "segmentation") == "segmentation_id"

@@ -1,18 +1,15 @@
-"""Which pose convention an NDDS data set follows, found by trying all of them on its own images.
+"""The pose convention of an NDDS data set, found by trying all conventions on its own images.
 
-Files of this format look alike and mean different things. ``quaternion_xyzw`` holds x, y, z, w or
-w, x, y, z; lengths are centimetres (NDDS, FAT), metres (nvisii) or millimetres; camera axes are
-OpenCV's or, in old nvisii files, OpenGL's; and the pose is the mesh's own or that of a frame into
-which ``fixed_model_transform`` turns the mesh (FAT). No field says which.
+``quaternion_xyzw`` holds x, y, z, w or w, x, y, z; lengths are centimetres (NDDS, FAT), metres
+(nvisii) or millimetres; camera axes are OpenCV's or, in old nvisii files, OpenGL's; and the pose is
+the mesh's own or that of a frame into which ``fixed_model_transform`` turns the mesh (FAT). No
+field states which. But every object states ``projected_cuboid``, its box in the image.
+:func:`find_convention` applies each :class:`PoseConvention` to objects with known meshes and keeps
+the one under which the mesh's box lands there; :func:`check_observation` later compares every
+object.
 
-But every object states ``projected_cuboid``, where its box appears on the image in pixels. So each
-combination (a :class:`PoseConvention`) is applied to some objects whose meshes are known: it gives
-a pose, the pose puts the mesh's box somewhere on the image, and under the right combination that is
-where the file says (:func:`find_convention`). Later every object that is read is held against its
-own ``projected_cuboid`` (:func:`check_observation`).
-
-To allow for one more way of writing poses, add its value to the ``Literal`` of its kind below, and
-what it means to :meth:`Observation.T_cam_obj`.
+To add a convention, add its value to a ``Literal`` below, and its meaning to
+:meth:`Observation.T_cam_obj`.
 """
 
 from __future__ import annotations
@@ -37,13 +34,12 @@ Quaternion = Literal["xyzw", "wxyz"]
 Unit = Literal["cm", "m", "mm"]
 CameraAxes = Literal["opencv", "opengl"]
 Frame = Literal["mesh", "mesh, front x", "centred", "fixed", "fixed, centred"]
-"""What the stated pose moves.
+"""The frame that the stated pose moves.
 
 - ``mesh``: the mesh as it is.
-- ``mesh, front x``: the mesh as it is, with the corners listed as seen along its x axis, z up
-  (nvisii).
-- ``centred``: the mesh after its box's centre was moved into the origin; the pose then puts that
-  centre at ``cuboid_centroid``, or at ``location`` where there is none.
+- ``mesh, front x``: the mesh as it is; corners listed as seen along its x axis, z up (nvisii).
+- ``centred``: the mesh with its box's centre in the origin, which the pose moves to
+  ``cuboid_centroid``, or to ``location`` where there is none.
 - ``fixed``: the mesh after ``fixed_model_transform``.
 - ``fixed, centred``: the mesh after the rotation of ``fixed_model_transform``, then centred.
 """
@@ -147,12 +143,12 @@ def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "
 
 
 MAX_ERROR_PX: Final = 5.0
-"""The right convention puts three quarters of the instances this close to ``projected_cuboid``;
-annotations of photos are no better."""
+"""Largest error of three quarters of the instances under the right convention; annotations of
+photos are no better."""
 
 _MAX_SHARE: Final = 0.05
-"""An instance may be off by this share of its projected cuboid's longer side, where that is more
-than ``MAX_ERROR_PX``: annotations of photos are worse on what is near."""
+"""Allowed error of an instance as a share of its projected cuboid's longer side, where that is more
+than ``MAX_ERROR_PX``: annotations of photos are worse for near objects."""
 
 _MOST: Final = 0.75
 """Share of the instances that must fit: a few damaged ones decide nothing."""
@@ -164,8 +160,7 @@ _ROUNDING_PX: Final = 0.05
 """Between two fits that count as equally good: files round to a few digits."""
 
 _SAME_POSE: Final = 0.05
-"""Two conventions whose corners lie closer than this many diameters give the same poses: it matters
-not which of them is taken, so neither has to fit three times better than the other."""
+"""Distance of corners, in diameters, below which two conventions give the same poses."""
 
 
 @dataclass(frozen=True)
@@ -173,8 +168,7 @@ class Finding:
     """The convention of a data set, and how sure it is.
 
     Attributes:
-        error_px: Three quarters of the instances are no farther than this from
-            ``projected_cuboid``.
+        error_px: Largest error of three quarters of the instances.
         rival_px: The same of the best convention that gives other poses.
         undecided: Conventions that give the same poses in these instances, e.g. of a turn whose
             quaternion reads the same in both orders.
@@ -192,57 +186,61 @@ class Finding:
             f"{self.rival_px:.3g} px, {self.num_instances} instances)"
         )
         if self.undecided:
-            others = "; ".join(map(str, self.undecided))
-            text += f"; the same poses so far with: {others}"
+            text += f"; the same poses so far with: {'; '.join(map(str, self.undecided))}"
         return text
 
 
 def find_convention(observations: Sequence[Observation], where: str) -> Finding:
-    """Find the one convention under which the part's cuboid lands on ``projected_cuboid``.
+    """Find the one convention under which the parts' cuboids land on ``projected_cuboid``.
 
-    ``observations`` have ``projected_cuboid``; one is enough in most cases. A UserError: none fits
-    three quarters of the instances within 5 px, or two that give different poses fit alike.
+    One observation is enough in most cases.
+
+    Raises:
+        UserError: No convention fits three quarters of the instances within 5 px, or two that give
+            different poses fit alike.
     """
     errors = {
-        convention: _most([one.error_px(convention) for one in observations])
+        convention: _most([observation.error_px(convention) for observation in observations])
         for convention in POSE_CONVENTIONS
     }
-    ranked = sorted(errors, key=lambda one: errors[one])
+    ranked = sorted(errors, key=lambda convention: errors[convention])
     least = errors[ranked[0]]
     if not least <= MAX_ERROR_PX:
         raise _undecidable(where, "no known convention fits", ranked[:6], errors)
-    best = next(one for one in POSE_CONVENTIONS if errors[one] <= least + _ROUNDING_PX)
-    rivals = [one for one in ranked if one != best]
-    alike = tuple(one for one in rivals if _same_poses(observations, best, one))
-    others = [one for one in rivals if one not in alike]
-    rival = min((errors[one] for one in others), default=np.inf)
-    if rival < _RATIO * errors[best] + _ROUNDING_PX:
+    best = next(c for c in POSE_CONVENTIONS if errors[c] <= least + _ROUNDING_PX)
+    rivals = [convention for convention in ranked if convention != best]
+    alike = tuple(rival for rival in rivals if _same_poses(observations, best, rival))
+    others = [rival for rival in rivals if rival not in alike]
+    rival_px = min((errors[rival] for rival in others), default=np.inf)
+    if rival_px < _RATIO * errors[best] + _ROUNDING_PX:
         raise _undecidable(where, "two conventions fit alike", [best, *others[:5]], errors)
-    undecided = tuple(one for one in alike if replace(one, frame=best.frame) != best)
-    return Finding(best, errors[best], rival, undecided, len(observations))
+    undecided = tuple(rival for rival in alike if replace(rival, frame=best.frame) != best)
+    return Finding(best, errors[best], rival_px, undecided, len(observations))
 
 
-def check_observation(one: Observation, convention: PoseConvention) -> Transform:
-    """Return an instance's pose after holding it against its own ``projected_cuboid``.
+def check_observation(observation: Observation, convention: PoseConvention) -> Transform:
+    """Return an instance's pose after comparing it with its own ``projected_cuboid``.
 
-    A UserError: it is behind the camera, needs a ``fixed_model_transform`` that its class does not
-    have, or is off by more than 5 px and 5 % of the cuboid's longer side.
+    Raises:
+        UserError: The instance is behind the camera, lacks a ``fixed_model_transform``, or is off
+            by more than 5 px and 5 % of the cuboid's longer side.
     """
-    T_cam_obj, place = one.T_cam_obj(convention), one.item.place
+    item = observation.item
+    T_cam_obj, place = observation.T_cam_obj(convention), item.place
     if T_cam_obj is None:
-        got = f"no fixed_model_transform of {one.item.label} in the object settings"
+        got = f"no fixed_model_transform of {item.label} in the object settings"
         place["class"].report(got, f"one as for the others ({convention})")
     assert T_cam_obj is not None
     if T_cam_obj[2, 3] <= 0:
         got = f"an object behind the camera (z = {T_cam_obj[2, 3]:.3g} m)"
         place["location"].report(got, f"one before it ({convention})")
-    predicted = one.predicted_px(convention)
-    # Projections of what nobody sees or what reaches behind the camera mean nothing.
-    if predicted is None or not np.isfinite(predicted).all() or one.item.visibility == 0:
+    predicted = observation.predicted_px(convention)
+    # Projections of a hidden object, or of one that reaches behind the camera, mean nothing.
+    if predicted is None or not np.isfinite(predicted).all() or item.visibility == 0:
         return T_cam_obj
-    error, extent = one.error_px(convention), float(np.ptp(predicted, axis=0).max())
-    if one.item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
-        got = f"{error:.3g} px from where the pose puts the cuboid of {one.part.name}"
+    error, extent = observation.error_px(convention), float(np.ptp(predicted, axis=0).max())
+    if item.corners_px is not None and error > max(MAX_ERROR_PX, _MAX_SHARE * extent):
+        got = f"{error:.3g} px from where the pose puts the cuboid of {observation.part.name}"
         place["projected_cuboid"].report(got, f"the data set's {convention}")
     return T_cam_obj
 
@@ -250,24 +248,24 @@ def check_observation(one: Observation, convention: PoseConvention) -> Transform
 def _same_poses(observations: Sequence[Observation], a: PoseConvention, b: PoseConvention) -> bool:
     """Tell whether two conventions put most instances' cuboids at the same place in space."""
     distances = []
-    for one in observations:
-        T_a, T_b = one.T_cam_obj(a), one.T_cam_obj(b)
+    for observation in observations:
+        T_a, T_b, part = observation.T_cam_obj(a), observation.T_cam_obj(b), observation.part
         if T_a is None or T_b is None:
             return False
-        apart = transform(T_a, one.part.cuboid) - transform(T_b, one.part.cuboid)
-        distances.append(float(np.abs(apart).max()) / one.part.diameter)
+        apart = np.abs(transform(T_a, part.cuboid) - transform(T_b, part.cuboid)).max()
+        distances.append(float(apart) / part.diameter)
     return _most(distances) <= _SAME_POSE
 
 
 def _most(values: Sequence[float]) -> float:
-    """Return what three quarters of the values do not exceed: a few damaged items do not count."""
+    """Return the bound of three quarters of the values: a few damaged items do not count."""
     return float(np.quantile(values, _MOST, method="higher"))
 
 
 def _undecidable(
     where: str, why: str, shown: Sequence[PoseConvention], errors: dict[PoseConvention, float]
 ) -> UserError:
-    figures = "; ".join(f"{errors[one]:.3g} px: {one}" for one in shown)
+    figures = "; ".join(f"{errors[convention]:.3g} px: {convention}" for convention in shown)
     return UserError(
         f"{where}: {why}; reprojection error: {figures}",
         f"one convention with at most {MAX_ERROR_PX:g} px and a third of any other's error",

@@ -1,8 +1,8 @@
-"""Check NDDS and FAT folders without knowing the meshes: against their own cuboids and images.
+"""Invariants of NDDS and FAT: annotations agree with their own cuboids, images and settings.
 
-What differs between data sets in the wild is no defect as long as a whole one does it one way: x,
-y, z, w or w, x, y, z; boxes as (row, column) or (column, row); OpenCV's or OpenGL's camera axes. It
-is noted, and objects that differ from the majority are defects.
+The meshes need not be known. Data sets differ in their conventions: x, y, z, w or w, x, y, z; boxes
+as (row, column) or (column, row); OpenCV's or OpenGL's camera axes. A convention of the whole data
+set is noted, and objects that differ from the majority are defects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from dopepp.data.formats import ndds as files
+from dopepp.data.formats import ndds
 from dopepp.data.formats.images import picture_shape, read_map
 from dopepp.data.formats.invariants import camera_problem
 from dopepp.data.formats.ndds import IMAGE_SUFFIXES, Objects, Settings
@@ -30,7 +30,7 @@ _DERIVED: Final = (".depth", ".seg", ".cs", ".is", ".16", ".8")
 
 def check_ndds(report: CheckReport) -> None:
     """Check every annotation, every image and the settings."""
-    items, lonely = files.find_items(report.root)
+    items, lonely = ndds.find_items(report.root)
     _check_unannotated(report, items + lonely)
     for path in lonely:
         report.report(path, "image", f"missing: neither {' nor '.join(IMAGE_SUFFIXES)} beside it")
@@ -50,20 +50,19 @@ def check_ndds(report: CheckReport) -> None:
 
 
 def _check_settings(report: CheckReport, settings: Settings, folder: Path) -> None:
-    """Check a folder's settings files; what reads from them reports once what is damaged."""
-    content = settings.read(folder / files.OBJECT_SETTINGS) or {}
+    content = settings.read(folder / ndds.OBJECT_SETTINGS) or {}
     listed = content.get("exported_object_classes")
-    place = Place(report, folder / files.OBJECT_SETTINGS, "exported_objects")
+    place = Place(report, folder / ndds.OBJECT_SETTINGS, "exported_objects")
     objects = place.entries(content.get("exported_objects", []))
     if isinstance(listed, list) and objects:
         names = {str(entry.get("class")) for entry in objects}
         for name in sorted(set(map(str, listed)) - names):
             place.report(f"no entry for class {name!r:.60}")
-    cameras = settings.read(folder / files.CAMERA_SETTINGS)
+    cameras = settings.read(folder / ndds.CAMERA_SETTINGS)
     if cameras is not None:
-        place = Place(report, folder / files.CAMERA_SETTINGS, "camera_settings")
-        listed = place.entries(cameras.get("camera_settings"))
-        for camera_name in _twice(str(camera.get("name")) for camera in listed):
+        place = Place(report, folder / ndds.CAMERA_SETTINGS, "camera_settings")
+        entries = place.entries(cameras.get("camera_settings"))
+        for camera_name in _twice(str(camera.get("name")) for camera in entries):
             place["name"].report(f"{camera_name!r:.60} twice")
 
 
@@ -73,7 +72,7 @@ def _twice(values: Iterable[Hashable]) -> list[Hashable]:
 
 
 def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
-    """Report pictures without an annotation, in folders that hold annotations."""
+    """Report pictures without an annotation, in folders with annotations."""
     stems: dict[Path, set[str]] = {}
     for path in annotations:
         stems.setdefault(path.parent, set()).add(path.name.removesuffix(".json"))
@@ -81,11 +80,8 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
         for path in sorted(folder.iterdir()):
             stem = path.stem
             is_picture = path.suffix in IMAGE_SUFFIXES and not path.name.startswith((".", "_"))
-            belongs = stem in annotated or any(
-                stem.startswith(f"{stem[:place]}.") and stem[:place] in annotated
-                for place, character in enumerate(stem)
-                if character == "."
-            )
+            starts = (stem[:end] for end, character in enumerate(stem) if character == ".")
+            belongs = stem in annotated or not annotated.isdisjoint(starts)
             if is_picture and not belongs and not stem.endswith(_DERIVED):
                 report.report(path, "annotation", f"missing: no {stem}.json beside it")
 
@@ -93,35 +89,34 @@ def _check_unannotated(report: CheckReport, annotations: list[Path]) -> None:
 def _check_item(
     report: CheckReport, path: Path, settings: Settings, majority: Majority, maps: list[str]
 ) -> None:
-    """Check an annotation and its images; ``maps`` are the suffixes of those that must be there."""
-    image = files.image_of(path)
+    """Check an annotation and its images; ``maps`` are the suffixes of the required ones."""
+    image = ndds.image_of(path)
     shape = None if image is None else picture_shape(Place(report, image))
     images = {
-        suffix: read_map(Place(report, files.companion(path, suffix)), shape, colour=True)
+        suffix: read_map(Place(report, ndds.companion(path, suffix)), shape, colour=True)
         for suffix in maps
     }
     labels = images.get(".seg.png")
-    record = files.read_record(path, report)
+    record = ndds.read_record(path, report)
     if record is None:
         return
     K = _check_camera(report, path, settings, record, shape)
-    objects = files.objects_of(record, path, report)
+    objects = ndds.objects_of(record, path, report)
     ids = _check_ids(Place(report, path, "objects"), objects)
-    own_ids = files.has_own_ids(record)
-    if labels is not None and own_ids:
+    if labels is not None and ndds.has_object_ids(record):
         strangers = sorted(set(np.unique(labels).tolist()) - ids - {0})
         if strangers:
             got = f"{strangers[:10]}: no object's segmentation_id"
-            report.report(files.companion(path, ".seg.png"), "values", got)
-    values, known = files.label_values(objects, own_ids, path, settings), settings.classes(path)
+            report.report(ndds.companion(path, ".seg.png"), "values", got)
+    values, known = ndds.label_values(objects, record, path, settings), settings.classes(path)
     for place, item, label in objects:
         if known is not None and label and label not in known:
             got = f"unknown object {label!r:.60}; known: {', '.join(sorted(known)[:10])}"
             place["class"].report(got)
         value = values[place.where]
         mask = None if labels is None or value is None else labels == value
-        one, sides = files.parse_object(item, place), settings.dimensions(path, label)
-        ObjectCheck(one, item, majority).check(K, shape, mask, sides)
+        parsed, sides = ndds.parse_object(item, place), settings.dimensions(path, label)
+        ObjectCheck(parsed, item, majority).check(K, shape, mask, sides)
 
 
 def _check_camera(
@@ -136,13 +131,14 @@ def _check_camera(
     if not np.isfinite(K).all():
         return None
     problem = None if shape is None else camera_problem(K, shape)
-    if problem is not None:
-        place["intrinsics"].report(problem)
-    return K if problem is None else None
+    if problem is None:
+        return K
+    place["intrinsics"].report(problem)
+    return None
 
 
 def _check_ids(place: Place, objects: Objects) -> set[int]:
-    """Report ids that two objects share; return what labels there may be."""
+    """Report ids that two objects share; return the segmentation ids."""
     for name in ("instance_id", "segmentation_id"):
         ids = [item.get(name) for _, item, _ in objects]
         known = [value for value in ids if type(value) is int and value > 0]  # −1, 0: none

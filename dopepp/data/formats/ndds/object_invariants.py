@@ -1,7 +1,7 @@
-"""Hold the fields of one NDDS object against each other and against the image.
+"""Invariants of one NDDS object: its fields agree with each other and with the image.
 
 Tolerances beside those of :mod:`~dopepp.data.formats.invariants`: a stated projection lies within
-2 px and 2 % of the cuboid's longer side of where K puts the 3-D point; edges of a cuboid are
+2 px and 2 % of the cuboid's longer side of the projected 3-D point; edges of a cuboid are
 perpendicular and equal within 2 %, and its class's within 5 %; an orientation agrees with the
 cuboid's within 2 degrees.
 """
@@ -29,18 +29,18 @@ from dopepp.geometry.rotation import (
     rotation_angle,
 )
 
+Corners = Float[np.ndarray, "8 3"]
+
 PROJECTION_PX: Final = 2.0
 PROJECTION_SHARE: Final = 0.02
-"""A stated projection may be off by this much: pixels, plus a share of the cuboid's longer side."""
+"""Allowed error of a stated projection: pixels, plus a share of the cuboid's longer side."""
 
 ORIENTATION_RAD: Final = np.deg2rad(2.0)
 """Between orientations that a file states twice."""
 
 MATRIX_TOLERANCE: Final = 5e-3
-"""Of ``pose_transform`` from a rotation: FAT rounds to four digits."""
-
 NORM_TOLERANCE: Final = 0.01
-"""Of a quaternion's norm from 1: FAT rounds to four digits."""
+"""Of ``pose_transform`` from a rotation, of a quaternion's norm from 1: FAT has four digits."""
 
 EDGE_SHARE: Final = 0.02
 """Of the longest edge: by how much edges may be unequal, slanted, or thin to have no direction."""
@@ -62,14 +62,14 @@ _DOCUMENTED: Final = {
     "bounding_box": "row, column",
     "camera axes": "OpenCV",
 }
-"""What NDDS itself does."""
+"""NDDS's own conventions."""
 
 _MAX_MINORITY: Final = 1000
-"""Objects of each way that are remembered, in case they turn out to be the minority."""
+"""Objects of each convention that are remembered, in case they are the minority."""
 
 
 class Majority:
-    """Which of several ways a data set does something: what most objects do is noted, not wrong."""
+    """Conventions of a data set: the one of most objects is noted, the others are defects."""
 
     def __init__(self, report: CheckReport) -> None:
         self._report = report
@@ -77,14 +77,14 @@ class Majority:
         self._places: dict[tuple[str, str], list[Place]] = {}
 
     def vote(self, subject: str, way: str, place: Place) -> None:
-        """Count which way one object does it."""
+        """Count the convention of one object."""
         self._votes.setdefault(subject, Counter())[way] += 1
         places = self._places.setdefault((subject, way), [])
         if len(places) < _MAX_MINORITY:
             places.append(place)
 
     def conclude(self) -> None:
-        """Note each way that is not NDDS's own, and report the objects that have another."""
+        """Note each convention that is not NDDS's own, and report the objects of the others."""
         for subject, votes in self._votes.items():
             (common, number), *rest = votes.most_common()
             if common != _DOCUMENTED[subject]:
@@ -95,14 +95,14 @@ class Majority:
 
 
 class ObjectCheck:
-    """One object; lengths are in the file's unit, whatever it is."""
+    """One object; lengths are in the file's unit, whatever it is. Damaged fields are None."""
 
-    def __init__(self, one: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
-        self._place, self._item, self._majority = one.place, item, majority
-        self._visibility = one.visibility
-        self._location, self._quaternion = _known(one.location), _known(one.quaternion)
-        self._projected, self._cuboid = _known(one.corners_px), _known(one.cuboid)
-        self._centroid = _known(one.centroid)
+    def __init__(self, parsed: NddsObject, item: Mapping[str, Any], majority: Majority) -> None:
+        self._place, self._item, self._majority = parsed.place, item, majority
+        self._visibility = parsed.visibility
+        self._location, self._quaternion = _known(parsed.location), _known(parsed.quaternion)
+        self._projected, self._cuboid = _known(parsed.corners_px), _known(parsed.cuboid)
+        self._centroid = _known(parsed.centroid)
         self._projected_centroid = self._numbers("projected_cuboid_centroid", 2)
 
     def check(
@@ -110,7 +110,7 @@ class ObjectCheck:
     ) -> None:
         """Check pose, cuboid, projections and boxes.
 
-        What is not known is None; ``sides`` are its class's ``cuboid_dimensions``.
+        An unknown argument is None; ``sides`` are the class's ``cuboid_dimensions``.
         """
         rotations = self._rotations()
         if self._cuboid is not None and not _is_box(self._cuboid):
@@ -120,29 +120,35 @@ class ObjectCheck:
             problem = None if sides is None else _size_problem(self._cuboid, sides)
             if problem is not None:
                 self._add(f"cuboid.{problem[0]}", problem[1])
-            self._check_orientation(self._cuboid, rotations)
+            axes = _box_axes(self._cuboid)
+            if axes is not None and rotations:
+                fits = {
+                    order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
+                    for order, rotation in rotations.items()
+                }
+                problem_text = "not the cuboid's orientation in either order"
+                self._judge("quaternion_xyzw", fits, problem_text)
         self._check_transforms(rotations)
-        # The file itself may say that nobody sees the object, or not know.
+        # The file itself may state that nobody sees the object, or not know.
         is_hidden = self._visibility is not None and self._visibility <= 0
         seen = None if mask is None else Box.of_mask(mask)
         self._check_bounding_box(None if is_hidden else seen)
         if self._location is None or is_hidden:
             return
         axes = self._camera_axes(self._location, K)
-        if self._is_place_possible(self._location, axes) and K is not None:
-            fraction = None if mask is None else self._visibility
-            self._check_image(axes, K, shape, seen, fraction)
+        if self._is_location_possible(self._location, axes) and K is not None:
+            self._check_image(axes, K, shape, seen, None if mask is None else self._visibility)
 
     def _add(self, field: str, got: str) -> None:
         self._place[field].report(got)
 
     def _numbers(self, field: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-        """Read a field that no source needs; None where it is missing or damaged."""
+        """Read a field that the reader does not need; None where it is missing or damaged."""
         value = self._item.get(field)
         return None if value is None else _known(self._place[field].numbers(value, *shape))
 
     def _rotations(self) -> dict[str, RotationMatrix]:
-        """Return the rotation by either order of ``quaternion_xyzw``, none where it is damaged."""
+        """Return the rotation by either order of ``quaternion_xyzw``; empty if it is damaged."""
         stored = self._quaternion
         if stored is None:
             return {}
@@ -151,26 +157,11 @@ class ObjectCheck:
             got = f"no rotation: norm {norm:.4g}; allowed: 1 ± {NORM_TOLERANCE}"
             self._add("quaternion_xyzw", got)
             return {}
-        return {
-            "x, y, z, w": quaternion_to_matrix(np.roll(stored, 1)),
-            "w, x, y, z": quaternion_to_matrix(stored),
-        }
-
-    def _check_orientation(
-        self, cuboid: Float[np.ndarray, "8 3"], rotations: Mapping[str, RotationMatrix]
-    ) -> None:
-        """Hold the quaternion against the cuboid: equal up to quarter turns, in either order."""
-        axes = _box_axes(cuboid)
-        if axes is None or not rotations:
-            return
-        fits = {
-            order: _quarter_turn_distance(rotation.T @ axes) <= ORIENTATION_RAD
-            for order, rotation in rotations.items()
-        }
-        self._judge("quaternion_xyzw", fits, "not the cuboid's orientation in either order")
+        orders = {"x, y, z, w": np.roll(stored, 1), "w, x, y, z": stored}
+        return {order: quaternion_to_matrix(values) for order, values in orders.items()}
 
     def _judge(self, field: str, fits: dict[str, bool], problem: str) -> None:
-        """Count which of two ways a field has, where it can be told; neither is a defect."""
+        """Report a field that fits no convention, and vote where it fits only one."""
         if not any(fits.values()):
             self._add(field, problem)
         elif not all(fits.values()):
@@ -183,8 +174,7 @@ class ObjectCheck:
             matrix = self._numbers(name, 4, 4)
             if matrix is None:
                 continue
-            linear = matrix[:3, :3]
-            upright = linear * np.sign(np.linalg.det(linear))
+            upright = matrix[:3, :3] * np.sign(np.linalg.det(matrix[:3, :3]))
             if not is_rotation(upright, MATRIX_TOLERANCE):
                 self._add(name, f"no rotation (mirrored or not) within {MATRIX_TOLERANCE}")
                 continue
@@ -196,14 +186,14 @@ class ObjectCheck:
             if distances and min(distances) > ORIENTATION_RAD:
                 self._add(name, "another rotation than quaternion_xyzw, in either order")
             if self._location is not None:
-                places = matrix[3, :3], matrix[:3, 3]
+                candidates = matrix[3, :3], matrix[:3, 3]
                 scale = max(1.0, float(np.abs(self._location).max()))
-                if min(np.abs(p - self._location).max() for p in places) > EDGE_SHARE * scale:
-                    got = f"translation {_text(places[0])}; location {_text(self._location)}"
+                if min(np.abs(c - self._location).max() for c in candidates) > EDGE_SHARE * scale:
+                    got = f"translation {_text(candidates[0])}; location {_text(self._location)}"
                     self._add(name, got)
 
     def _check_bounding_box(self, seen: Box | None) -> None:
-        """Hold the stated box, which may be the whole object's, against what is seen."""
+        """Compare the stated box, which may be the whole object's, with the visible pixels'."""
         stated = mapping(self._item.get("bounding_box"))
         if not stated:
             return
@@ -225,8 +215,8 @@ class ObjectCheck:
 
     def _camera_axes(self, location: Vector, K: CameraMatrix | None) -> RotationMatrix:
         """Return the file's camera axes as a matrix into OpenCV's."""
-        # A point behind an OpenCV camera is before an OpenGL one if it then projects to where the
-        # file says.
+        # A point behind an OpenCV camera is before an OpenGL one if it projects to the stated
+        # corners there.
         projected, is_opengl = self._projected, False
         is_before = self._cuboid is not None and self._cuboid[:, 2].mean() > 0
         if location[2] < 0 and not is_before and projected is not None and K is not None:
@@ -237,7 +227,7 @@ class ObjectCheck:
         self._majority.vote("camera axes", way, self._place["location"])
         return OPENGL if is_opengl else np.eye(3)
 
-    def _is_place_possible(self, location: Vector, axes: RotationMatrix) -> bool:
+    def _is_location_possible(self, location: Vector, axes: RotationMatrix) -> bool:
         """Check location, centroid and unit; tell whether projections can mean anything."""
         cuboid, centroid = self._cuboid, self._centroid
         diagonal = None if cuboid is None else float(np.linalg.norm(cuboid[0] - cuboid[6]))
@@ -264,24 +254,23 @@ class ObjectCheck:
         seen: Box | None,
         fraction: float | None,
     ) -> None:
-        """Hold projections and what is seen against the cuboid, or against each other."""
+        """Compare projections and visible pixels with the cuboid, or with each other."""
         if self._cuboid is not None:
             points = self._cuboid @ axes.T
             self._check_projections(points, K)
         elif self._projected is not None:
-            # Points at depth 1 that project onto what the file states.
-            rays = np.column_stack([self._projected, np.ones(len(self._projected))])
-            points = rays @ np.linalg.inv(K).T
+            # Points at depth 1 that project onto the stated ones.
+            points = np.column_stack([self._projected, np.ones(8)]) @ np.linalg.inv(K).T
         else:
             return
         problem = box_problem(points, K, seen, fraction, shape)
         if problem is not None:
             self._add("box", problem)
 
-    def _check_projections(self, cuboid: Float[np.ndarray, "8 3"], K: CameraMatrix) -> None:
+    def _check_projections(self, cuboid: Corners, K: CameraMatrix) -> None:
         expected = project(np.vstack([cuboid, cuboid.mean(axis=0)]), K)
         if not np.isfinite(expected).all():
-            return  # of what reaches behind the camera, projections mean nothing
+            return  # projections of an object that reaches behind the camera mean nothing
         allowed = PROJECTION_PX + PROJECTION_SHARE * float(np.ptp(expected, axis=0).max())
         pairs = (
             ("projected_cuboid", self._projected, expected[:8]),
@@ -295,11 +284,10 @@ class ObjectCheck:
 
 
 def _known(values: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "..."] | None:
-    """Return a field's numbers, None where it is missing or damaged."""
     return values if values is not None and np.isfinite(values).all() else None
 
 
-def _is_box(corners: Float[np.ndarray, "8 3"]) -> bool:
+def _is_box(corners: Corners) -> bool:
     """Tell whether eight points are the corners of a box in NDDS order."""
     edges = corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]
     means = edges.mean(axis=1)
@@ -310,8 +298,8 @@ def _is_box(corners: Float[np.ndarray, "8 3"]) -> bool:
     return axes is None or bool(np.abs(axes.T @ axes - np.eye(3)).max() <= EDGE_SHARE)
 
 
-def _box_axes(corners: Float[np.ndarray, "8 3"]) -> RotationMatrix | None:
-    """Return the directions of a box's edges as columns; None for one that is flat."""
+def _box_axes(corners: Corners) -> RotationMatrix | None:
+    """Return the directions of a box's edges as columns; None for a flat box."""
     means = (corners[_EDGES[..., 1]] - corners[_EDGES[..., 0]]).mean(axis=1)
     lengths = np.linalg.norm(means, axis=1)
     if lengths.min() <= EDGE_SHARE * lengths.max():
@@ -319,8 +307,8 @@ def _box_axes(corners: Float[np.ndarray, "8 3"]) -> RotationMatrix | None:
     return np.asarray((means / lengths[:, None]).T)
 
 
-def _size_problem(corners: Float[np.ndarray, "8 3"], sides: Vector) -> tuple[str, str] | None:
-    """Say as (kind, message) how a box differs from its class's sides, None where it does not."""
+def _size_problem(corners: Corners, sides: Vector) -> tuple[str, str] | None:
+    """Return how a box differs from its class's sides as (kind, message), or None."""
     edges = np.linalg.norm(corners[_EDGES[:, 0, 1]] - corners[_EDGES[:, 0, 0]], axis=1)
     if np.abs(edges - sides).max() <= SIZE_SHARE * sides.max():
         return None
@@ -333,7 +321,7 @@ def _size_problem(corners: Float[np.ndarray, "8 3"], sides: Vector) -> tuple[str
 def _quarter_turn_distance(rotation: RotationMatrix) -> float:
     """Return the angle to the nearest orthogonal matrix that maps axes onto axes, mirrored or not.
 
-    Frames of one object differ by such matrices between tools.
+    Tools' frames of one object differ by such matrices.
     """
     nearest = np.where(np.abs(rotation) == np.abs(rotation).max(axis=0), np.sign(rotation), 0.0)
     if abs(np.linalg.det(nearest)) != 1:
@@ -342,5 +330,4 @@ def _quarter_turn_distance(rotation: RotationMatrix) -> float:
 
 
 def _text(values: Float[np.ndarray, " n"]) -> str:
-    """Return numbers with four digits."""
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

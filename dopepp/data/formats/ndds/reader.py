@@ -11,16 +11,19 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats import ndds as files
-from dopepp.data.formats import share
-from dopepp.data.formats.ndds import IMAGE_SUFFIXES, conventions
-from dopepp.data.formats.ndds.conventions import Finding, Observation
+from dopepp.data.formats import ndds, share
+from dopepp.data.formats.ndds.conventions import (
+    Finding,
+    Observation,
+    check_observation,
+    find_convention,
+)
 from dopepp.data.sample import Instance, Sample, SourceInfo, hull_areas
 from dopepp.drawing.pictures import Shape, read_rgb
 from dopepp.geometry.camera import CameraMatrix, check_camera, project_keypoints
@@ -75,7 +78,7 @@ class NddsReader:
         if unknown:
             allowed = f"parts of {sorted(self._parts)}"
             raise UserError(f"classes of the parts {unknown}", allowed, "correct it")
-        self._settings = files.Settings(self.folder)
+        self._settings = ndds.Settings(self.folder)
         items = _find(self.folder)
         self.items = items[share(len(items), part_of, self.name)]
         # On all items, so that training and validation shares of one folder are read alike.
@@ -86,14 +89,14 @@ class NddsReader:
         seen: list[Observation] = []
         hidden: list[Observation] = []
         others: Counter[str] = Counter()
-        for path in _spread(items):
-            record = files.read_record(path) or {}
-            others.update(
-                name for _, _, name in files.objects_of(record, path) if not self._part(name)
-            )
-            for one in self._observations(record, path):
-                if one.item.corners_px is not None:
-                    (hidden if one.item.visibility == 0 else seen).append(one)
+        step = max(1, len(items) // _MAX_OBSERVATIONS)
+        # Evenly spread items first, so that a few of them stand for the whole.
+        for path in (path for start in range(step) for path in items[start::step]):
+            observations, labels = self._read(path)
+            others.update(labels)
+            for observation in observations:
+                if observation.item.corners_px is not None:
+                    (hidden if observation.item.visibility == 0 else seen).append(observation)
             if len(seen) >= _MAX_OBSERVATIONS:
                 break
         if not seen and not hidden:
@@ -104,78 +107,86 @@ class NddsReader:
                 "at least one, whose class is a part's name",
                 "name the parts as the classes, or give classes={class: part}",
             )
-        # What nobody sees may be behind the camera, where projections mean nothing.
-        return conventions.find_convention(seen or hidden, str(self.folder))
+        # Hidden objects may be behind the camera, where projections mean nothing.
+        return find_convention(seen or hidden, str(self.folder))
 
     def _part(self, label: str) -> Part | None:
-        """Return the part of a class name; FAT's suffix is dropped where it hides a part's name."""
+        """Return the part of a class name, without FAT's suffix where that hides a part's name."""
         label = self._classes.get(label, label)
         if label not in self._parts and label.lower().endswith(_FAT_SUFFIX):
             label = label[: -len(_FAT_SUFFIX)]
         return self._parts.get(label)
 
-    def _observations(
-        self, record: Mapping[str, Any], path: Path, K: CameraMatrix | None = None
-    ) -> Iterator[Observation]:
-        """Yield the objects that are instances of the parts."""
-        for place, item, label in files.objects_of(record, path):
+    def _read(self, path: Path) -> tuple[list[Observation], list[str]]:
+        """Return an annotation's instances of the parts, and its other objects' classes."""
+        record = ndds.read_record(path) or {}
+        observations: list[Observation] = []
+        others: list[str] = []
+        K: CameraMatrix | None = None
+        for place, item, label in ndds.objects_of(record, path):
             part = self._part(label)
-            if part is not None:
-                K = self._settings.camera(record, path) if K is None else K
-                fixed = self._settings.fixed_transform(path, label)
-                yield Observation(files.parse_object(item, place), part, K, fixed)
+            if part is None:
+                others.append(label)
+                continue
+            K = self._settings.camera(record, path) if K is None else K
+            fixed = self._settings.fixed_transform(path, label)
+            observations.append(Observation(ndds.parse_object(item, place), part, K, fixed))
+        return observations, others
 
     def __len__(self) -> int:
         return len(self.items)
 
     def sample(self, index: int, epoch: int = 0) -> Sample:
-        """Read an item; the epoch is ignored."""
+        """Read an item; the epoch does not matter."""
         path = self.items[index]
-        record = files.read_record(path) or {}
-        image = read_rgb(files.image_of(path) or files.companion(path, IMAGE_SUFFIXES[0]))
+        image = read_rgb(ndds.image_of(path) or ndds.companion(path, ndds.IMAGE_SUFFIXES[0]))
         shape: Shape = image.shape[:2]
-        objects, own_ids = files.objects_of(record, path), files.has_own_ids(record)
-        values = files.label_values(objects, own_ids, path, self._settings)
-        labels = cache(lambda: files.read_labels(path, shape))
+        record = ndds.read_record(path) or {}
         K = check_camera(self._settings.camera(record, path), shape[::-1], str(path))
-        counts_truncation = files.stated(record, "visibility_counts_truncation") is True
+        objects = ndds.objects_of(record, path)
+        values = ndds.label_values(objects, record, path, self._settings)
+        labels = cache(lambda: ndds.read_labels(path, shape))
+        counts_truncation = ndds.stated(record, "visibility_counts_truncation") is True
         instances = []
-        for one in self._observations(record, path, K):
-            if not self._is_out_of_view(one):
-                instance = self._instance(one, shape, counts_truncation)
-                value = values[one.item.place.where]
-                if value is not None and (found := labels()) is not None:
-                    instance.mask = found == value
+        for observation in self._read(path)[0]:
+            if not self._is_out_of_view(observation):
+                instance = self._instance(observation, shape, counts_truncation)
+                value = values[observation.item.place.where]
+                if value is not None and (map_of_labels := labels()) is not None:
+                    instance.mask = map_of_labels == value
                 instances.append(instance)
-        depth = files.read_depth(record, path, shape) if self._read_depth else None
+        depth = ndds.read_depth(record, path, shape) if self._read_depth else None
         return Sample(image, K, instances, depth, self.name, self._key(path))
 
     def _key(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix().removesuffix(".json")
 
-    def _is_out_of_view(self, one: Observation) -> bool:
-        """Tell whether an object is behind the camera, where the file calls it invisible."""
-        T_cam_obj = one.T_cam_obj(self.finding.convention)
+    def _is_out_of_view(self, observation: Observation) -> bool:
+        """Tell whether an object is behind the camera, and the file calls it invisible."""
+        T_cam_obj = observation.T_cam_obj(self.finding.convention)
         behind = T_cam_obj is not None and T_cam_obj[2, 3] <= 0
-        return behind and one.item.visibility is not None and one.item.visibility <= 0
+        visibility = observation.item.visibility
+        return behind and visibility is not None and visibility <= 0
 
-    def _instance(self, one: Observation, shape: Shape, counts_truncation: bool) -> Instance:
-        T_cam_obj = conventions.check_observation(one, self.finding.convention)
-        keypoints = project_keypoints(one.part.cuboid, T_cam_obj, one.K)
-        fraction = one.item.visibility
+    def _instance(
+        self, observation: Observation, shape: Shape, counts_truncation: bool
+    ) -> Instance:
+        T_cam_obj = check_observation(observation, self.finding.convention)
+        part, fraction = observation.part, observation.item.visibility
+        keypoints = project_keypoints(part.cuboid, T_cam_obj, observation.K)
         if fraction is None or fraction == -1:
             fraction, counts_truncation = 1.0, False
         if not counts_truncation:
             inside, whole = hull_areas(keypoints[:8], shape)
             fraction *= min(1.0, inside / whole) if whole > 0 else 0.0
-        return Instance(one.part.name, T_cam_obj, keypoints, float(fraction))
+        return Instance(part.name, T_cam_obj, keypoints, float(fraction))
 
     def contains(self, label: str) -> bool:
         """Tell whether an item holds this object, reading annotations until one does."""
         return label in self._parts and any(
             self._part(name) is self._parts[label]
             for path in self.items
-            for _, _, name in files.objects_of(files.read_record(path) or {}, path)
+            for _, _, name in ndds.objects_of(ndds.read_record(path) or {}, path)
         )
 
     def describe(self) -> list[SourceInfo]:
@@ -190,29 +201,23 @@ class NddsReader:
         }
         if len(self.items) > _MAX_COUNTED_ITEMS:
             return [SourceInfo(self.name, len(self.items), identity)]
-        kept, left_out = self._count()
+        kept: Counter[str] = Counter()
+        left_out: Counter[str] = Counter()
+        for path in self.items:
+            observations, others = self._read(path)
+            left_out.update(others)
+            for observation in observations:
+                if self._is_out_of_view(observation):
+                    left_out[f"{observation.item.label}, behind the camera"] += 1
+                else:
+                    kept[observation.part.name] += 1
         identity["left out"] = dict(sorted(left_out.items()))
         instances = {name: kept[name] for name in self._parts}
         return [SourceInfo(self.name, len(self.items), identity, instances)]
 
-    def _count(self) -> tuple[Counter[str], Counter[str]]:
-        """Count the instances of the parts by name, and what is left out by class."""
-        kept: Counter[str] = Counter()
-        left_out: Counter[str] = Counter()
-        for path in self.items:
-            record = files.read_record(path) or {}
-            names = [name for _, _, name in files.objects_of(record, path)]
-            left_out.update(name for name in names if self._part(name) is None)
-            for one in self._observations(record, path):
-                if self._is_out_of_view(one):
-                    left_out[f"{one.item.label}, behind the camera"] += 1
-                else:
-                    kept[one.part.name] += 1
-        return kept, left_out
-
 
 def _find(folder: Path) -> list[Path]:
-    items, lonely = files.find_items(folder) if folder.is_dir() else ([], [])
+    items, lonely = ndds.find_items(folder) if folder.is_dir() else ([], [])
     if not items:
         raise UserError(
             f"{folder} without one annotated image ({len(lonely)} JSON files without an image)",
@@ -223,10 +228,3 @@ def _find(folder: Path) -> list[Path]:
         message = "%s: %s annotations have no image and are left out; first: %s"
         _log.warning(message, folder, f"{len(lonely):,}", lonely[0])
     return items
-
-
-def _spread(items: Sequence[Path]) -> Iterator[Path]:
-    """Yield all items, evenly spread ones first, so that a few of them stand for the whole."""
-    step = max(1, len(items) // _MAX_OBSERVATIONS)
-    for start in range(step):
-        yield from items[start::step]

@@ -77,22 +77,22 @@ class NddsWriter:
         self._parts = {part.name: part for part in parts}
 
     def prepare(self) -> None:
-        """Write ``_object_settings.json``, idempotently; a UserError in another's folder."""
+        """Write ``_object_settings.json``, idempotently; a UserError in a folder of other data."""
         path = self._root / OBJECT_SETTINGS
         settings = _encode(object_settings(list(self._parts.values())))
-        if path.is_file():
-            if path.read_bytes() != settings:
-                raise self._occupied(f"{path} of other parts")
-            return
         present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
         foreign = [path for path in present if path.is_dir() or path.suffix in _DATA_SUFFIXES]
-        if foreign:
+        got = ""
+        if path.is_file():
+            got = "" if path.read_bytes() == settings else f"{path} of other parts"
+        elif foreign:
             got = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
-            raise self._occupied(got)
-        write_whole(path, settings)
-
-    def _occupied(self, got: str) -> UserError:
-        return UserError(got, "an empty folder, or one begun with the same parts", "name another")
+        else:
+            write_whole(path, settings)
+        if got:
+            raise UserError(
+                got, "an empty folder, or one begun with the same parts", "name another"
+            )
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an item's images and then its annotation, which marks it as complete."""
@@ -128,13 +128,9 @@ class NddsWriter:
         Every annotation has its own intrinsics; this file is for readers that look only here. A
         preset has one camera, so every chunk writes the same bytes.
         """
-        cameras = []
-        for index in sorted(indices):
-            record: Any = read_json(self._path(index, ".json"))
-            cameras.append(record["camera_data"])
-            if any(cameras[0][name] != cameras[-1][name] for name in CAMERA_FIELDS):
-                return
-        if cameras:
+        records: list[Any] = [read_json(self._path(index, ".json")) for index in sorted(indices)]
+        cameras = [record["camera_data"] for record in records]
+        if cameras and all(cameras[0][n] == camera[n] for camera in cameras for n in CAMERA_FIELDS):
             write_whole(self._root / CAMERA_SETTINGS, _encode(camera_settings(cameras[0])))
 
 

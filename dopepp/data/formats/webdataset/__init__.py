@@ -30,7 +30,7 @@ MAX_MEMBERS: Final = 1_000_000
 """Of a shard; one of BOP's has 1,000 images of seven members each."""
 
 KEY_FILE: Final = "key_to_shard.json"
-"""Beside the shards: in which of them a key is."""
+"""File beside the shards: the shard of every key."""
 
 _IMAGE: Final = re.compile(r"(rgb|gray)\.(png|jpe?g|tiff?)")
 _DEPTH: Final = re.compile(r"depth\.(png|tiff?)")
@@ -67,57 +67,51 @@ class ShardIndex:
 
 
 def read_span(path: Path, offset: int, size: int) -> bytes:
-    """Return a part of a file; a UserError where it has become shorter or has gone."""
+    """Return a part of a file; a UserError where the file is shorter now or missing."""
+    got = f"cut short within the member at byte {offset}"
     try:
         with path.open("rb") as file:
             file.seek(offset)
             content = file.read(size)
+        if len(content) == size:
+            return content
     except OSError as error:
-        raise _gone(path, str(error.strerror)) from error
-    if len(content) < size:
-        raise _gone(path, f"cut short within the member at byte {offset}")
-    return content
-
-
-def _gone(path: Path, got: str) -> UserError:
-    return UserError(f"shard {path}: {got}", _ALLOWED, "copy, unzip or download the shard again")
+        got = str(error.strerror)
+    raise UserError(f"shard {path}: {got}", _ALLOWED, "copy, unzip or download the shard again")
 
 
 def index_shard(path: Path) -> ShardIndex:
     """Find a shard's images.
 
-    A UserError: the archive is refused (see :func:`members`), or an image lacks its picture or its
-    camera, or has one of them twice.
+    Raises:
+        UserError: :func:`members` reports a problem, or an image lacks its picture or its camera,
+            or has two of them.
     """
     place = Place(STRICT, path, "archive")
     rows: dict[str, int] = {}
-    found: list[tuple[int, int, int, int]] = []
+    spans: dict[tuple[int, int], tuple[int, int]] = {}
     for member in members(path):
         field = field_of(member.extension)
         if field is not None:
-            row = rows.setdefault(member.key, len(rows))
-            found.append((row, FIELDS.index(field), member.offset, member.size))
-    spans = np.full((len(rows), len(FIELDS), 2), -1, np.int64)
-    table = np.array(found, np.int64).reshape(-1, 4)
-    spans[table[:, 0], table[:, 1]] = table[:, 2:]
-    keys = list(rows)
-    filled = np.bincount(table[:, 0] * len(FIELDS) + table[:, 1], minlength=spans[..., 0].size)
-    for slot in np.flatnonzero(filled > 1).tolist():
-        key, field = keys[slot // len(FIELDS)], FIELDS[slot % len(FIELDS)]
-        place.report(f"{key} with two members for its {field}", _ALLOWED)
-    for name in ("image", "camera"):
-        for row in np.flatnonzero(spans[:, FIELDS.index(name), 0] < 0).tolist():
-            got = f"{keys[row]} without {'rgb or gray' if name == 'image' else name}"
-            place.report(got, _ALLOWED)
-    return ShardIndex(path, keys, spans)
+            slot = rows.setdefault(member.key, len(rows)), FIELDS.index(field)
+            if slot in spans:
+                place.report(f"{member.key} with two members for its {field}", _ALLOWED)
+            spans[slot] = member.offset, member.size
+    table = np.full((len(rows), len(FIELDS), 2), -1, np.int64)
+    if spans:
+        table[tuple(np.array(list(spans)).T)] = list(spans.values())
+    for name, noun in (("image", "rgb or gray"), ("camera", "camera")):
+        for key, row in rows.items():
+            if table[row, FIELDS.index(name), 0] < 0:
+                place.report(f"{key} without {noun}", _ALLOWED)
+    return ShardIndex(path, list(rows), table)
 
 
 def members(path: Path, problems: Problems = STRICT) -> Iterator[TarMember]:
-    """Yield the files of a shard; folders and WebDataset's own ``__meta__`` are passed over.
+    """Yield the files of a shard; folders and WebDataset's own ``__meta__`` are skipped.
 
-    What cannot be taken is a problem and passed over: an archive that is compressed, cut short or
-    damaged, and a member that is no plain file, leads out of the archive, has no extension, comes
-    twice or is too large.
+    Reported and skipped are an archive that is compressed, cut short or damaged, and a member that
+    is no plain file, leads out of the archive, has no extension, comes twice or is too large.
     """
     place = Place(problems, path, "archive")
     try:
@@ -141,31 +135,26 @@ def _walk(place: Place, file: io.BufferedReader, size: int) -> Iterator[TarMembe
     with tarfile.open(fileobj=Bounded(file), mode="r:") as archive:
         while (info := archive.next()) is not None:
             archive.members = []  # type: ignore[attr-defined]  # it keeps every header it has read
-            if _is_passed_over(info):
+            name = PurePosixPath(info.name)
+            is_meta = name.name.startswith("__") and name.name.endswith("__")
+            if (info.isdir() or is_meta) and not _leads_out(info):
                 continue
             if len(names) == MAX_MEMBERS:
                 place.report(f"over {MAX_MEMBERS:,} members", _ALLOWED)
                 return
-            got = "twice" if info.name in names else _refusal(info, size)
-            if got:
+            if got := "twice" if info.name in names else _refusal(info, size):
                 place.report(f"member {info.name!r:.80} {got}", _ALLOWED)
                 continue
             names.add(info.name)
-            name = PurePosixPath(info.name)
             key, _, extension = name.name.partition(".")
-            start = str(name.with_name(key))
-            yield TarMember(start, extension.lower(), info.offset_data, info.size)
+            yield TarMember(
+                str(name.with_name(key)), extension.lower(), info.offset_data, info.size
+            )
         end = archive.offset
     # tarfile takes a damaged header after the first, and the end of the file, for the archive's.
     file.seek(end)
     if file.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
         place.report(f"cut short or damaged at byte {end}", _ALLOWED)
-
-
-def _is_passed_over(info: tarfile.TarInfo) -> bool:
-    name = PurePosixPath(info.name).name
-    is_meta = name.startswith("__") and name.endswith("__")
-    return (info.isdir() or is_meta) and not _leads_out(info)
 
 
 def _leads_out(info: tarfile.TarInfo) -> bool:
@@ -175,7 +164,7 @@ def _leads_out(info: tarfile.TarInfo) -> bool:
 
 
 def _refusal(info: tarfile.TarInfo, archive_size: int) -> str:
-    """Say why a member is not taken; nothing where it is."""
+    """Return why a member is refused; empty where it is not."""
     key, dot, _ = PurePosixPath(info.name).name.partition(".")
     if _leads_out(info):
         return "which leads out of the archive"

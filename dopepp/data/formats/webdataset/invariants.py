@@ -50,21 +50,14 @@ def check_webdataset(report: CheckReport) -> None:
             oddities.count(_check_image(report, f"{path}/{key}", content, models), models)
             report.count_image()
         oddities.note(report, path)
-        staged = len(list((path.parent / STAGING).glob("**/[0-9]*.tar")))
-        if staged:
+        if staged := len(list((path.parent / STAGING).glob("**/[0-9]*.tar"))):
             report.note(f"{path.parent}: {staged} images written and not yet finalized")
     for folder, keys in seen.items():
-        _check_key_file(report, folder / shards.KEY_FILE, keys)
-
-
-def _check_key_file(report: CheckReport, path: Path, keys: dict[str, str]) -> None:
-    """Hold ``key_to_shard.json`` against the shards: ``{key: shard's number}``."""
-    place = Place(report, path)
-    listed = place.load() if path.is_file() else None
-    if listed:
-        for key in sorted(keys.keys() - listed.keys()):
+        place = Place(report, folder / shards.KEY_FILE)
+        listed = place.load() if (folder / shards.KEY_FILE).is_file() else None
+        for key in sorted(keys.keys() - listed.keys()) if listed else ():
             place[key].report(f"missing; it is in {keys[key]}")
-        for key in sorted(listed.keys() - keys.keys()):
+        for key in sorted(listed.keys() - keys.keys()) if listed else ():
             place[key].report("in no shard")
 
 
@@ -86,13 +79,11 @@ def _check_image(
     """Check the members of one key; return its poses."""
     names = {shards.field_of(name): name for name in reversed(content)}
     shape: Shape | None = None
-    if "image" in names:
-        name = names["image"]
+    if name := names.get("image"):
         shape = picture_shape(Place(report, f"{start}.{name}"), content[name], COLOUR_MODES)
     else:
         report.report(f"{start}.rgb.png", "member", "missing")
-    if "depth" in names:
-        name = names["depth"]
+    if name := names.get("depth"):
         one_channel_of(Place(report, f"{start}.{name}"), shape, content[name], DEPTH_MODES)
     if "camera.json" not in content:
         report.report(f"{start}.camera.json", "member", "missing")
@@ -101,10 +92,10 @@ def _check_image(
     records = ShardRecords(start, lambda name: content.get(f"{name}.json"), report)
 
     camera, truths, infos = records.json("camera"), records.truths, records.infos
-    known = {name for name in ("mask", "mask_visib") if records.json(name) is not None}
+    present = {name for name in ("mask", "mask_visib") if records.json(name) is not None}
 
     def read_mask(name: str, number: int) -> Mask | None:
-        return records.mask(name, number, shape) if shape and name in known else None
+        return records.mask(name, number, shape) if shape and name in present else None
 
     has_depth = "depth" in names
     return check_image(records.places, camera, truths, infos, shape, has_depth, models, read_mask)

@@ -43,9 +43,9 @@ def find_shards(
         root: Folder that relative paths start from.
         shards: A folder (its ``*.tar`` by name), a file, a URL, or several of them; braces as in
             ``shard-{000000..000009}.tar`` are expanded.
-        download_dir: Where shards from URLs are kept; one that is there is not fetched again.
-        allow_commands: Whether ``pipe:COMMAND`` may be run: a path that somebody else wrote into a
-            config would run it with the user's rights.
+        download_dir: Folder for shards from URLs; a shard in it is not downloaded again.
+        allow_commands: Whether ``pipe:COMMAND`` may be run: a path in a stranger's config would
+            run it with the user's rights.
     """
     paths = []
     for text in _expanded([shards] if isinstance(shards, str) else shards):
@@ -67,59 +67,43 @@ def _expanded(texts: Sequence[str]) -> list[str]:
 
     expanded: list[str] = []
     for text in texts:
-        if _longest_range(text) >= MAX_SHARDS:
-            raise _too_many(text)
-        try:
-            # Of a command, braces belong to the command.
-            lazily = [text] if text.startswith("pipe:") else braceexpand(text)
-            expanded += islice(lazily, MAX_SHARDS + 1)
-        except ValueError as error:
-            raise UserError(
-                f"shards {text!r:.100}: {error}", "braces as in shard-{000000..000009}.tar",
-                "close the brace",
-            ) from error  # fmt: skip
-        if len(expanded) > MAX_SHARDS:
-            raise _too_many(text)
+        # The library lists a whole range at once, and nothing bounds the product of many braces.
+        lengths = (abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text[:_MAX_TEXT]))
+        too_long = len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES
+        if not too_long and max(lengths, default=0) < MAX_SHARDS:
+            try:
+                # The braces of a command belong to the command.
+                lazily = [text] if text.startswith("pipe:") else braceexpand(text)
+                expanded += islice(lazily, MAX_SHARDS + 1)
+            except ValueError as error:
+                got, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
+                raise UserError(got, allowed, "close the brace") from error
+            if len(expanded) <= MAX_SHARDS:
+                continue
+        allowed = f"at most {MAX_SHARDS:,} shards"
+        raise UserError(f"shards {text!r:.100}", allowed, "correct the range")
     return expanded
 
 
-def _longest_range(text: str) -> int:
-    """Return the length of the longest ``{1..9}``, all of which the library lists at once."""
-    # Texts too long, or with more braces than a path needs, count as too long a range.
-    if len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES:
-        return MAX_SHARDS
-    return max((abs(int(m[2]) - int(m[1])) for m in _RANGE.finditer(text)), default=0)
-
-
-def _too_many(text: str) -> UserError:
-    return UserError(f"shards {text!r:.100}", f"at most {MAX_SHARDS:,} shards", "correct the range")
-
-
 def _local(path: Path) -> list[Path]:
-    if path.is_dir():
-        shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))
-        if shards:
-            return shards
-    elif path.is_file():
+    if path.is_file():
         return [path]
-    raise UserError(
-        f"shards {path}, {'a folder without *.tar' if path.is_dir() else 'no such file or folder'}",
-        "a folder of shard-000000.tar, …, a shard, or a URL", "correct data.root or image_sets",
-    )  # fmt: skip
+    shards = sorted(file for file in path.glob("*.tar") if not file.name.startswith("."))
+    if shards:
+        return shards
+    lack = "a folder without *.tar" if path.is_dir() else "no such file or folder"
+    allowed = "a folder of shard-000000.tar, …, a shard, or a URL"
+    raise UserError(f"shards {path}, {lack}", allowed, "correct data.root or image_sets")
 
 
 def _fetched(url: str, scheme: str, folder: Path | None, allow_commands: bool) -> Path:
+    got = f"shards {url!r:.100}"
     if scheme == "pipe" and not allow_commands:
-        raise UserError(
-            f"shards {url!r:.100}, a command to run", "files, folders and URLs of shards",
-            "download the shards, or allow commands in so many words (allow_commands=True)",
-        )  # fmt: skip
+        fix = "download the shards, or allow commands in so many words (allow_commands=True)"
+        raise UserError(f"{got}, a command to run", "files, folders and URLs of shards", fix)
     if folder is None:
-        raise UserError(
-            f"shards {url!r:.100}, which are not on this machine",
-            "local shards, or a folder to download them into",
-            "set data.download_dir",
-        )
+        allowed = "local shards, or a folder to download them into"
+        raise UserError(f"{got}, which are not on this machine", allowed, "set data.download_dir")
     name = PurePosixPath(urlsplit(url).path).name
     if scheme == "pipe" or not name.endswith(".tar"):
         name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
@@ -131,13 +115,12 @@ def _fetched(url: str, scheme: str, folder: Path | None, allow_commands: bool) -
 
 
 def _download(url: str, scheme: str, path: Path) -> None:
-    """Copy a shard through the library's own opener, within bounds; all of it or nothing."""
-    # Imports torch where it is installed, so only those who download pay for it.
-    from webdataset.gopen import gopen, gopen_schemes
+    """Download a whole shard, within bounds, through the library's own opener."""
+    from webdataset.gopen import gopen, gopen_schemes  # imports torch where it is installed
 
     if scheme not in gopen_schemes:
-        known = sorted(gopen_schemes.keys() - {"__default__", "pipe"})
-        raise UserError(f"shards {url!r:.100}", f"URLs of {', '.join(known)}", "correct the URL")
+        known = ", ".join(sorted(gopen_schemes.keys() - {"__default__", "pipe"}))
+        raise UserError(f"shards {url!r:.100}", f"URLs of {known}", "correct the URL")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial, size = partial_path(path), 0
     try:
@@ -145,16 +128,14 @@ def _download(url: str, scheme: str, path: Path) -> None:
             while piece := stream.read(_PIECE_BYTES):
                 size += len(piece)
                 if size > MAX_SHARD_BYTES:
-                    raise UserError(
-                        f"{url} of over {size / 1e9:.0f} GB",
-                        f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB", "download it by hand",
-                    )  # fmt: skip
+                    allowed = f"shards of at most {MAX_SHARD_BYTES / 1e9:.0f} GB"
+                    got = f"{url} of over {size / 1e9:.0f} GB"
+                    raise UserError(got, allowed, "download it by hand")
                 file.write(piece)
         partial.replace(path)
     except OSError as error:  # the library's for a command that failed, and a full disk
-        raise UserError(
-            f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}",
-            "a URL that can be read and enough space", "check the URL and the connection",
-        ) from error  # fmt: skip
+        got = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
+        allowed = "a URL that can be read and enough space"
+        raise UserError(got, allowed, "check the URL and the connection") from error
     finally:
         partial.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""BOP-WebDataset: tar shards of which any image can be read at random, so a run resumes exactly.
+"""BOP-WebDataset: tar shards of which any image can be read, so a run resumes exactly.
 
 Members are ``KEY.rgb.png`` (or jpg, or gray), ``KEY.depth.png``, ``KEY.camera.json``,
 ``KEY.gt.json``, ``KEY.gt_info.json`` and ``KEY.mask_visib.json``; lengths are millimetres there.
@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -30,22 +30,20 @@ from dopepp.parts.part import Part
 
 _log = logging.getLogger(__name__)
 
-_MAX_NAMED: Final = 3
-
 
 class WebdatasetReader:
     """The images of some shards, shard by shard in the shards' own order.
 
-    Opening reads the archives' headers; an image's members are read and checked when it is asked
-    for. An image without ``gt.json`` has no instances. Objects that are none of the parts, and
-    objects behind the camera, are left out. The visible fraction is ``visib_fract`` of
-    ``gt_info.json``; without it, see :func:`~dopepp.data.formats.bop.make_instance`.
+    Opening reads the archives' headers; an image's members are read and checked with the image. An
+    image without ``gt.json`` has no instances. Objects that are none of the parts, and objects
+    behind the camera, are left out. The visible fraction is ``visib_fract`` of ``gt_info.json``;
+    without it, see :func:`~dopepp.data.formats.bop.make_instance`.
 
     Args:
-        parts: The objects to return, called as in ``models_info.json`` or ``obj_000001``.
+        parts: The objects to return, named as in ``models_info.json`` or ``obj_000001``.
         shards: A folder in ``root``, a file or a URL, or several; see
             :func:`~dopepp.data.formats.webdataset.locations.find_shards`.
-        download_dir: Where shards from URLs are kept; None refuses URLs.
+        download_dir: Folder for shards from URLs; None refuses URLs.
         allow_commands: Whether ``pipe:`` may run a command.
     """
 
@@ -62,7 +60,7 @@ class WebdatasetReader:
         self.root = Path(root)
         self.name = f"webdataset/{shards if isinstance(shards, str) else shards[0]}"
         self._parts = parts_by_id(self.root, parts)
-        self._read_depth, self._told_inexact = read_depth, False
+        self._read_depth, self._logged_inexact = read_depth, False
         folder = None if download_dir is None else Path(download_dir)
         paths = find_shards(self.root, shards, folder, allow_commands)
         self._shards = [index_shard(path) for path in paths]
@@ -77,7 +75,7 @@ class WebdatasetReader:
     def sample(self, index: int, epoch: int = 0) -> Sample:
         """Read an image; the epoch does not matter."""
         shard, image = self._shards[self._items[index, 0]], int(self._items[index, 1])
-        records = self._records(shard, image)
+        records = _records(shard, image)
         content = shard.read(image, "image")
         assert content is not None  # the index holds no image without
         picture = decode_rgb(content, records.start)
@@ -86,47 +84,38 @@ class WebdatasetReader:
         camera = check_camera(K[0], (shape[1], shape[0]), records.start)
         has_masks = records.json("mask_visib") is not None
         poses = records.poses()
-        if poses.inexact.any() and not self._told_inexact:
-            self._told_inexact = True
-            _log.warning(
-                "%s: rotations orthogonal to %g only; the nearest are taken",
-                records.start, bop.INEXACT,
-            )  # fmt: skip
+        if poses.inexact.any() and not self._logged_inexact:
+            self._logged_inexact = True
+            got = f"rotations orthogonal to {bop.INEXACT:g} only"
+            _log.warning("%s: %s; the nearest are taken", records.start, got)
         instances = []
         for number in self._chosen(poses):
             mask = records.mask("mask_visib", number, shape) if has_masks else None
             part = self._parts[int(poses.obj_ids[number])]
             T, fraction = poses.T_cam_obj[number], float(poses.visible_fractions[number])
             instances.append(bop.make_instance(part, T, camera, fraction, mask, shape))
-        encoded = shard.read(image, "depth") if self._read_depth else None
-        depth = None
+        encoded, depth = shard.read(image, "depth") if self._read_depth else None, None
         if encoded is not None:
             depth = decode_depth(encoded, f"{records.start}.depth", float(scales[0]), shape)
         return Sample(picture, camera, instances, depth, self.name, shard.keys[image])
 
-    def _records(self, shard: ShardIndex, image: int) -> ShardRecords:
-        return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
-
     def _chosen(self, poses: bop.BopPoses) -> list[int]:
-        """Return the numbers of the objects of interest before the camera."""
+        """Return the indices of the objects of interest before the camera."""
         wanted = np.isin(poses.obj_ids, list(self._parts)) & (poses.T_cam_obj[:, 2, 3] > 0)
         return [int(number) for number in np.flatnonzero(wanted)]
 
     def contains(self, label: str) -> bool:
         """Tell whether an image holds this object, reading ground truth until one does."""
         wanted = {number for number, part in self._parts.items() if part.name == label}
-        if not wanted:
-            return False
-        for number, image in self._items.tolist():
-            poses = self._records(self._shards[number], image).poses()
+        for number, image in self._items.tolist() if wanted else ():
+            poses = _records(self._shards[number], image).poses()
             if any(int(poses.obj_ids[k]) in wanted for k in self._chosen(poses)):
                 return True
         return False
 
     def describe(self) -> list[SourceInfo]:
-        """Return the shards' members' sizes as a hash, the objects, and how fractions are known."""
-        digest = hashlib.sha256()
-        stated = True
+        """Return the hash of the members' sizes, the objects and the origin of fractions."""
+        digest, stated = hashlib.sha256(), True
         for number, image in self._items.tolist():
             shard = self._shards[number]
             digest.update(shard.keys[image].encode())
@@ -142,11 +131,12 @@ class WebdatasetReader:
 
 
 class ShardRecords:
-    """The JSON members of one image, each parsed when it is first asked for.
+    """The JSON members of one image, each parsed on first use.
 
     Args:
-        start: What the members' paths begin with, ``SHARD/KEY``.
+        start: Beginning of the members' paths, ``SHARD/KEY``.
         read: Returns a member's content by its name, e.g. ``gt``; None where there is none.
+        problems: Receives what is wrong.
     """
 
     def __init__(
@@ -159,12 +149,12 @@ class ShardRecords:
         return Place(self._problems, f"{self.start}.{name}.json")
 
     def places(self, what: str, number: int) -> Place:
-        """Return where a record stands."""
+        """Return a record's place."""
         member = self._member(what)
         return member if what == "camera" else member[number]
 
     def _json(self, name: str) -> Any:
-        """Return what a member holds, None where there is none or it cannot be read."""
+        """Return a member's content; None where there is none or it cannot be read."""
         content, member = self._read(name), self._member(name)
         if content is None or len(content) <= MAX_BYTES:
             return None if content is None else member.decode(content)
@@ -172,14 +162,11 @@ class ShardRecords:
         member["member"].report(f"{len(content) / 1e6:.0f} MB", allowed)
         return None
 
-    def _entries(self, name: str) -> list[Any]:
-        found = self.json(name)
-        return [] if found is None else self._member(name).entries(found)
-
     @cached_property
     def truths(self) -> list[bop.Record]:
-        """The ``gt`` records of the objects, none where there are none."""
-        return self._entries("gt")
+        """The ``gt`` records of the objects."""
+        content = self.json("gt")
+        return [] if content is None else self._member("gt").entries(content)
 
     @cached_property
     def infos(self) -> list[bop.Record | None]:
@@ -199,15 +186,14 @@ class ShardRecords:
         return decode_runs(record, shape, self._member(name)[f"{number}"])
 
 
+def _records(shard: ShardIndex, image: int) -> ShardRecords:
+    return ShardRecords(f"{shard.path}/{shard.keys[image]}", partial(shard.read, image))
+
+
 def _check_keys(shards: Sequence[ShardIndex]) -> None:
     owners: dict[str, Path] = {}
     for shard in shards:
-        twice = [key for key in shard.keys if key in owners]
-        if twice:
-            raise UserError(
-                f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, "
-                f"e.g. {twice[:_MAX_NAMED]}",
-                "each key in one shard",
-                "write or download the shard again",
-            )
+        if twice := [key for key in shard.keys if key in owners]:
+            got = f"{shard.path} with {len(twice)} keys of {owners[twice[0]]}, e.g. {twice[:3]}"
+            raise UserError(got, "each key in one shard", "write or download the shard again")
         owners |= dict.fromkeys(shard.keys, shard.path)

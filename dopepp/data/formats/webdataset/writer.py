@@ -20,7 +20,7 @@ from dopepp.core.files import partial_path, write_whole
 from dopepp.data.formats import STAGING, by_line, finalizing, read_object, stage, staged_items
 from dopepp.data.formats.bop.writer import BopFolder
 from dopepp.data.formats.images import encode_png, encode_runs
-from dopepp.data.formats.webdataset import KEY_FILE, members, read_span
+from dopepp.data.formats.webdataset import KEY_FILE, TarMember, members, read_span
 from dopepp.data.sample import Sample
 
 _OWNER: Final = "dopepp"
@@ -49,7 +49,9 @@ class WebdatasetWriter(BopFolder):
             runs = {str(number): encode_runs(mask) for number, mask in enumerate(masks)}
             content[f"{name}.json"] = json.dumps(runs).encode()
         chunk, image = divmod(index, self.chunk_size)
-        stage(self._staging(chunk) / f"{image:06d}.tar", _archive(_key(chunk, image), content))
+        stage(
+            self._staging(chunk) / f"{image:06d}.tar", _archive(f"{chunk:06d}_{image:06d}", content)
+        )
 
     def written(self, chunk: int) -> set[int]:
         """Return the indices of the shard's complete images."""
@@ -79,7 +81,7 @@ class WebdatasetWriter(BopFolder):
         partial = partial_path(path)
         try:
             with tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as archive:
-                for key, content in _merged(path, chunk, staged):
+                for key, content in _merged([path, *staged.values()], chunk):
                     _add(archive, key, content)
             partial.replace(path)
         finally:
@@ -104,17 +106,16 @@ class WebdatasetWriter(BopFolder):
         return staged_items(self._staging(chunk), ".tar")
 
 
-def _merged(path: Path, chunk: int, staged: dict[int, Path]) -> Iterator[tuple[str, Content]]:
-    """Yield the finalized and the staged images in order, one in memory at a time."""
-    sources: dict[int, Path] = {}
-    places: dict[int, list[tuple[str, int, int]]] = {}
-    for source in [*([path] if path.exists() else []), *staged.values()]:
-        for key, group in groupby(members(source), key=lambda member: member.key):
-            sources[_image(key)] = source
-            places[_image(key)] = [(m.extension, m.offset, m.size) for m in group]
-    for image in sorted(places):
-        content = {name: read_span(sources[image], *span) for name, *span in places[image]}
-        yield _key(chunk, image), content
+def _merged(paths: Sequence[Path], chunk: int) -> Iterator[tuple[str, Content]]:
+    """Yield the images of some archives in order, one in memory at a time; later archives win."""
+    images: dict[int, tuple[Path, list[TarMember]]] = {}
+    for path in paths:
+        if path.exists():
+            for key, group in groupby(members(path), key=lambda member: member.key):
+                images[_image(key)] = path, list(group)
+    for image, (path, listed) in sorted(images.items()):
+        content = {m.extension: read_span(path, m.offset, m.size) for m in listed}
+        yield f"{chunk:06d}_{image:06d}", content
 
 
 def _archive(key: str, content: Content) -> bytes:
@@ -130,10 +131,6 @@ def _add(archive: tarfile.TarFile, key: str, content: Content) -> None:
         info.size, info.mode = len(data), 0o444
         info.uname = info.gname = _OWNER
         archive.addfile(info, io.BytesIO(data))
-
-
-def _key(chunk: int, image: int) -> str:
-    return f"{chunk:06d}_{image:06d}"
 
 
 def _image(key: str) -> int:
