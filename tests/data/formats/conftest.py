@@ -1,4 +1,4 @@
-"""What the tests of every layout share: rendered samples, and what is asked of a set of files."""
+"""Makers of miniature data sets that the tests of every layout share."""
 
 import io
 import tarfile
@@ -20,7 +20,8 @@ from dopepp.virtual.renderers.raster import silhouette
 from dopepp.virtual.scene import SceneObject
 from dopepp.virtual.surface import make_surface
 
-BOX = trimesh.creation.box((60.0, 40.0, 24.0))  # mm
+BOX = trimesh.creation.box((60.0, 40.0, 24.0))  # mm, with its centre beside the origin
+BOX.apply_translation((4.0, -6.0, 2.0))
 
 
 @pytest.fixture(scope="session")
@@ -50,23 +51,6 @@ def write_set():
         return root
 
     return write
-
-
-@pytest.fixture(scope="session")
-def assert_read_back():
-    def compare(read, sample):
-        """Compare what was read with what was written; depth has steps of 0.1 mm."""
-        np.testing.assert_array_equal(read.image, sample.image)
-        np.testing.assert_array_equal(read.K, sample.K)
-        assert np.abs(read.depth - sample.depth).max() <= 0.51e-4
-        for instance, expected in zip(read.instances, sample.instances, strict=True):
-            assert instance.label == expected.label
-            np.testing.assert_allclose(instance.T_cam_obj, expected.T_cam_obj, atol=1e-12)
-            np.testing.assert_allclose(instance.keypoints, expected.keypoints, atol=1e-4)
-            np.testing.assert_array_equal(instance.mask, expected.mask)
-            assert instance.visible_fraction == expected.visible_fraction
-
-    return compare
 
 
 @pytest.fixture(scope="session")

@@ -1,24 +1,95 @@
 """What the writers write: clean, without torch, and whole with several processes in one folder."""
 
 import multiprocessing
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dopepp.data.check import check_dataset
 from dopepp.data.formats import STAGING, finalizing, stage, staged_items
+from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.writer import BopWriter
+from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
+from dopepp.data.formats.webdataset.reader import WebdatasetReader
 from dopepp.data.formats.webdataset.writer import WebdatasetWriter
+
+LAYOUTS = {
+    "ndds": (NddsWriter, NddsReader),
+    "bop": (BopWriter, lambda root, parts: BopReader(root, parts, "train_pbr")),
+    "webdataset": (
+        WebdatasetWriter,
+        lambda root, parts: WebdatasetReader(root, parts, "train_pbr"),
+    ),
+}
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("writer_class", [NddsWriter, BopWriter, WebdatasetWriter])
-def test_written_sets_are_clean(tmp_path, parts, samples, writer_class, write_set):
-    report = check_dataset(write_set(writer_class, tmp_path / "set", parts, samples))
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_is_written_is_clean_and_read_back(tmp_path, parts, samples, layout, write_set):
+    writer, make_reader = LAYOUTS[layout]
+    root = write_set(writer, tmp_path / "set", parts, samples)
+    report = check_dataset(root)
     assert (report.defects, report.notes, report.num_images) == ([], [], len(samples))
+    reader = pickle.loads(pickle.dumps(make_reader(root, parts)))
+    assert len(reader) == len(samples)
+    for index in (2, 0, 3, 1):  # at random
+        read, sample = reader.sample(index, epoch=7), samples[index]
+        np.testing.assert_array_equal(read.image, sample.image)
+        np.testing.assert_array_equal(read.K, sample.K)
+        assert np.abs(read.depth - sample.depth).max() <= 0.51e-4  # steps of 0.1 mm
+        for instance, expected in zip(read.instances, sample.instances, strict=True):
+            assert instance.label == expected.label
+            np.testing.assert_allclose(instance.T_cam_obj, expected.T_cam_obj, atol=1e-12)
+            np.testing.assert_allclose(instance.keypoints, expected.keypoints, atol=1e-4)
+            np.testing.assert_array_equal(instance.mask, expected.mask)
+            assert instance.visible_fraction == expected.visible_fraction
+    assert reader.contains("servoholder")
+    assert not reader.contains("else")
+
+
+def die(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_bytes_depend_neither_on_the_order_nor_on_kills(
+    tmp_path, boxes, layout, write_set, contents
+):
+    writer_class, (parts, samples) = LAYOUTS[layout][0], boxes
+    whole = write_set(writer_class, tmp_path / "whole", parts, samples, 998)
+    root = tmp_path / "killed"
+    writer = writer_class(root, parts)
+    for _ in range(2):
+        writer.prepare()
+    writer.write(1000, samples[2])
+    for _ in range(2):
+        writer.finalize(1, [1000])
+    writer.write(999, samples[1])
+    with pytest.MonkeyPatch.context() as patch:  # after some files of an item, before its marker
+        module = writer_class.__module__
+        for name in ("stage", "_encode"):
+            patch.setattr(f"{module}.{name}", die, raising=False)
+        with pytest.raises(KeyboardInterrupt):
+            writer.write(998, samples[0])
+    assert writer_class(root, parts).written(0) == {999}
+    with pytest.MonkeyPatch.context() as patch:  # after some of a chunk's files, before the last
+        for name in ("_write_camera", "_write_keys"):
+            if hasattr(writer_class, name):
+                patch.setattr(writer_class, name, die)
+                with pytest.raises(KeyboardInterrupt):
+                    writer.finalize(0, [999])
+    again = writer_class(root, parts)
+    assert (again.written(0), again.written(1), again.written(2)) == ({999}, {1000}, set())
+    again.write(998, samples[0])
+    again.write(999, samples[1])
+    again.finalize(0, [998, 999])
+    assert contents(root) == contents(whole)
+    assert not list(root.rglob(STAGING))
 
 
 def test_data_sets_are_read_written_and_checked_without_torch(tmp_path):

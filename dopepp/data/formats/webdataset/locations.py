@@ -32,10 +32,7 @@ _SCHEME: Final = re.compile(r"([a-z][a-z0-9+.-]+):", re.IGNORECASE)
 
 
 def find_shards(
-    root: Path,
-    shards: str | Sequence[str],
-    download_dir: Path | None = None,
-    allow_commands: bool = False,
+    root: Path, shards: str | Sequence[str], download_dir: Path | None = None
 ) -> list[Path]:
     """Return the shards as local files, in the order in which they are named.
 
@@ -44,8 +41,6 @@ def find_shards(
         shards: A folder (its ``*.tar`` by name), a file, a URL, or several of them; braces as in
             ``shard-{000000..000009}.tar`` are expanded.
         download_dir: Folder for shards from URLs; a shard in it is not downloaded again.
-        allow_commands: Whether ``pipe:COMMAND`` may be run: a path in a stranger's config would
-            run it with the user's rights.
     """
     paths = []
     for text in _expanded([shards] if isinstance(shards, str) else shards):
@@ -55,7 +50,7 @@ def find_shards(
         elif scheme[1].lower() == "file":
             paths += _local(Path(url2pathname(urlsplit(text).path)))
         else:
-            paths.append(_fetched(text, scheme[1].lower(), download_dir, allow_commands))
+            paths.append(_fetched(text, scheme[1].lower(), download_dir))
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise UserError(f"shard {twice} twice", "each shard once", "correct data.image_sets")
@@ -72,9 +67,7 @@ def _expanded(texts: Sequence[str]) -> list[str]:
         too_long = len(text) > _MAX_TEXT or text.count("{") > _MAX_BRACES
         if not too_long and max(lengths, default=0) < MAX_SHARDS:
             try:
-                # The braces of a command belong to the command.
-                lazily = [text] if text.startswith("pipe:") else braceexpand(text)
-                expanded += islice(lazily, MAX_SHARDS + 1)
+                expanded += islice(braceexpand(text), MAX_SHARDS + 1)
             except ValueError as error:
                 got, allowed = f"shards {text!r:.100}: {error}", "braces as in shard-{00..09}.tar"
                 raise UserError(got, allowed, "close the brace") from error
@@ -96,16 +89,16 @@ def _local(path: Path) -> list[Path]:
     raise UserError(f"shards {path}, {lack}", allowed, "correct data.root or image_sets")
 
 
-def _fetched(url: str, scheme: str, folder: Path | None, allow_commands: bool) -> Path:
+def _fetched(url: str, scheme: str, folder: Path | None) -> Path:
     got = f"shards {url!r:.100}"
-    if scheme == "pipe" and not allow_commands:
-        fix = "download the shards, or allow commands in so many words (allow_commands=True)"
-        raise UserError(f"{got}, a command to run", "files, folders and URLs of shards", fix)
+    if scheme == "pipe":  # a path in a stranger's config would run with the user's rights
+        allowed = "files, folders and URLs of shards"
+        raise UserError(f"{got}, a command to run", allowed, "download the shards")
     if folder is None:
         allowed = "local shards, or a folder to download them into"
         raise UserError(f"{got}, which are not on this machine", allowed, "set data.download_dir")
     name = PurePosixPath(urlsplit(url).path).name
-    if scheme == "pipe" or not name.endswith(".tar"):
+    if not name.endswith(".tar"):
         name = hashlib.sha256(url.encode()).hexdigest()[:16] + ".tar"
     path = folder / name
     if not path.exists():
@@ -133,7 +126,7 @@ def _download(url: str, scheme: str, path: Path) -> None:
                     raise UserError(got, allowed, "download it by hand")
                 file.write(piece)
         partial.replace(path)
-    except OSError as error:  # the library's for a command that failed, and a full disk
+    except OSError as error:
         got = f"shard {url}, which cannot be fetched into {path.parent}: {error!s:.200}"
         allowed = "a URL that can be read and enough space"
         raise UserError(got, allowed, "check the URL and the connection") from error

@@ -44,7 +44,6 @@ class WebdatasetReader:
         shards: A folder in ``root``, a file or a URL, or several; see
             :func:`~dopepp.data.formats.webdataset.locations.find_shards`.
         download_dir: Folder for shards from URLs; None refuses URLs.
-        allow_commands: Whether ``pipe:`` may run a command.
     """
 
     def __init__(
@@ -55,14 +54,13 @@ class WebdatasetReader:
         part_of: tuple[float, float] = (0.0, 1.0),
         read_depth: bool = True,
         download_dir: str | Path | None = None,
-        allow_commands: bool = False,
     ) -> None:
         self.root = Path(root)
         self.name = f"webdataset/{shards if isinstance(shards, str) else shards[0]}"
         self._parts = parts_by_id(self.root, parts)
         self._read_depth, self._logged_inexact = read_depth, False
         folder = None if download_dir is None else Path(download_dir)
-        paths = find_shards(self.root, shards, folder, allow_commands)
+        paths = find_shards(self.root, shards, folder)
         self._shards = [index_shard(path) for path in paths]
         _check_keys(self._shards)
         items = [(n, i) for n, shard in enumerate(self._shards) for i in range(len(shard.keys))]

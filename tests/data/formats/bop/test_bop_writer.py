@@ -11,91 +11,23 @@ import pytest
 import trimesh
 
 from dopepp.core.errors import UserError
-from dopepp.data.formats import STAGING
-from dopepp.data.formats.bop.models import bop_parts
-from dopepp.data.formats.bop.reader import BopReader
 from dopepp.data.formats.bop.writer import BopWriter, make_labels
 from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part
 from dopepp.virtual.surface import make_surface
 
-NUM_IMAGES = 4
-
-
-def test_round_trip(parts, samples, tmp_path, assert_read_back, write_set):
-    write_set(BopWriter, tmp_path, parts, samples)
-    source = BopReader(tmp_path, bop_parts(tmp_path), "train_pbr")
-    assert len(source) == NUM_IMAGES
-    assert sum(len(sample.instances) for sample in samples) > 2 * NUM_IMAGES
-    for index, sample in enumerate(samples):
-        read = source.sample(index, epoch=3)
-        assert read.key == f"000000/{index:06d}"
-        assert_read_back(read, sample)
-    (info,) = source.describe()
-    assert sum(info.num_instances.values()) == sum(len(s.instances) for s in samples)
-    assert info.identity["visible_fractions"] == "scene_gt_info.json"
-
-
-def test_bytes_do_not_depend_on_the_order_of_writing(parts, samples, tmp_path, contents):
-    one, other = BopWriter(tmp_path / "one", parts), BopWriter(tmp_path / "other", parts)
-    for writer in (one, other):
-        writer.prepare()
-        writer.prepare()
-    for index in (0, 1, 1002, 1003):
-        one.write(index, samples[index % 1000])
-    for chunk in (0, 1):
-        one.finalize(chunk, [0, 1, 1002, 1003][2 * chunk : 2 * chunk + 2])
-    for index in (1003, 1, 1002, 0):
-        other.write(index, samples[index % 1000])
-        other.finalize(index // 1000, [index])
-        other.finalize(index // 1000, [index])
-    assert contents(tmp_path / "one") == contents(tmp_path / "other")
-    assert not list((tmp_path / "one").rglob(".*"))
-    assert other.written(1) == {1002, 1003}
-    assert other.written(2) == set()
-
-
-def test_goes_on_after_being_killed(parts, samples, tmp_path, contents, write_set):
-    write_set(BopWriter, tmp_path / "whole", parts, samples)
-
-    def die(*_):
-        raise KeyboardInterrupt
-
-    root = tmp_path / "killed"
-    first = BopWriter(root, parts)
-    first.prepare()
-    first.write(2, samples[2])
-    first.finalize(0, [2])
-    first.write(0, samples[0])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dopepp.data.formats.bop.writer.stage", die)
-        with pytest.raises(KeyboardInterrupt):
-            first.write(1, samples[1])  # all of its images, and no marker
-    assert BopWriter(root, parts).written(0) == {0, 2}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(BopWriter, "_write_camera", die)
-        with pytest.raises(KeyboardInterrupt):
-            BopWriter(root, parts).finalize(0, [0])
-    assert len(list((root / "train_pbr/000000" / STAGING).glob("*.json"))) == 1
-    again = BopWriter(root, parts)
-    assert again.written(0) == {0, 2}
-    for index in {0, 1, 2, 3} - again.written(0):
-        again.write(index, samples[index])
-    again.finalize(0, range(NUM_IMAGES))
-    again.finalize(0, range(NUM_IMAGES))
-    assert contents(root) == contents(tmp_path / "whole")
-
 
 def _write_and_seal(root: Path, parts: list[Part], samples: list[Sample], first: int) -> None:
     writer = BopWriter(root, parts)
     for index in range(first, 40, 2):
-        writer.write(index, samples[index % NUM_IMAGES])
+        writer.write(index, samples[index % len(samples)])
         writer.finalize(0, [index])
 
 
 @pytest.mark.ddp
-def test_two_processes_seal_one_scene(parts, samples, tmp_path):
+def test_two_processes_seal_one_scene(boxes, tmp_path):
+    parts, samples = boxes
     BopWriter(tmp_path, parts).prepare()
     context = multiprocessing.get_context("fork")
     processes = [
@@ -189,7 +121,8 @@ def test_truncated_hidden_and_far_objects(plate):
     assert labels.depth[10, 5] == 20_000
 
 
-def test_refuses_a_folder_of_something_else(parts, tmp_path):
+def test_refuses_a_folder_of_something_else(boxes, tmp_path):
+    parts = boxes[0]
     BopWriter(tmp_path / "a", parts).prepare()
     with pytest.raises(UserError, match=r"models_info\.json, written for other parts"):
         BopWriter(tmp_path / "a", parts[:1]).prepare()

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from dopepp.core.errors import UserError
 from dopepp.data.formats.ndds.reader import NddsReader
 from dopepp.data.formats.ndds.writer import NddsWriter
-from dopepp.data.sample import Instance, Sample
 from dopepp.geometry.camera import camera_matrix, project_keypoints
 from dopepp.parts.part import Mesh, Part, make_part
 
@@ -44,133 +44,95 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     return T
 
 
-def make_sample(seed: int, parts: tuple[Part, ...] = (BOX, CUBE)) -> Sample:
-    rng = np.random.default_rng(seed)
-    instances = []
-    taken = np.zeros((HEIGHT, WIDTH), bool)
-    for part in parts:
-        T = random_pose(rng)
-        keypoints = project_keypoints(part.cuboid, T, K)
-        canvas = np.zeros((HEIGHT, WIDTH), np.uint8)
-        cv2.fillConvexPoly(canvas, cv2.convexHull(np.rint(keypoints[:8]).astype(np.int32)), 1)
-        mask = (canvas > 0) & ~taken
-        taken |= mask
-        instances.append(Instance(part.name, T, keypoints, float(rng.uniform(0.2, 1)), mask))
-    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    depth = rng.uniform(0.3, 3, (HEIGHT, WIDTH)).astype(np.float32)
-    depth[0] = 0
-    return Sample(image, K, instances, depth)
-
-
 @pytest.fixture
-def written(tmp_path, write_set):
-    samples = [make_sample(seed) for seed in range(4)]
-    return write_set(NddsWriter, tmp_path / "set", [BOX, CUBE], samples), samples
+def written(tmp_path, write_set, boxes):
+    parts, samples = boxes
+    return write_set(NddsWriter, tmp_path / "set", parts, samples), parts, samples
 
 
-def test_round_trip(written, assert_read_back):
-    root, samples = written
-    source = NddsReader(root, [BOX, CUBE])
-    assert len(source) == 4
-    for index, sample in enumerate(samples):
-        back = source.sample(index, epoch=7)
-        assert_read_back(back, sample)
-        assert (back.key, back.source) == (f"{index:06d}", "ndds/set")
-    parts = [NddsReader(root, [BOX, CUBE], part_of=part) for part in ((0, 0.75), (0.75, 1))]
-    assert parts[0].items + parts[1].items == source.items
-    assert parts[0].describe()[0].identity["items"] != parts[1].describe()[0].identity["items"]
+def test_keys_and_shares(written):
+    root, parts, _ = written
+    source = NddsReader(root, parts)
+    assert (source.sample(1).key, source.sample(1).source) == ("000001", "ndds/set")
+    shares = [NddsReader(root, parts, part_of=part) for part in ((0, 0.7), (0.7, 1))]
+    assert shares[0].items + shares[1].items == source.items
+    assert shares[0].describe()[0].identity["items"] != shares[1].describe()[0].identity["items"]
 
 
 def test_fields_agree_with_their_documentation(written):
-    root, samples = written
+    root, (part, _), samples = written
     record = json.loads((root / "000001.json").read_text())
     P = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])
+    half, centre = np.ptp(part.cuboid, axis=0) / 2, part.cuboid[8]
     for item, instance in zip(record["objects"], samples[1].instances, strict=True):
         R, t = instance.T_cam_obj[:3, :3], instance.T_cam_obj[:3, 3]
-        np.testing.assert_allclose(
-            Rotation.from_quat(item["quaternion_xyzw"]).as_matrix(), R, atol=1e-12
-        )
+        turned = Rotation.from_quat(item["quaternion_xyzw"]).as_matrix()
+        np.testing.assert_allclose(turned, R, atol=1e-12)
         np.testing.assert_allclose(item["location"], 100 * t, atol=1e-10)
         # The readme of Falling Things: the rotation is Aᵀ·P of the stored matrix A.
         A = np.array(item["pose_transform"])
         np.testing.assert_allclose(A[:3, :3].T @ P, R, atol=1e-12)
         np.testing.assert_allclose(A[3], [*(100 * t), 1], atol=1e-10)
-        part = {"box": BOX, "cube": CUBE}[item["class"]]
-        half, centre = np.ptp(part.cuboid, axis=0) / 2, part.cuboid[8]
         corners = 100 * ((centre + SIGNS * half) @ R.T + t)
         np.testing.assert_allclose(item["cuboid"], corners, atol=1e-9)
         np.testing.assert_allclose(item["cuboid_centroid"], 100 * (R @ centre + t), atol=1e-9)
-        pixels, _ = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), K, None)
+        pixels, _ = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), samples[1].K, None)
         np.testing.assert_allclose(item["projected_cuboid"], pixels[:, 0], atol=1e-6)
         x, y, width, height = cv2.boundingRect(instance.mask.astype(np.uint8))
         assert item["bounding_box"]["top_left"] == [y, x]
         assert item["bounding_box"]["bottom_right"] == [y + height - 1, x + width - 1]
     camera = json.loads((root / "_camera_settings.json").read_text())["camera_settings"][0]
-    assert camera["intrinsic_settings"]["fx"] == 180.0
-    assert camera["captured_image_size"] == {"width": WIDTH, "height": HEIGHT}
+    assert camera["intrinsic_settings"]["fx"] == 150.0
+    assert camera["captured_image_size"] == {"width": 128, "height": 128}
     exported = json.loads((root / "_object_settings.json").read_text())["exported_objects"]
-    np.testing.assert_allclose(exported[0]["cuboid_dimensions"], [8, 5, 3])
+    np.testing.assert_allclose(exported[0]["cuboid_dimensions"], [6, 4, 2.4])
 
 
-def test_interrupted_writing_goes_on(tmp_path):
-    writer = NddsWriter(tmp_path, [BOX, CUBE])
-    writer.prepare()
-    writer.write(3, make_sample(3))
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    (tmp_path / "000004.png").write_bytes(b"half an image")  # killed before its annotation
-    again = NddsWriter(tmp_path, [BOX, CUBE])
-    again.prepare()
-    assert again.written(0) == {3}
-    assert again.written(1) == set()
-    again.write(4, make_sample(4))
-    again.write(3, make_sample(3))
-    assert again.written(0) == {3, 4}
-    assert {name: (tmp_path / name).read_bytes() for name in before} == before
-    again.write(1_234_567, make_sample(5))
-    assert again.written(1234) == {1_234_567}
-
-
-def test_settings_are_written_for_one_camera_only(tmp_path, write_set):
-    other = make_sample(1)
-    other.K = camera_matrix(200.0, 200.0, 79.0, 60.0)
-    write_set(NddsWriter, tmp_path, [BOX, CUBE], [make_sample(0), other])
+def test_settings_are_written_for_one_camera_only(tmp_path, write_set, boxes):
+    parts, (first, second, _) = boxes
+    other = replace(second, K=camera_matrix(200.0, 200.0, 79.0, 60.0))
+    write_set(NddsWriter, tmp_path, parts, [first, other])
     assert not (tmp_path / "_camera_settings.json").exists()
-    NddsWriter(tmp_path, [BOX, CUBE]).finalize(0, [0])
+    writer = NddsWriter(tmp_path, parts)
+    writer.finalize(0, [0])
     assert (tmp_path / "_camera_settings.json").exists()
+    writer.write(1_234_567, first)
+    assert writer.written(1234) == {1_234_567}
 
 
-def test_writer_refuses_foreign_folders(tmp_path):
-    NddsWriter(tmp_path / "a", [BOX]).prepare()
-    NddsWriter(tmp_path / "a", [BOX]).prepare()
+def test_writer_refuses_foreign_folders(tmp_path, boxes):
+    for _ in range(2):
+        NddsWriter(tmp_path / "a", boxes[0]).prepare()
     with pytest.raises(UserError, match=r"_object_settings\.json of other parts"):
-        NddsWriter(tmp_path / "a", [CUBE]).prepare()
+        NddsWriter(tmp_path / "a", boxes[0][:1]).prepare()
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "holiday.jpg").touch()
     with pytest.raises(UserError, match=r"holiday\.jpg in .*/b, which no NDDS writer"):
-        NddsWriter(tmp_path / "b", [BOX]).prepare()
+        NddsWriter(tmp_path / "b", boxes[0]).prepare()
 
 
-def test_samples_without_masks_depth_or_instances(tmp_path, write_set):
-    bare, empty = make_sample(0, (BOX,)), make_sample(1, ())
-    bare.depth, bare.instances[0].mask = None, None
-    write_set(NddsWriter, tmp_path, [BOX], [bare, empty])
-    source = NddsReader(tmp_path, [BOX])
+def test_samples_without_masks_depth_or_instances(tmp_path, write_set, boxes):
+    parts, (first, second, _) = boxes
+    bare = replace(first, depth=None, instances=[replace(first.instances[0], mask=None)])
+    write_set(NddsWriter, tmp_path, parts, [bare, replace(second, instances=[])])
+    source = NddsReader(tmp_path, parts)
     assert source.sample(0).depth is None
     assert source.sample(0).instances[0].mask is None
     assert source.sample(1).instances == []
 
 
-def test_corner_behind_the_camera_survives(tmp_path, write_set):
-    sample = make_sample(0, (BOX, BOX))
-    T = sample.instances[0].T_cam_obj
+def test_corner_behind_the_camera_survives(tmp_path, write_set, boxes):
+    (part, _), samples = boxes
+    T = samples[0].instances[0].T_cam_obj.copy()
     T[:3, 3] = [0, 0, 0.02]
-    sample.instances[0].keypoints = project_keypoints(BOX.cuboid, T, K)
-    assert np.isnan(sample.instances[0].keypoints).any()
-    others = [make_sample(index, (BOX,)) for index in (1, 2)]
-    write_set(NddsWriter, tmp_path, [BOX], [sample, *others])
-    back = NddsReader(tmp_path, [BOX]).sample(0).instances[0]
+    keypoints = project_keypoints(part.cuboid, T, samples[0].K)
+    assert np.isnan(keypoints).any()
+    near = replace(samples[0].instances[0], T_cam_obj=T, keypoints=keypoints)
+    near = replace(samples[0], instances=[near, samples[0].instances[1]])
+    write_set(NddsWriter, tmp_path, boxes[0], [near, *samples[1:]])
+    back = NddsReader(tmp_path, boxes[0]).sample(0).instances[0]
     np.testing.assert_allclose(back.T_cam_obj, T, atol=1e-12)
-    np.testing.assert_allclose(back.keypoints, sample.instances[0].keypoints, atol=1e-6)
+    np.testing.assert_allclose(back.keypoints, keypoints, atol=1e-6)
 
 
 class Wild:
