@@ -130,7 +130,7 @@ class Side:
         import torch
 
         from dopepp.experiment.results.cost import likely_maps
-        from dopepp.maps.encode import MapGeometry
+        from dopepp.maps.codec import MapGeometry
 
         own, generator = self.estimator, torch.Generator().manual_seed(0)
         geometry = MapGeometry(own.network.stride, own.recovery.sigma)

@@ -20,8 +20,8 @@ FLOOR: Final = 1e-6
 needs its third column, which is as low as e⁻¹²·⁵ = 4e-6."""
 
 FIRST_MARGIN: Final = 3.0
-"""Squared cells by which a cell must be nearer to its peak than to another: both lie anywhere
-within their own cells. Of 1 to 4, 3 gave the smallest errors on pairs of peaks 3σ to 4σ apart."""
+"""Squared cells by which a cell must be nearer to its peak than to another, whose positions within
+their own cells are unknown."""
 
 MARGIN: Final = 1.0
 """The same once both positions are fitted."""
@@ -183,9 +183,8 @@ def _own_cells(
 
     Of Gaussians s·exp(−d²/2σ²) the highest in a cell is that with the smallest d² − 2σ² log s.
     """
-    side = windows.shape[1]
+    side, highest = windows.shape[1], 0
     half = side // 2
-    highest = 0
     for y in range(side):
         for x in range(side):
             own[y, x] = math.isfinite(windows[i, y, x])
@@ -227,9 +226,7 @@ def _fit_logarithm(
     theta: Array,
 ) -> None:
     """Write the weighted linear least-squares fit of log b over its peak, with the prior's pull."""
-    side = len(window)
-    half = side // 2
-    curvature = 0.5 / sigma**2
+    side, half, curvature = len(window), len(window) // 2, 0.5 / sigma**2
     theta[:] = 0.0
     theta[3] = theta[5] = curvature
     work[:] = 0.0
@@ -264,8 +261,7 @@ def _linearised(
 
     Returned are Σ residual² and the number of cells.
     """
-    side = len(window)
-    half = side // 2
+    side, half = len(window), len(window) // 2
     squared, used = 0.0, 0.0
     work[:] = 0.0
     for y in range(side):

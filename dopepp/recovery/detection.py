@@ -14,26 +14,24 @@ from dopepp.geometry.camera import CameraMatrix, Transform, project_keypoints
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
 from dopepp.geometry.pnp import PnPResult, solve_pnp
 from dopepp.geometry.refine import MIN_POINTS, too_few
-from dopepp.maps.peaks import Peaks
+from dopepp.maps.codec import Peaks
 from dopepp.recovery.association import KeypointGroup, ObjectPeaks, associate, direction_evidence
 
 SIGMA_FLOOR_PX: Final = 1.0
-"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one. On a
-trained network's maps 1 px did as well as 2 and better than 0.5."""
+"""No peak is trusted beyond this: it bounds the weight of a clean peak against a blurred one."""
 
 WIDENINGS: Final = (1.0, 2.0, 4.0)
 """Factors on the peaks' standard deviations, tried in turn until most keypoints agree."""
 
 ROUNDS: Final = 3
-"""Most turns of grouping and solving; in crowds one or two change anything."""
+"""Most turns of grouping and solving."""
 
 BORDER: Final = 1.0
 """Distance from the maps' border within which a peak may be that of a keypoint beyond, cells."""
 
 BORDER_DEVIATION: Final = 0.75
-"""Error of such a peak, cells: half a network's belief lies where there are no cells, so the peak
-is pulled inward. Two trained networks' peaks were off by 0.3 to 0.5 cells on average there, by
-0.75 in the root mean square, and by nothing on average two cells further in."""
+"""Error of such a peak, cells (root mean square of trained networks): half of the belief lies where
+there are no cells, so the peak is pulled inward."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +52,10 @@ class Detection:
         covariance: Of a small turn about the object's origin (rotation vector in the camera
             frame, radians) and a small shift (camera frame, metres), from the peaks' covariances.
         kept: Why a refinement that was asked for kept the network's pose; empty elsewhere.
-        agreement: Share of what the picture tells about the refined outline that agrees with it, in
-            [0, 1]; None where none was refined.
-        support: Share of the refined outline that the picture tells about and that agrees, in
-            [0, 1]: what is hidden has none. None where none was refined.
+        agreement: Share of the image's evidence about the refined outline that agrees with it, in
+            [0, 1]; None without refinement.
+        support: Share of the refined outline that has agreeing evidence, in [0, 1], which hidden
+            outline has not; None without refinement.
     """
 
     object: str

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from dopepp.geometry.camera import CameraMatrix
 from dopepp.geometry.cuboid import CENTROID, NUM_CORNERS, NUM_KEYPOINTS, Cuboid
-from dopepp.maps.encode import Beliefs, Fields, MapGeometry
-from dopepp.maps.peaks import find_peaks
+from dopepp.maps.codec import Beliefs, Fields, MapGeometry, find_peaks
 from dopepp.recovery.association import ObjectPeaks
 from dopepp.recovery.calibration import RecoveryOptions, calibrated
 from dopepp.recovery.detection import Detection, make_detection, peaks_of_object, pose_instances

@@ -22,7 +22,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from dopepp.core.errors import RunError
 from dopepp.data.batch import Batch
-from dopepp.maps.encode import Beliefs, Fields, MapGeometry
+from dopepp.maps.codec import Beliefs, Fields, MapGeometry
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss
 from dopepp.models.network import PoseNetwork

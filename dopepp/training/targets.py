@@ -22,7 +22,7 @@ from dopepp.core.validation import Range, check_fields
 from dopepp.data.batch import PADDING, Batch
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_vector_to_matrix
-from dopepp.maps.encode import Beliefs, Fields, MapGeometry, encode
+from dopepp.maps.codec import Beliefs, Fields, MapGeometry, encode
 from dopepp.metrics.pose import MIN_VISIBLE_FRACTION
 from dopepp.models.heads import Stage
 from dopepp.models.losses import MapLoss

@@ -10,7 +10,7 @@ from dopepp.geometry.camera import camera_matrix, make_transform, project_keypoi
 from dopepp.geometry.cuboid import cuboid_keypoints
 from dopepp.geometry.pnp import solve_pnp
 from dopepp.maps import MapGeometry, encode
-from dopepp.maps.peaks import Peaks
+from dopepp.maps.codec import Peaks
 from dopepp.recovery import Reason, explain, recover, recover_batch
 from dopepp.recovery.detection import BORDER_DEVIATION, peaks_of_object
 from dopepp.recovery.recover import explained, furthest, summary

@@ -12,7 +12,7 @@ from dopepp.data.batch import Batch
 from dopepp.data.datamodule import PoseDataModule
 from dopepp.data.sample import Instance, Sample, SourceInfo
 from dopepp.data.sources.rendered import RenderedSource, Split
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint
 from dopepp.models.losses import SpatialCrossEntropy
 from dopepp.models.network import build_network

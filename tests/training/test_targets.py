@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dopepp.data.batch import PADDING, Batch
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.codec import MapGeometry
 from dopepp.training.targets import Targets, draw_maps
 
 

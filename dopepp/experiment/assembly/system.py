@@ -22,7 +22,7 @@ from dopepp.data.datamodule import PoseDataModule
 from dopepp.experiment import program
 from dopepp.experiment.assembly.registries import CALLBACKS, optimizer_factory, scheduler_factory
 from dopepp.experiment.config.run import MapsConfig, RunConfig, TrainerConfig
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.codec import MapGeometry
 from dopepp.models.checkpoint import Checkpoint, load_network
 from dopepp.models.network import LOSSES, PoseNetwork, build_network
 from dopepp.parts.part import Part

@@ -40,7 +40,7 @@ from dopepp.experiment.results.report import Cost
 from dopepp.geometry.camera import Letterbox
 from dopepp.inference.estimator import Maps, PoseEstimator
 from dopepp.inference.picture import letterboxed
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.codec import MapGeometry
 from dopepp.models.network import build_network, network_cost
 from dopepp.training.targets import draw_maps
 

@@ -23,7 +23,7 @@ from dopepp.experiment.results.cost import (
 )
 from dopepp.experiment.run.train import do_job
 from dopepp.geometry.camera import transform
-from dopepp.maps.encode import MapGeometry
+from dopepp.maps.codec import MapGeometry
 
 SMALL = ("scale=laptop", "data.input_size=[32,32]", "cost.num_frames=4", "cost.batch_size=2")
 
