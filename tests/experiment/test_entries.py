@@ -66,6 +66,8 @@ def test_a_refused_run_leaves_what_was_there(call, tiny_options, tmp_path):
         (["model", "="], "dopepp_", ["dopepp_fast"]),  # as bash splits it
         ([], "recip", ["recipe=ours", "recipe=paper"]),
         (["recipe=paper"], "trainer.max_ep", ["trainer.max_epochs=60"]),
+        ([], "virtual.scene.sensors.noise", ["virtual.scene.sensors.noise_probability=0.5"]),
+        (["virtual.preset=wide"], "virtual.scene.hor", ["virtual.scene.horizontal_fov_deg=60.0"]),
         ([], "no_such", []),
     ],
 )

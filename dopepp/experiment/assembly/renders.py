@@ -18,7 +18,7 @@ from dopepp.parts.catalogue import with_meshes
 from dopepp.parts.part import Parts
 from dopepp.virtual.backgrounds import find_backgrounds
 from dopepp.virtual.factory import Factory, code_hash
-from dopepp.virtual.presets import Preset, preset_of
+from dopepp.virtual.presets import Preset
 
 
 def training_renders(data: DataConfig, parts: Parts, seed: int) -> DescribedSource:
@@ -76,7 +76,7 @@ def validation_renders(
     their own; those of a camera that the checkpoint was trained for keep theirs.
     """
     data = chosen_data({}, {}, trained_on(checkpoint.data), str(path))
-    virtual = replace(data.virtual, preset=_preset_name(data))
+    virtual = replace(data.virtual, preset=data.preset_name)
     data = replace(data, root=None, objects=None, virtual=virtual, num_val=count)
     if size is not None and data.virtual.view is None:
         scene = {**(data.virtual.scene or {}), "width": size[0], "height": size[1]}
@@ -98,25 +98,17 @@ def kept(
 
 def choose_preset(data: DataConfig) -> Preset:
     """Return the preset with the config's changes, at the size of a camera's whole pictures."""
-    preset, view = _customised(data), data.virtual.view
+    preset, view = data.preset, data.virtual.view
     return preset if view is None else view.whole(preset, data.virtual.camera_scale or 1.0)
 
 
 def seen_preset(data: DataConfig) -> Preset:
     """Return the same scenes as the network sees them: resized, or in windows of such pictures."""
-    preset, view = _customised(data), data.virtual.view
+    preset, view = data.preset, data.virtual.view
     if view is not None:
         return view.window(preset, data.virtual.camera_scale or 1.0, data.network_input)
     box = Letterbox.fit((preset.width, preset.height), data.network_input)
     return preset.resized(box.width, box.height)
-
-
-def _customised(data: DataConfig) -> Preset:
-    return preset_of(_preset_name(data), data.virtual.scene, "virtual.scene")
-
-
-def _preset_name(data: DataConfig) -> str:
-    return data.virtual.preset or ("paper" if data.root is None else "ycb")
 
 
 def _factory(data: DataConfig, parts: Parts, preset: Preset, seed: int, renderer: str) -> Factory:

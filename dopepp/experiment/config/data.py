@@ -14,6 +14,7 @@ from dopepp.core.errors import UserError
 from dopepp.core.validation import STRICT, Range, parse, shown
 from dopepp.data.sources.rendered import MAX_ITEMS, Split
 from dopepp.geometry.camera import camera_matrix
+from dopepp.virtual.presets import Preset, preset_of
 from dopepp.virtual.presets.view import View, read_lens
 
 Node = Mapping[str, Any]
@@ -54,7 +55,7 @@ class VirtualConfig:
     Attributes:
         preset: Name of the scenes' description (:mod:`dopepp.virtual.presets`); None takes ``ycb``
             with a ``data.root``, else ``paper``.
-        scene: Fields of the preset that are changed.
+        scene: Fields of the preset that are changed (:class:`~dopepp.virtual.presets.Preset`).
         backgrounds: Folder of photos, ``skimage`` for its own photos; None for procedural pictures.
         negatives: Parts that are shown but must not be found: built-in names or mesh files. Of a
             BOP data set, models that are none of ``data.objects`` are shown anyway.
@@ -193,7 +194,9 @@ class DataConfig:
         if isinstance(data, Mapping) and "virtual" in data:
             got = f"data.virtual={shown(data['virtual'])}"
             raise UserError(got, "virtual.… alone", "set virtual.…")
-        return replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
+        parsed = replace(parse(cls, data, "data"), virtual=VirtualConfig.of(virtual))
+        _ = parsed.preset  # refuses a wrong field before anything is rendered
+        return parsed
 
     def __post_init__(self) -> None:
         if any(side < 1 or side % _MULTIPLE for side in self.input_size or ()):
@@ -202,6 +205,16 @@ class DataConfig:
                 f"[width, height], each a multiple of {_MULTIPLE}",
                 "round up; images are letterboxed into it",
             )
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the scenes' description."""
+        return self.virtual.preset or ("paper" if self.root is None else "ycb")
+
+    @property
+    def preset(self) -> Preset:
+        """The scenes that are rendered, ``virtual.scene``'s changes included."""
+        return preset_of(self.preset_name, self.virtual.scene, "virtual.scene")
 
     @property
     def network_input(self) -> tuple[int, int]:
@@ -249,7 +262,9 @@ def chosen_data(data: Node | None, virtual: Node | None, stored: object, source:
         chosen = DataConfig.of(merged, None)
         if not virtual and how is None and not chosen.is_rendered("test"):
             return chosen
-        return replace(chosen, virtual=_chosen_virtual(virtual or {}, how, source))
+        chosen = replace(chosen, virtual=_chosen_virtual(virtual or {}, how, source))
+        _ = chosen.preset
+        return chosen
     except UserError as error:
         if whole or error.got.startswith(source):
             raise

@@ -43,9 +43,9 @@ def test_the_checkpoints_own_data_by_default(evaluated, stored, trained):
 def test_single_options_replace_the_stored_ones(evaluated, stored, trained):
     data = evaluated(
         stored, "++data.num_test=7", "data/test=photoreal", "++data.image_sets.test=other",
-        "++virtual.preset=table", "++virtual.scene.turning.tilt_deg=10",
+        "++virtual.preset=wide", "++virtual.scene.turning.tilt_deg=10",
     )  # fmt: skip
-    virtual = replace(trained.data.virtual, preset="table", scene={"turning": {"tilt_deg": 10}})
+    virtual = replace(trained.data.virtual, preset="wide", scene={"turning": {"tilt_deg": 10}})
     test = replace(trained.data.test, renderer="photoreal", cache="disk")
     sets = {**trained.data.image_sets, "test": "other"}
     assert data == replace(trained.data, num_test=7, test=test, image_sets=sets, virtual=virtual)
