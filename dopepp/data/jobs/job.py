@@ -44,14 +44,9 @@ WRITERS: Final = {
 }
 """Module and class of each layout's writer."""
 
-RECORD_VERSION: Final = 1
-"""Of the record's layout."""
-
-_HASH_DIGITS: Final = 16
-"""Of the hash of the code that renders, enough to tell versions apart."""
-
-_NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")
-"""``NAME=FILE``; a name is not a path."""
+RECORD_VERSION: Final = 1  # of the record's layout
+_HASH_DIGITS: Final = 16  # of the hash of the code that renders, enough to tell versions apart
+_NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a path
 
 
 @dataclass(frozen=True)
@@ -218,11 +213,8 @@ def _part_record(part: Part) -> dict[str, Any]:
     }
 
 
-_MAX_RECORD_BYTES: Final = 4_000_000
-"""Some 10,000 parts."""
-
-_MAX_DIFFERENCES: Final = 3
-"""As many as one line can hold."""
+_MAX_RECORD_BYTES: Final = 4_000_000  # some 10,000 parts
+_MAX_DIFFERENCES: Final = 3  # as many as one line can hold
 
 
 def is_begun(root: Path) -> bool:

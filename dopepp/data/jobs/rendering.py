@@ -41,9 +41,7 @@ _log = logging.getLogger(__name__)
 
 ENGINES: Final = ("local", "ray")
 
-MAX_WORKERS: Final = 1024
-"""More processes than any machine here has cores: a slip of the keyboard."""
-
+MAX_WORKERS: Final = 1024  # more processes than any machine here has cores: a slip of the keyboard
 _LINE_EVERY_S: Final = 30.0
 
 OpenPool = Callable[[bytes], Pool]

@@ -31,9 +31,7 @@ MARGIN_MM: Final = 10
 
 LONGEST_MM: Final = 1200
 
-MIN_POINTS: Final = 8
-"""Fewer do not tell a board's turn from its distance."""
-
+MIN_POINTS: Final = 8  # fewer do not tell a board's turn from its distance
 SPELLING: Final = (
     "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], chess:COLUMNSxROWS:SQUARE (inner corners), "
     "circles:COLUMNSxROWS:SPACING (asymmetric); lengths in mm"
@@ -42,9 +40,7 @@ SPELLING: Final = (
 DICTIONARY: Final = "5X5_100"
 
 
-PIXEL_NOISE: Final = 0.1
-"""Of a found point, pixels, where the picture itself shows less."""
-
+PIXEL_NOISE: Final = 0.1  # of a found point, pixels, where the picture itself shows less
 OVERSAMPLED: Final = 2
 
 BACKGROUND: Final = 110

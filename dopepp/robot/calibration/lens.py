@@ -19,21 +19,15 @@ from dopepp.robot.calibration.board import MIN_POINTS, Sighting
 
 Size = tuple[int, int]
 
-MIN_VIEWS: Final = 6
-"""Of a trustworthy calibration; three would give a K."""
-
-CELLS: Final = (8, 6)
-"""Of a picture, columns and rows, in which points are counted."""
-
+MIN_VIEWS: Final = 6  # of a trustworthy calibration; three would give a K
+CELLS: Final = (8, 6)  # of a picture, columns and rows, in which points are counted
 MIN_COVERAGE: Final = 0.5
 MIN_TILT: Final = 0.2
 """Standard deviation of the boards' normals: about 12°, from which on focal length and distance
 are told from each other."""
 
 MAX_ERROR_PX: Final = 1.0
-OUTLIER: Final = 3.0
-"""Times the median view's error, from which on a view is left out."""
-
+OUTLIER: Final = 3.0  # times the median view's error, from which on a view is left out
 LEAST_OUTLIER_PX: Final = 0.5
 
 
@@ -42,8 +36,7 @@ APART: Final = 0.04
 
 MAX_VIEWS: Final = 60
 
-LOOKS_PER_S: Final = 5.0
-"""How often a video is looked at."""
+LOOKS_PER_S: Final = 5.0  # how often a video is looked at
 
 
 class Views:

@@ -29,32 +29,21 @@ from dopepp.robot.calibration.hand_eye import (
 )
 from dopepp.robot.calibration.tool import named
 
-MIN_TURN: Final = np.radians(5.0)
-"""Between the two poses that are farthest from each other."""
-
-TURN: Final = np.radians(1.5)
-"""Median disagreement of pairs' turns below which a reading is right."""
-
-SHIFT: Final = 0.01
-"""The same of shifts, metres."""
-
+MIN_TURN: Final = np.radians(5.0)  # between the two poses that are farthest from each other
+TURN: Final = np.radians(1.5)  # median disagreement of pairs' turns below which a reading is right
+SHIFT: Final = 0.01  # the same of shifts, metres
 MOUNTS: Final[tuple[Mount, Mount]] = ("hand", "bench")
 
-SCALE: Final = 1.03
-"""Factor between robot's and camera's lengths that is none."""
-
+SCALE: Final = 1.03  # factor between robot's and camera's lengths that is none
 MIN_POSES: Final = 8
 
 MIN_DIVERSITY: Final = np.radians(15.0)
 """Of turns about the second most common axis, RMS over pairs."""
 
-MAX_ERROR: Final = 0.003
-"""Of a part at the board's distance, metres, one standard deviation."""
-
+MAX_ERROR: Final = 0.003  # of a part at the board's distance, metres, one standard deviation
 MAX_TURN: Final = np.radians(0.5)
 
-MIN_USED: Final = 0.7
-"""Share of the poses that agree with each other."""
+MIN_USED: Final = 0.7  # share of the poses that agree with each other
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ MIN_POSES: Final = 4
 MAX_AMPLIFICATION: Final = 6.0
 """From a pose's error to the tip's: about 25° between the farthest poses."""
 
-MAX_RESIDUAL: Final = 0.002
-"""Metres: more is no point that was touched."""
+MAX_RESIDUAL: Final = 0.002  # metres: more is no point that was touched
 
 
 @dataclass(frozen=True, eq=False)

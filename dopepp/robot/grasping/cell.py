@@ -38,14 +38,11 @@ HOME: Final = np.radians([-90.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 JOINTS: Final = 6
 
-DENSITY: Final = 1200.0
-"""Of a printed part, kg/m³."""
-
+DENSITY: Final = 1200.0  # of a printed part, kg/m³
 FRICTION: Final = 0.5
 """Of a part on the bench and on others; on the finger pads it is theirs, 0.6 and 0.7."""
 
-STEP: Final = 0.002
-"""Of the simulation, seconds."""
+STEP: Final = 0.002  # of the simulation, seconds
 
 FLANGE, GRIPPER, CAMERA = "attachment_site", "gripper/", "wrist"
 

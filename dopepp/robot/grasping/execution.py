@@ -13,9 +13,7 @@ from jaxtyping import Float
 from dopepp.robot.grasping.cell import JOINTS, STEP, Cell
 from dopepp.robot.grasping.planner import Gripper, Joints, Path, Plan
 
-SPEED: Final = 1.5
-"""Fastest joint, rad/s, on average over a motion."""
-
+SPEED: Final = 1.5  # fastest joint, rad/s, on average over a motion
 CLOSING_S: Final = 0.5
 """Seconds over which the fingers' command ramps; it ends beyond zero width, so that they press."""
 
@@ -29,17 +27,12 @@ SHAKE_HZ: Final = 3.0
 SHAKE: Final = np.radians([0.0, 0.0, 0.0, 7.0, 7.0, 12.0])
 """The wrist's swings, radians: about 1 g at the part."""
 
-HELD_HEIGHT: Final = 0.05
-"""Metres above where it lay at which a part counts as held."""
-
-HIT_FORCE: Final = 5.0
-"""Newtons from which on a touch before the fingers close is a collision."""
-
+HELD_HEIGHT: Final = 0.05  # metres above where it lay at which a part counts as held
+HIT_FORCE: Final = 5.0  # newtons from which on a touch before the fingers close is a collision
 LAG_S: Final = 0.2
 """Damping over stiffness of the arm's servos: what a command leads by at a joint's speed."""
 
-FRAME_S: Final = 0.04
-"""Seconds from frame to frame of a recording."""
+FRAME_S: Final = 0.04  # seconds from frame to frame of a recording
 
 
 @dataclass
@@ -150,6 +143,7 @@ def _timed(path: Path) -> Iterator[tuple[Joints, Joints]]:
 
 
 def _shaken(joints: Joints) -> Iterator[tuple[Joints, Joints]]:
+    """Yield joints and their speeds as the wrist swings."""
     times = np.arange(0, SHAKE_S, STEP)
     fade = np.sin(np.pi * times / SHAKE_S) ** 0.5
     swings = (fade * np.sin(2 * np.pi * SHAKE_HZ * times))[:, None] * SHAKE

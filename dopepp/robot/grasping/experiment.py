@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -51,30 +51,31 @@ SOURCES: Final[dict[str, tuple[Source, ...]]] = {
 
 def parse_sources(text: str) -> tuple[Source, ...]:
     """Return the sources of a list with commas; a :class:`UserError` where one is unknown."""
-    names = [one.strip() for one in text.split(",")]
-    for one in names:
-        if one not in SOURCES:
-            raise UserError(f"--poses {one}", ", ".join(SOURCES), "separate several by commas")
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        _choose("--poses", name, SOURCES)
     return tuple(source for name in dict.fromkeys(names) for source in SOURCES[name])
+
+
+def _choose(option: str, value: str, allowed: Iterable[str]) -> None:
+    if value not in allowed:
+        raise UserError(f"{option} {value}", ", ".join(allowed), f"change {option}")
 
 
 def check_task(task: Task, poses: str, count: int) -> Task:
     """Return a task with its sources of poses, checked before anything slow is done.
 
-    A :class:`UserError`: an option is none there is, or the part has no network or no grasp.
+    Raises:
+        UserError: An option has a value that is not allowed, or the part no network or no grasp.
     """
-    for name, value, allowed in (
-        ("--layout", task.layout, LAYOUTS),
-        ("--renderer", task.renderer, RENDERERS),
-        ("--rest", task.rest, ("front", "any")),
-    ):
-        if value not in allowed:
-            raise UserError(f"{name} {value}", ", ".join(allowed), "pass one of these")
+    _choose("--layout", task.layout, LAYOUTS)
+    _choose("--renderer", task.renderer, RENDERERS)
+    _choose("--rest", task.rest, ("front", "any"))
     check("-n", count, int, Range(1, MAX_TRIALS))
-    check("--yaw", task.yaw_deg, float, Range(0.0, 180.0, "degrees"))
+    check("--yaw", task.yaw_deg, float, Range(0, 180, "degrees"))
     sources = parse_sources(poses)
-    needed = any(one.kind == "network" for one in sources)
-    if needed and task.network is None:
+    needs_network = any(source.kind == "network" for source in sources)
+    if needs_network and task.network is None:
         raise UserError(
             f"part {task.part} without a network", "a checkpoint of it, or exact or random poses",
             "pass --network CHECKPOINT, or --poses exact",
@@ -82,7 +83,7 @@ def check_task(task: Task, poses: str, count: int) -> Task:
     part = load_part(task.part, task.unit)
     find_grasps(part, task.grasps)
     convex_pieces(part)  # which takes a minute, once, and not in every process
-    return replace(task, sources=sources, network=task.network if needed else None)
+    return replace(task, sources=sources, network=task.network if needs_network else None)
 
 
 def make_experiment(
@@ -166,6 +167,12 @@ class _Attempts:
         return [self._trials.attempt(scene, source).record for source in self._task.sources]
 
 
+def _interval(count: int, trials: int) -> tuple[float, float]:
+    from dopepp.metrics.functional.rates import wilson_interval  # imports torch
+
+    return wilson_interval(count, trials)
+
+
 @dataclass(frozen=True)
 class Counts:
     """Of some trials."""
@@ -176,9 +183,7 @@ class Counts:
 
     def rate(self, count: int) -> str:
         """Return a count as a share with its Wilson interval."""
-        from dopepp.metrics.functional.rates import wilson_interval
-
-        low, high = wilson_interval(count, self.trials)
+        low, high = _interval(count, self.trials)
         return f"{100 * count / self.trials:.1f} % ({100 * low:.1f} – {100 * high:.1f})"
 
 
@@ -205,26 +210,19 @@ def table_9(records: Sequence[Record]) -> list[str]:
     ]
     for first in range(0, len(records), BLOCK):
         block, number = records[first : first + BLOCK], first // BLOCK
-        here = counted(block)
-        paper = PAPER[number] if number < len(PAPER) and len(block) == BLOCK else None
-        there = (
-            "| – | – |"
-            if paper is None
-            else f"| {paper[0]} ({2 * paper[0]} %) | {paper[1]} ({2 * paper[1]} %) |"
+        counts, paper = counted(block), "– | –"
+        if number < len(PAPER) and len(block) == BLOCK:
+            paper = " | ".join(f"{count} ({2 * count} %)" for count in PAPER[number])
+        ours = " | ".join(
+            f"{count} ({100 * count / counts.trials:.0f} %)"
+            for count in (counts.recognised, counts.caught)
         )
-        lines.append(
-            f"| {first + 1}–{first + len(block)} "
-            f"| {here.recognised} ({100 * here.recognised / here.trials:.0f} %) "
-            f"| {here.caught} ({100 * here.caught / here.trials:.0f} %) {there}"
-        )
-    whole = counted(records)
-    recognised, caught = (sum(one) for one in zip(*PAPER, strict=True))
-    paper_text = f"{Counts(200, 0, 0).rate(recognised)} | {Counts(200, 0, 0).rate(caught)}"
-    lines.append(
-        f"| all, with 95 % intervals | {whole.rate(whole.recognised)} "
-        f"| {whole.rate(whole.caught)} | {paper_text} |"
+        lines.append(f"| {first + 1}–{first + len(block)} | {ours} | {paper} |")
+    ours, paper = (
+        f"{counts.rate(counts.recognised)} | {counts.rate(counts.caught)}"
+        for counts in (counted(records), Counts(200, *map(sum, zip(*PAPER, strict=True))))
     )
-    return lines
+    return [*lines, f"| all, with 95 % intervals | {ours} | {paper} |"]
 
 
 def sources_table(records: Sequence[Record]) -> list[str]:
@@ -281,13 +279,12 @@ def write_report(folder: Path, records: Sequence[Record], facts: Mapping[str, An
 def curve(records: Sequence[Record]) -> Any:
     """Draw how often parts are caught by poses that are off."""
     from dopepp.drawing.curves import RateCurve, rates_figure
-    from dopepp.metrics.functional.rates import wilson_interval
 
     points = []
     for name, rows in by_source(records).items():
         if name.startswith(EXACT):
             here = counted(rows)
-            ends = wilson_interval(here.caught, here.trials)
+            ends = _interval(here.caught, here.trials)
             points.append((rows[0].off, here.caught / here.trials, *ends))
     x, rate, low, high = (np.array(one) for one in zip(*sorted(points), strict=True))
     return rates_figure(
@@ -297,18 +294,15 @@ def curve(records: Sequence[Record]) -> Any:
 
 
 def _summary(rows: Sequence[Record]) -> dict[str, Any]:
-    from dopepp.metrics.functional.rates import wilson_interval
-
-    here = counted(rows)
+    counts = counted(rows)
     return {
-        **asdict(here),
-        "recognised_interval": wilson_interval(here.recognised, here.trials),
-        "caught_interval": wilson_interval(here.caught, here.trials),
-        "failures": {name: sum(one.failure == name for one in rows) for name in FAILURES},
+        **asdict(counts),
+        "recognised_interval": _interval(counts.recognised, counts.trials),
+        "caught_interval": _interval(counts.caught, counts.trials),
+        "failures": {name: sum(row.failure == name for row in rows) for name in FAILURES},
     }
 
 
 def _plain(record: Record) -> dict[str, Any]:
     """Return a record for JSON, which knows no NaN."""
-    values = {one.name: getattr(record, one.name) for one in fields(record)}
-    return {name: None if value != value else value for name, value in values.items()}
+    return {name: None if value != value else value for name, value in asdict(record).items()}

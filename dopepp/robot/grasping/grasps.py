@@ -20,16 +20,17 @@ What is kept has much of the surface under both pads and is close to the centre 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dopepp.core.errors import UserError
 from dopepp.core.files import check_target, write_whole
+from dopepp.core.validation import STRICT, Range, parse
 from dopepp.core.yaml import read_yaml
 from dopepp.geometry.camera import Transform, make_transform
 from dopepp.geometry.rotation import Vector
@@ -38,9 +39,7 @@ from dopepp.virtual.body import make_body
 
 MAX_GRASPS: Final = 1000
 
-WIDEST: Final = 0.085
-"""Metres that the fingers open (2F-85)."""
-
+WIDEST: Final = 0.085  # metres that the fingers open (2F-85)
 CLEARANCE: Final = 0.006
 """Metres between each finger and the part as the fingers come down, where they open so far."""
 
@@ -52,24 +51,12 @@ INSERTIONS: Final = (0.009, 0.003)
 """How far the pads' ends go beyond a grasp's point, where there is room, metres: half a pad, or no
 deeper than what lies below may allow."""
 
-ABOVE_BENCH: Final = 0.001
-"""Metres that the pads' ends keep from the bench."""
-
-PAIRS: Final = 1500
-"""Points of the surface at which pairs are looked for."""
-
-FACES: Final = 8
-"""Faces, the commonest, on which a part may lie."""
-
-TRIED: Final = 100
-"""Pairs that are tried on every face."""
-
-SAMPLES: Final = 5000
-"""Points that stand for the surface where fingers are to go and to press."""
-
-THINNEST: Final = 0.002
-"""Metres between the pads below which nothing is gripped."""
-
+ABOVE_BENCH: Final = 0.001  # metres that the pads' ends keep from the bench
+PAIRS: Final = 1500  # points of the surface at which pairs are looked for
+FACES: Final = 8  # faces, the commonest, on which a part may lie
+TRIED: Final = 100  # pairs that are tried on every face
+SAMPLES: Final = 5000  # points that stand for the surface where fingers are to go and to press
+THINNEST: Final = 0.002  # metres between the pads below which nothing is gripped
 FRICTION_ANGLE: Final = math.radians(15.0)
 """Largest angle between the normals and the closing direction; friction 0.6 holds up to 31°."""
 
@@ -79,15 +66,9 @@ STEEPEST_CLOSING: Final = math.sin(math.radians(37.0))
 TILTS: Final = np.radians([0.0, 25.0, -25.0])
 """Of an approach from straight down, about the closing direction."""
 
-ENOUGH: Final = 80e-6
-"""Square metres under a pad from which on more is no better: a fifth of it."""
-
-LEAST: Final = 12e-6
-"""Square metres under each pad that hold a part."""
-
-FINGER: Final = 0.025
-"""How thick a finger is behind its pad, metres."""
-
+ENOUGH: Final = 80e-6  # square metres under a pad from which on more is no better: a fifth of it
+LEAST: Final = 12e-6  # square metres under each pad that hold a part
+FINGER: Final = 0.025  # how thick a finger is behind its pad, metres
 PALM: Final = np.array([[-0.075, -0.04, -0.16], [0.075, 0.04, -0.055]])
 """Corners of the gripper's body, in the frame of the pads' ends, metres."""
 
@@ -95,6 +76,9 @@ APART: Final = (0.008, math.radians(20.0))
 """Grasps of one face are at least so far apart, metres, or their approaches so turned."""
 
 _BUILT_IN: Final = Path(__file__).parent / "data"
+Points = Float[np.ndarray, "n 3"]
+
+FIX: Final = "correct it, or write one with `dopepp grasp propose`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +104,12 @@ class Grasp:
 
 
 def find_grasps(part: Part, path: Path | None = None) -> tuple[Grasp, ...]:
-    """Return a part's grasps, out of a file or the built-in ones.
+    """Return a part's grasps from a file or the built-in ones.
 
-    A :class:`UserError`: the file is none of this part, or there is none.
+    Raises:
+        UserError: The file is no file of this part's grasps, or there is none.
     """
-    chosen = _BUILT_IN / f"{part.name}.yaml" if path is None else path
+    chosen = path or _BUILT_IN / f"{part.name}.yaml"
     if path is None and not chosen.is_file():
         raise UserError(
             f"part {part.name} without a grasp", "a file of grasps for every part that is not "
@@ -134,18 +119,53 @@ def find_grasps(part: Part, path: Path | None = None) -> tuple[Grasp, ...]:
     return read_grasps(chosen, part)
 
 
+@dataclass(frozen=True)
+class _GraspRecord:
+    __pydantic_config__ = STRICT
+
+    point: tuple[float, float, float]
+    closing: tuple[float, float, float]
+    approach: tuple[float, float, float]
+    width: Annotated[float, Range(1e-4, WIDEST, "metres")]
+
+
+@dataclass(frozen=True)
+class _GraspFile:
+    __pydantic_config__ = STRICT
+
+    part: str
+    grasps: list[_GraspRecord]
+
+
 def read_grasps(path: Path, part: Part) -> tuple[Grasp, ...]:
-    """Read a file of grasps; a :class:`UserError` where it is none, or one of another part."""
-    content = read_yaml(path)
-    if not isinstance(content, Mapping) or set(content) != {"part", "grasps"}:
-        raise _refused(f"{path} without part: and grasps:", "both, and nothing else")
-    if content["part"] != part.name:
-        raise _refused(f"{path}, part: {content['part']!r:.100}", f"part: {part.name}")
-    listed = content["grasps"]
-    if not isinstance(listed, list) or not 0 < len(listed) <= MAX_GRASPS:
-        got = f"{path}, part {part.name} without a grasp"
-        raise _refused(got, f"a list of 1 to {MAX_GRASPS} grasps")
-    return tuple(_parsed(one, f"{path}, grasp {k + 1}", part) for k, one in enumerate(listed))
+    """Read a file of grasps.
+
+    Raises:
+        UserError: The file is no file of grasps, or is one of another part.
+    """
+    content = parse(_GraspFile, read_yaml(path), str(path), FIX)
+    if content.part != part.name:
+        raise UserError(f"{path}, part: {content.part!r:.100}", f"part: {part.name}", FIX)
+    if not 0 < len(content.grasps) <= MAX_GRASPS:
+        got = f"{path}, part {part.name} with {len(content.grasps)} grasps"
+        raise UserError(got, f"1 to {MAX_GRASPS} grasps", FIX)
+    return tuple(
+        _checked(record, f"{path}.grasps[{number}]", part)
+        for number, record in enumerate(content.grasps)
+    )
+
+
+def _checked(record: _GraspRecord, name: str, part: Part) -> Grasp:
+    point, closing, approach = map(np.array, (record.point, record.closing, record.approach))
+    lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
+    if not ((point >= lower) & (point <= upper)).all():
+        raise UserError(f"{name}.point={list(record.point)}", "a point of the part, metres", FIX)
+    lengths = [float(np.linalg.norm(direction)) for direction in (closing, approach)]
+    if min(lengths) < 1e-6 or abs(closing @ approach) > 0.02 * lengths[0] * lengths[1]:
+        raise UserError(name, "closing and approach at a right angle", FIX)
+    z = approach / lengths[1]
+    x = closing - (closing @ z) * z
+    return Grasp(point, x / np.linalg.norm(x), z, record.width)
 
 
 def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
@@ -160,45 +180,6 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
         )
         lines.append(f"- {{{vectors}, width: {round(one.width, 5):g}}}")
     write_whole(path, ("\n".join(lines) + "\n").encode())
-
-
-def _parsed(values: object, where: str, part: Part) -> Grasp:
-    names = {"point", "closing", "approach", "width"}
-    if not isinstance(values, Mapping) or set(values) != names:
-        raise _refused(where, "point, closing, approach and width")
-    point, closing, approach = (
-        _vector(values[name], f"{where}, {name}") for name in ("point", "closing", "approach")
-    )
-    lower, upper = part.cuboid.min(axis=0) - 0.01, part.cuboid.max(axis=0) + 0.01
-    if not ((point >= lower) & (point <= upper)).all():
-        raise _refused(f"{where}, point {point.tolist()}", "a point of the part, metres")
-    lengths = [float(np.linalg.norm(one)) for one in (closing, approach)]
-    if min(lengths) < 1e-6 or abs(closing @ approach) > 0.02 * lengths[0] * lengths[1]:
-        raise _refused(where, "closing and approach at a right angle")
-    width = values["width"]
-    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 0 < width < WIDEST:
-        allowed = f"metres, more than 0 and less than {WIDEST:g}, which the fingers open"
-        raise _refused(f"{where}, width {width!r:.50}", allowed)
-    z = approach / lengths[1]
-    x = closing - (closing @ z) * z
-    return Grasp(point, x / np.linalg.norm(x), z, float(width))
-
-
-def _vector(values: object, where: str) -> Float[np.ndarray, "3"]:
-    try:
-        found = np.array(values, np.float64)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise _refused(f"{where}: {values!r:.100}", "[x, y, z], three finite numbers")
-    return found
-
-
-def _refused(got: str, allowed: str) -> UserError:
-    return UserError(got, allowed, "correct it, or write one with `dopepp grasp propose`")
-
-
-Points = Float[np.ndarray, "n 3"]
 
 
 def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:

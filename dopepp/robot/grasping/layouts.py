@@ -14,9 +14,7 @@ from dopepp.parts.part import Part
 from dopepp.robot.grasping.cell import TRAY, Thing, convex_pieces
 from dopepp.virtual.body import Body, distractor_shapes, make_body
 
-SPREAD: Final = 0.025
-"""Radius of the circle in which a part's middle lies, metres."""
-
+SPREAD: Final = 0.025  # radius of the circle in which a part's middle lies, metres
 HEAP: Final = (3, 5)
 HEAP_SPREAD: Final = 0.05
 HEAP_TILT: Final = 15.0

@@ -30,32 +30,17 @@ Joints = Float[np.ndarray, "6"]
 Path = Float[np.ndarray, "waypoints 6"]
 
 POSITION_TOLERANCE: Final = 1e-4
-ANGLE_TOLERANCE: Final = 1e-3
-"""Metres and radians within which a pose is reached."""
-
-STEPS: Final = 60
-"""Of inverse kinematics; a reachable pose takes about ten."""
-
-COMMANDS: Final = np.linspace(0.0, 255.0, 18)
-"""Of the gripper, open to closed."""
-
+ANGLE_TOLERANCE: Final = 1e-3  # metres and radians within which a pose is reached
+STEPS: Final = 60  # of inverse kinematics; a reachable pose takes about ten
+COMMANDS: Final = np.linspace(0.0, 255.0, 18)  # of the gripper, open to closed
 LOW: Final = 0.005
 """How far the middle of a part that lies on the bench may seem to be off its height, metres."""
 
-STEEPEST: Final = np.radians(40.0)
-"""Largest angle between an approach and straight down."""
-
-RETREAT: Final = 0.06
-"""Metres from which the gripper comes straight."""
-
-LIFT: Final = 0.12
-"""Metres by which a part is lifted."""
-
-CHECKS: Final = 24
-"""Places of a path between two waypoints at which collisions are looked for."""
-
-PENETRATION: Final = 1e-4
-"""Metres from which on touching is a collision."""
+STEEPEST: Final = np.radians(40.0)  # largest angle between an approach and straight down
+RETREAT: Final = 0.06  # metres from which the gripper comes straight
+LIFT: Final = 0.12  # metres by which a part is lifted
+CHECKS: Final = 24  # places of a path between two waypoints at which collisions are looked for
+PENETRATION: Final = 1e-4  # metres from which on touching is a collision
 
 
 class Arm:

@@ -35,9 +35,7 @@ from dopepp.robot.calibration.tool import find_bench, find_tip
 from dopepp.robot.grasping.cell import JOINTS, TRAY
 from dopepp.robot.grasping.planner import Arm, Joints, Knowledge
 
-SIZE: Final[Size] = (640, 480)
-"""Of the camera's pictures, pixels."""
-
+SIZE: Final[Size] = (640, 480)  # of the camera's pictures, pixels
 FOCAL: Final = SIZE[0] / 2 / np.tan(np.radians(30.0))
 """Pixels: 60° across, as the released networks were trained."""
 
@@ -55,14 +53,12 @@ BRACKET: Final = (np.radians(1.0), 0.003)
 ZERO: Final = np.radians(0.02)
 """Standard deviation of a joint's zero, radians: 0.3 mm at the flange."""
 
-TOUCH: Final = 1e-4
-"""Standard deviation of a touch, metres along each axis."""
+TOUCH: Final = 1e-4  # standard deviation of a touch, metres along each axis
 
 TOUCHES, VIEWS = 8, 15
 BOARD: Final = "charuco:8x6:20:15"
 
-_DOWN: Final = np.diag([1.0, -1.0, -1.0])
-"""Rotation of a tool that looks straight down."""
+_DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that looks straight down
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,47 +119,44 @@ def calibrate(robot: Robot, arm: Arm, rng: Generator, distance: float) -> Calibr
     )  # fmt: skip
 
 
-def _stand(robot: Robot, arm: Arm, goal: Transform) -> tuple[Transform, Transform] | None:
-    """Lead the flange to a pose; return where it is and where it is read to be, None out of reach.
+Stand = tuple[Transform, Transform]
+"""T_base_flange where the flange is, and where the controller reads it to be."""
 
-    Both are T_base_flange.
-    """
+
+def _stand(robot: Robot, arm: Arm, goal: Transform) -> Stand | None:
+    """Lead the flange to a pose; None out of reach."""
     joints = arm.joints(goal)
     return None if joints is None else (arm.flange(joints), arm.flange(joints - robot.zero))
 
 
-def _gathered(
-    draw: Callable[[], tuple[Transform, Transform] | None], count: int
-) -> tuple[Float[np.ndarray, "poses 4 4"], Float[np.ndarray, "poses 4 4"]]:
-    """Draw poses until so many are in reach; return true and read ones."""
+def _gathered(draw: Callable[[], Stand | None], count: int) -> list[Stand]:
+    """Draw poses until so many are in reach."""
     drawn = (draw() for _ in range(4 * count))
-    found = [one for one in drawn if one is not None][:count]
-    if len(found) < count:
+    stands = [stand for stand in drawn if stand is not None][:count]
+    if len(stands) < count:
         raise RunError("the arm does not reach the poses of its calibration")
-    true, read = zip(*found, strict=True)
-    return np.stack(true), np.stack(read)
+    return stands
 
 
 def _pivoted(robot: Robot, arm: Arm, rng: Generator) -> Float[np.ndarray, "poses 4 4"]:
     """Return read poses of the flange in which the tip touches one point above the tray."""
 
-    def draw() -> tuple[Transform, Transform] | None:
+    def draw() -> Stand | None:
         turn = Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-1, 1)]).as_matrix()
         touched = TRAY + np.array([0.0, 0.0, 0.05]) + rng.normal(0, TOUCH, 3)
         return _stand(robot, arm, make_transform(_DOWN @ turn, touched - _DOWN @ turn @ robot.tip))
 
-    return _gathered(draw, TOUCHES)[1]
+    return np.stack([read for _, read in _gathered(draw, TOUCHES)])
 
 
 def _touched(robot: Robot, arm: Arm, rng: Generator, tip: Vector) -> Float[np.ndarray, "points 3"]:
     """Return points of the bench that the tip has touched, as the controller has them."""
 
-    def draw() -> tuple[Transform, Transform] | None:
+    def draw() -> Stand | None:
         touched = TRAY + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]) + rng.normal(0, TOUCH, 3)
         return _stand(robot, arm, make_transform(_DOWN, touched - _DOWN @ robot.tip))
 
-    read = _gathered(draw, TOUCHES)[1]
-    return np.stack([transform(one, tip) for one in read])
+    return np.stack([transform(read, tip) for _, read in _gathered(draw, TOUCHES)])
 
 
 def _seen(robot: Robot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
@@ -172,22 +165,21 @@ def _seen(robot: Robot, arm: Arm, rng: Generator) -> tuple[Camera, Transform]:
     middle = board.points.mean(axis=0)
     T_base_board = make_transform(_DOWN, TRAY - _DOWN @ middle)
 
-    def draw() -> tuple[Transform, Transform] | None:
+    def draw() -> Stand | None:
         T_base_cam = looking_at(
             TRAY + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]), rng.uniform(0.2, 0.32),
             rng.uniform(-0.6, 0.6, 2), rng.uniform(-1.0, 1.0),
         )  # fmt: skip
         return _stand(robot, arm, T_base_cam @ invert_transform(robot.T_flange_cam))
 
-    true, read = _gathered(draw, VIEWS)
     sightings, flanges = [], []
-    for number, (flange, told) in enumerate(zip(true, read, strict=True)):
+    for number, (flange, read) in enumerate(_gathered(draw, VIEWS)):
         T_cam_board = invert_transform(flange @ robot.T_flange_cam) @ T_base_board
         picture = draw_view(board, T_cam_board, true_camera, rng)
         sighting = board.find(picture, f"{number}")
         if sighting is not None:
             sightings.append(sighting)
-            flanges.append(told)
+            flanges.append(read)
     camera = calibrate_lens(sightings, SIZE).camera
     boards = [board_pose(one, camera) for one in sightings]
     return camera, calibrate_hand_eye(np.stack(flanges), boards, "hand").T_mount_cam

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-BLOCK: Final = 50
-"""Trials after which another robot is calibrated, as Table 9 counts them."""
-
+BLOCK: Final = 50  # trials after which another robot is calibrated, as Table 9 counts them
 EXACT: Final = "exact poses"
 
 FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")

@@ -32,7 +32,7 @@ from dopepp.robot.grasping.rehearsal import (
     looking_at,
 )
 from dopepp.robot.grasping.task import BLOCK, Record, Source, Task
-from dopepp.robot.grasping.view import MujocoView, RasterView, View
+from dopepp.robot.grasping.view import MujocoView, RasterView
 
 if TYPE_CHECKING:
     from dopepp.inference.estimator import PoseEstimator
@@ -46,11 +46,8 @@ TILT: Final = np.radians(17.0)
 
 SETTLE_S: Final = {"single": 0.2, "distractors": 0.4, "heap": 1.5}
 
-MOST_BELIEVED: Final = 8
-"""Parts of which a plan keeps clear."""
-
-RECOGNISED: Final = 0.1
-"""ADD over the diameter below which a part counts as recognised."""
+MOST_BELIEVED: Final = 8  # parts of which a plan keeps clear
+RECOGNISED: Final = 0.1  # ADD over the diameter below which a part counts as recognised
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +107,8 @@ class Trials:
         if task.network is not None:
             self.distance = self._distances()
         self.robot = cache(self._robot)
-        self._cells: dict[int, Cell] = {}
-        self._views: dict[int, MujocoView] = {}
+        self._parts_cell = cache(lambda count: Cell([self.layout.thing] * count))
+        self._parts_view = cache(lambda count: MujocoView([self.layout.thing] * count))
 
     @cached_property
     def estimator(self) -> PoseEstimator:
@@ -123,7 +120,7 @@ class Trials:
         return PoseEstimator.load(self.task.network, refine=refine)
 
     def _distances(self) -> tuple[float, float]:
-        """Return from where the network has learned to look, not quite to the ends, metres."""
+        """Return distances within those that the network was trained for, metres."""
         names = [part.name for part in self.estimator.parts]
         if self.part.name not in names:
             raise UserError(
@@ -163,22 +160,20 @@ class Trials:
 
     def attempt(self, scene: Scene, source: Source) -> Attempt:
         """Grip a part of a scene by the poses of a source."""
-        found = self._poses(scene, source)
-        if not found:
+        poses = self._poses(scene, source)
+        if not poses:
             return Attempt(self._record(scene, source, None, None))
         bench, hull = scene.calibrated.knowledge.T_base_bench, self.layout.body.hull
-        laid = [rested(one, hull, bench) for one in found][:MOST_BELIEVED]
-        planner, plan, chosen = self._planner(scene), None, 0
+        laid = [rested(pose, hull, bench) for pose in poses][:MOST_BELIEVED]
+        planner, believed, outcome = self._planner(scene), poses[0], None
         for number, first in enumerate(laid):
             others = [*laid[:number], *laid[number + 1 :]]
             plan = planner.plan([first, *others], self.grasps, scene.joints)
             if plan is not None:
-                chosen = number
+                believed, state = poses[number], copy(scene.start)
+                execution = Execution(scene.cell, state, self.gripper, scene.robot.zero)
+                outcome = execution.run(plan)
                 break
-        believed, outcome = found[chosen], None
-        if plan is not None:
-            state = copy(scene.start)
-            outcome = Execution(scene.cell, state, self.gripper, scene.robot.zero).run(plan)
         record = self._record(scene, source, believed, outcome)
         return Attempt(record, outcome or Outcome(), believed)
 
@@ -200,9 +195,9 @@ class Trials:
     def _detected(self, scene: Scene) -> list[Detection]:
         """Return the parts on the picture that are at least half as sure as the surest."""
         lens = scene.calibrated.camera
-        found = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
-        own = [one for one in found if one.object == self.part.name]
-        return [one for one in own if one.score >= own[0].score / 2]
+        detections = self.estimator.predict(scene.picture, lens.K, lens.coefficients)
+        parts = [detection for detection in detections if detection.object == self.part.name]
+        return [detection for detection in parts if detection.score >= parts[0].score / 2]
 
     def _record(
         self, scene: Scene, source: Source, believed: Transform | None, outcome: Outcome | None
@@ -263,31 +258,22 @@ class Trials:
         )
 
     def _cell(self, lying: Sequence[Lying]) -> Cell:
-        """Return a model of what lies there; those of parts alone are kept."""
-        things = [one.thing for one in lying]
-        if any(one.body.part is None for one in lying):
-            return Cell(things)
-        return self._kept(len(things))
-
-    def _kept(self, count: int) -> Cell:
-        if count not in self._cells:
-            self._cells[count] = Cell([self.layout.thing] * count)
-        return self._cells[count]
+        """Return a model of what lies there; models of parts alone are kept."""
+        if any(item.body.part is None for item in lying):
+            return Cell([item.thing for item in lying])
+        return self._parts_cell(len(lying))
 
     def _planner(self, scene: Scene) -> Planner:
         count = 1 if self.task.layout == "single" else MOST_BELIEVED
-        return Planner(self.arm, self.gripper, self._kept(count), scene.calibrated.knowledge)
+        return Planner(self.arm, self.gripper, self._parts_cell(count), scene.calibrated.knowledge)
 
-    def _view(self, lying: Sequence[Lying]) -> View:
-        """Return what takes the picture: of MuJoCo's, one for parts alone is kept."""
+    def _view(self, lying: Sequence[Lying]) -> RasterView | MujocoView:
+        """Return the renderer; MuJoCo's renderers of parts alone are kept."""
         if self.task.renderer != "mujoco":
             return self._raster
-        things = [one.thing for one in lying]
-        if any(one.body.part is None for one in lying):
-            return MujocoView(things)
-        if len(things) not in self._views:
-            self._views[len(things)] = MujocoView(things)
-        return self._views[len(things)]
+        if any(item.body.part is None for item in lying):
+            return MujocoView([item.thing for item in lying])
+        return self._parts_view(len(lying))
 
     @cached_property
     def _raster(self) -> RasterView:

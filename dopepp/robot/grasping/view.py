@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -32,21 +32,10 @@ shadows; the same with the shadows that parts throw on it; and MuJoCo's."""
 LOOK: Final = PRESETS["wide"]
 """Whose light, materials and camera errors the scenes have: the released networks'."""
 
-
 _log = logging.getLogger(__name__)
 
 UPRIGHT: Final = np.radians([90.0, -90.0, 0.0, -90.0, 0.0, 0.0])
 """Joints of an arm that points at the ceiling."""
-
-
-class View(Protocol):
-    """Takes a picture."""
-
-    def take(
-        self, bodies: Sequence[Body], poses: Sequence[Transform], T_base_cam: Transform,
-        rng: Generator,
-    ) -> Picture:  # fmt: skip
-        """Return what the camera at T_base_cam sees of bodies at T_base_obj on the bench."""
 
 
 class RasterView:
@@ -63,7 +52,7 @@ class RasterView:
         self, bodies: Sequence[Body], poses: Sequence[Transform], T_base_cam: Transform,
         rng: Generator,
     ) -> Picture:  # fmt: skip
-        """Return what the camera sees; see :class:`View`."""
+        """Return what the camera at T_base_cam sees of bodies at T_base_obj on the bench."""
         T_cam_base = invert_transform(T_base_cam)
         objects = []
         materials: dict[str, Any] = {}
@@ -83,10 +72,7 @@ class RasterView:
 
 
 class MujocoView:
-    """MuJoCo's renderer: its light, one colour a thing, an even bench.
-
-    A :class:`UserError`: there is no OpenGL.
-    """
+    """MuJoCo's renderer, which needs OpenGL: its light, one colour a thing, an even bench."""
 
     def __init__(self, things: Sequence[Thing]) -> None:
         self._cell = Cell(things, shown="things")
@@ -99,7 +85,7 @@ class MujocoView:
         self, bodies: Sequence[Body], poses: Sequence[Transform], T_base_cam: Transform,
         rng: Generator,
     ) -> Picture:  # fmt: skip
-        """Return what the camera sees; see :class:`View`."""
+        """Return a picture; see :meth:`RasterView.take`."""
         model, state = self._cell.model, self._state
         for number, pose in enumerate(poses):
             self._cell.put(state, number, pose)

@@ -13,8 +13,7 @@ from dopepp.geometry.camera_file import Camera
 from dopepp.inference.sources import Source
 from dopepp.robot.nodes.worker import Worker
 
-MAX_DATAGRAM = 65_507
-"""Bytes that UDP over IPv4 carries."""
+MAX_DATAGRAM = 65_507  # bytes that UDP over IPv4 carries
 
 logger = logging.getLogger(__name__)
 

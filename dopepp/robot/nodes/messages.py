@@ -34,12 +34,8 @@ ADD: Final = 0
 DELETE_ALL: Final = 3
 
 OK: Final = 0
-WARN: Final = 1
-"""These two are levels of a diagnosis."""
-
-OVERLAY: Final = "rgb_points"
-"""Topic of the pictures with poses drawn on them."""
-
+WARN: Final = 1  # these two are levels of a diagnosis
+OVERLAY: Final = "rgb_points"  # topic of the pictures with poses drawn on them
 DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/DiagnosticArray")
 """Topic and type of a diagnosis."""
 

@@ -42,11 +42,8 @@ before anybody has chosen: 10 and 33 of 300 at 30 Hz. With many, it begins with 
 
 QUEUE_OUT: Final = 10
 
-WAIT_S: Final = 0.2
-"""Seconds between two looks at whether the node is to end."""
-
-RECENT: Final = 100
-"""Pictures over which rates and latencies are told."""
+WAIT_S: Final = 0.2  # seconds between two looks at whether the node is to end
+RECENT: Final = 100  # pictures over which rates and latencies are told
 
 logger = logging.getLogger(__name__)
 

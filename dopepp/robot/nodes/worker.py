@@ -26,8 +26,7 @@ from dopepp.inference.tracker import PoseTracker
 PATIENCE: Final = 5
 """Pictures in a row without a ``camera_info`` before that is said: the first may come earlier."""
 
-OPTICAL: Final = "optical"
-"""What the name of a frame has in it whose z looks forward (REP 103)."""
+OPTICAL: Final = "optical"  # what the name of a frame has in it whose z looks forward (REP 103)
 
 logger = logging.getLogger(__name__)
 

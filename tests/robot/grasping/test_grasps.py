@@ -36,21 +36,25 @@ def test_the_tool_closes_and_comes_as_the_grasp_says(turned):
     assert Grasp(grasp.point, grasp.closing, grasp.approach, 0.08).opening == WIDEST
 
 
+def of(*grasps, part="pivconnector"):
+    return f"{{part: {part}, grasps: [{', '.join(grasps)}]}}"
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("[]", "without part: and grasps:"),
-        (f"{{part: other, grasps: [{GOOD}]}}", "part: pivconnector"),
-        ("{part: pivconnector, grasps: []}", "without a grasp"),
-        ("{part: pivconnector, grasps: [3]}", "grasp 1"),
-        (f"{{part: pivconnector, grasps: [{GOOD}, {GOOD.replace('0.05', '0.2')}]}}", "grasp 2"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('0.05', '-1')}]}}", "width -1"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('0.05', 'true')}]}}", "width True"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('[0, 1, 0]', '[0, 1]')}]}}", "closing"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('[0, 1, 0]', '[0, 1, .nan]')}]}}", "nan"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('[0, 1, 0]', '[0, 0, 2]')}]}}", "right"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('[0, 1, 0]', '[0, 0, 0]')}]}}", "right"),
-        (f"{{part: pivconnector, grasps: [{GOOD.replace('[0, 0, 0]', '[5, 0, 0]', 1)}]}}", "point"),
+        ("[]", "allowed: a mapping"),
+        (of(GOOD, part="other"), "part: pivconnector"),
+        (of(), "1 to 1000 grasps"),
+        (of("3"), r"grasps\[0\]=3"),
+        (of(GOOD, GOOD.replace("0.05", "0.2")), r"grasps\[1\].width=0.2"),
+        (of(GOOD.replace("0.05", "-1")), "width=-1; allowed: a number from"),
+        (of(GOOD.replace("0.05", "true")), "width=True"),
+        (of(GOOD.replace("[0, 1, 0]", "[0, 1]")), "closing"),
+        (of(GOOD.replace("[0, 1, 0]", "[0, 1, .nan]")), "nan"),
+        (of(GOOD.replace("[0, 1, 0]", "[0, 0, 2]")), "right"),
+        (of(GOOD.replace("[0, 1, 0]", "[0, 0, 0]")), "right"),
+        (of(GOOD.replace("[0, 0, 0]", "[5, 0, 0]", 1)), "point"),
     ],
 )
 def test_what_is_no_file_of_grasps_is_refused_by_name(part, tmp_path, text, named):
