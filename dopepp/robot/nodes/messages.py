@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 import numpy as np
@@ -118,27 +118,22 @@ class Speaker:
 
     def messages(self, answer: Answer, wanted: Callable[[str], bool]) -> list[Message]:
         """Return what there is to say about a picture on the topics that are wanted."""
-        kinds = dict(self.topics())
-        makers: dict[str, Callable[[], Fields]] = {
-            "detections": lambda: self._detections(answer),
-            "/tf": lambda: self._transforms(answer),
-            "markers": lambda: self._markers(answer),
-            OVERLAY: lambda: picture(answer.result.plot(), _header(answer)),
-        }
-        said: list[Message] = []
+        header = {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
+        makers: dict[str, Callable[[], Fields]] = {}
         for name, word in self._names.items():
-            own = [one for one in answer.result.detections if one.object == name]
-            poses = [_pose(one.T_cam_obj) for one in sorted(own, key=lambda one: -one.score)]
-            header = _header(answer)
-            if poses and wanted(f"pose_{word}"):
-                topic = f"pose_{word}"
-                said.append(Message(topic, kinds[topic], {"header": header, "pose": poses[0]}))
-            if wanted(f"poses_{word}"):
-                topic = f"poses_{word}"
-                said.append(Message(topic, kinds[topic], {"header": header, "poses": poses}))
-        return said + [
-            Message(topic, kinds[topic], make()) for topic, make in makers.items() if wanted(topic)
-        ]
+            found = [one for one in answer.result.detections if one.object == name]
+            poses = [_pose(one.T_cam_obj) for one in sorted(found, key=lambda one: -one.score)]
+            if poses:
+                makers[f"pose_{word}"] = partial(dict, header=header, pose=poses[0])
+            makers[f"poses_{word}"] = partial(dict, header=header, poses=poses)
+        makers |= {
+            "detections": lambda: self._detections(answer, header),
+            "/tf": lambda: self._transforms(answer, header),
+            "markers": lambda: self._markers(answer, header),
+            OVERLAY: lambda: picture(answer.result.plot(), header),
+        }
+        kinds = {topic: kind for topic, kind in self.topics() if topic in makers and wanted(topic)}
+        return [Message(topic, kind, makers[topic]()) for topic, kind in kinds.items()]
 
     def _named(self, answer: Answer) -> list[tuple[str, Detection]]:
         """Return every detection with its frame's name, ``<object>_<n>``."""
@@ -147,19 +142,12 @@ class Speaker:
             for number, one in zip(answer.numbers, answer.result.detections, strict=True)
         ]
 
-    def _detections(self, answer: Answer) -> Fields:
-        return {
-            "header": _header(answer),
-            "detections": [
-                {
-                    "header": _header(answer),
-                    "results": [_hypothesis(one)],
-                    "bbox": self._box(one),
-                    "id": name,
-                }
-                for name, one in self._named(answer)
-            ],
-        }
+    def _detections(self, answer: Answer, header: Fields) -> Fields:
+        detections = [
+            {"header": header, "results": [_hypothesis(one)], "bbox": self._box(one), "id": name}
+            for name, one in self._named(answer)
+        ]
+        return {"header": header, "detections": detections}
 
     def _box(self, one: Detection) -> Fields:
         """Return the part's box, whose middle need not be the part's origin."""
@@ -167,38 +155,25 @@ class Speaker:
         middle[:3, 3] += middle[:3, :3] @ cuboid[-1]
         return {"center": _pose(middle), "size": _xyz(np.ptp(cuboid, axis=0))}
 
-    def _transforms(self, answer: Answer) -> Fields:
-        transforms = [
-            {
-                "header": _header(answer),
-                "child_frame_id": name,
-                "transform": {
-                    "translation": _xyz(one.T_cam_obj[:3, 3]),
-                    "rotation": _turn(one.T_cam_obj),
-                },
-            }
-            for name, one in self._named(answer)
-        ]
+    def _transforms(self, answer: Answer, header: Fields) -> Fields:
+        transforms = []
+        for name, one in self._named(answer):
+            pose = _pose(one.T_cam_obj)
+            shift_and_turn = {"translation": pose["position"], "rotation": pose["orientation"]}
+            transforms.append(
+                {"header": header, "child_frame_id": name, "transform": shift_and_turn}
+            )
         return {"transforms": transforms}
 
-    def _markers(self, answer: Answer) -> Fields:
+    def _markers(self, answer: Answer, header: Fields) -> Fields:
         """Return the parts' triangles at their poses, in place of those of the last picture."""
-        markers: list[Fields] = [{"header": _header(answer), "action": DELETE_ALL}]
-        for place, one in enumerate(answer.result.detections):
-            colour = np.array(COLOURS[place % len(COLOURS)]) / 255
-            markers.append(
-                {
-                    "header": _header(answer),
-                    "ns": one.object,
-                    "id": place,
-                    "type": TRIANGLE_LIST,
-                    "action": ADD,
-                    "pose": _pose(one.T_cam_obj),
-                    "scale": _xyz(np.ones(3)),
-                    "color": {**dict(zip("rgb", colour.tolist(), strict=True)), "a": 0.8},
-                    "points": self._triangles[one.object],
-                }
-            )
+        markers: list[Fields] = [{"header": header, "action": DELETE_ALL}]
+        for index, one in enumerate(answer.result.detections):
+            colour = (np.array(COLOURS[index % len(COLOURS)]) / 255).tolist()
+            marker = {"header": header, "ns": one.object, "id": index, "type": TRIANGLE_LIST}
+            marker |= {"action": ADD, "pose": _pose(one.T_cam_obj), "scale": _xyz(np.ones(3))}
+            marker |= {"color": {**dict(zip("rgb", colour, strict=True)), "a": 0.8}}
+            markers.append(marker | {"points": self._triangles[one.object]})
         return {"markers": markers}
 
 
@@ -233,17 +208,9 @@ def _hypothesis(one: Detection) -> Fields:
     }
 
 
-def _header(answer: Answer) -> Fields:
-    return {"stamp": answer.stamp._asdict(), "frame_id": answer.frame_id}
-
-
 def _pose(T: Transform) -> Fields:
-    return {"position": _xyz(T[:3, 3]), "orientation": _turn(T)}
-
-
-def _turn(T: Transform) -> Fields:
     w, x, y, z = matrix_to_quaternion(T[:3, :3]).tolist()
-    return {"x": x, "y": y, "z": z, "w": w}
+    return {"position": _xyz(T[:3, 3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def _xyz(values: Float[np.ndarray, "3"]) -> Fields:

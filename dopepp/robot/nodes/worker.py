@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 
 from dopepp.core.errors import UserError
 from dopepp.core.validation import Range, check
-from dopepp.drawing.pictures import Picture
 from dopepp.geometry.camera_file import Camera
 from dopepp.inference.estimator import PoseEstimator
 from dopepp.inference.overlay import make_shape
@@ -65,13 +64,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What there is on a picture.
-
-    Attributes:
-        stamp: The picture's, and
-        frame_id: its camera's optical frame, which the poses are in.
-        result: The poses.
-    """
+    """Poses on a picture, with its stamp and its camera's optical frame, which they are in."""
 
     stamp: Stamp
     frame_id: str
@@ -86,8 +79,8 @@ class Answer:
         """
         if self.result.identities is not None:
             return [*self.result.identities]
-        names = [one.object for one in self.result.detections]
-        return [names[:place].count(name) for place, name in enumerate(names)]
+        names = [detection.object for detection in self.result.detections]
+        return [names[:index].count(name) for index, name in enumerate(names)]
 
 
 class Worker:
@@ -145,11 +138,10 @@ class Worker:
         return self._estimators[refine]
 
     def take(self, message: Any, info: Any | None, topic: str) -> Answer | None:
-        """Look at the picture of a ROS message; ``info`` is the ``camera_info`` that holds for it.
+        """Process the picture of a ROS message; ``info`` is the ``camera_info`` that holds for it.
 
-        None where it cannot be looked at, which was said.
+        None where that is not possible, which was said.
         """
-        stamp, frame_id = stamp_of(message.header.stamp), message.header.frame_id
         try:
             image = picture_of(message)
         except Exception as error:  # whatever is wrong with a message that anybody sent
@@ -157,17 +149,11 @@ class Worker:
             self._trouble("picture", f"a picture of {topic}: {error!s:.300}; fix: {fix}")
             return None
         try:
-            known = None if info is None else info_of(info)
+            lens = None if info is None else info_of(info)
         except Exception as error:
             self._trouble("info", f"the camera_info beside {topic}: {error!s:.300}")
             return None
-        return self.look(image, stamp, frame_id, known, topic)
-
-    def look(
-        self, image: Picture, stamp: Stamp, frame_id: str, info: CameraInfo | None, topic: str
-    ) -> Answer | None:
-        """Look at a picture (RGB, as the camera took it); as :meth:`take`."""
-        if info is None and self._camera is None:
+        if lens is None and self._camera is None:
             self._without_info += 1
             if self._without_info == PATIENCE:
                 self._trouble(
@@ -176,11 +162,12 @@ class Worker:
                 )  # fmt: skip
             return None
         self._without_info = 0
-        frame_id = self._checked_frame(frame_id, info, topic)
+        stamp = stamp_of(message.header.stamp)
+        frame_id = self._checked_frame(message.header.frame_id, lens, topic)
         self._check_time(stamp, topic)
         try:
-            camera = self._camera or info.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
-            cropped = self._camera is None and info is not None and info.roi is not None
+            camera = self._camera or lens.camera(f"camera_info of {topic}", is_rectified(topic))  # type: ignore[union-attr]
+            cropped = self._camera is None and lens is not None and lens.roi is not None
             frame = Frame(image, topic, self._number, stamp.seconds)
             result = self.result(frame, camera, cropped)
         except ValueError as error:  # a UserError, or fields of odd lengths
@@ -254,6 +241,7 @@ class Worker:
                 self._tracker = PoseTracker(self._estimator(True))
 
     def _trouble(self, kind: str, text: str) -> None:
+        """Say what keeps a picture from being processed."""
         self.trouble = text
         self._warn(kind, text)
 
