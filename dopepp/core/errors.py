@@ -12,9 +12,8 @@ from importlib.util import find_spec
 class UserError(ValueError):
     """A mistake in an input, a file or an option that its user can correct.
 
-    Entry points print it as one line and exit with code 2; the library raises it, so that a
-    caller can catch it as the ``ValueError`` it is. It says what was got, with the file, the field
-    and the value, what would have been accepted, and what to do about it.
+    It states the value with its file and field, the allowed values, and the fix. Entry points print
+    it as one line and exit with code 2.
     """
 
     def __init__(self, got: str, allowed: str, fix: str) -> None:

@@ -54,10 +54,7 @@ def write_picture(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> Non
 
 
 def check_target(path: Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written, and make its folder, before the work is done for it.
-
-    A :class:`UserError`: it has none of the suffixes, is a folder, or may not be written.
-    """
+    """Check that a file can be written, and make its folder; else a :class:`UserError`."""
     if suffixes and path.suffix.lower() not in suffixes:
         got = f"{path}, which is a folder" if path.is_dir() else f"{path} to write"
         raise UserError(got, f"a file with one of the suffixes {', '.join(suffixes)}", "name it so")
@@ -106,10 +103,7 @@ def write_whole(path: Path | str, content: bytes) -> None:
 
 @contextmanager
 def draft(path: Path) -> Iterator[Path]:
-    """Yield a place for a file or a folder, which then takes the place of what was at a path.
-
-    Where the block fails, what was there stays and nothing else is left.
-    """
+    """Yield a place for a file or folder that replaces a path, unless the block fails."""
     folder = partial_path(path)
     folder.mkdir(parents=True)
     try:
@@ -136,10 +130,7 @@ def partial_path(path: Path) -> Path:
 
 
 def is_abandoned(path: Path, now: float) -> bool:
-    """Tell whether a partial file's process is gone, so that nobody will complete it.
-
-    ``now`` is the present by the clock of the file system, seconds.
-    """
+    """Return whether a partial file's process is gone; ``now`` is by the file system's clock, s."""
     match = _PARTIAL.fullmatch(path.name)
     if match and match[1] == _machine() and not _is_running(int(match[2])):
         return True

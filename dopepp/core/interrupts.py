@@ -10,9 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, NoReturn
 
-NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)
-"""The disk is full, or the user's share of it."""
-
+NO_SPACE: Final = (errno.ENOSPC, errno.EDQUOT)  # The disk is full, or the user's share of it
 RESUME: Final = "the same command goes on where this one stopped"
 
 

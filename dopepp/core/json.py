@@ -36,10 +36,7 @@ _NOT_FINITE: Final = re.compile(rf"{_STRING}|(-?Infinity|NaN)|({_FLOAT})", re.DO
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
-    """Read a JSON file; what is missing, too large or refused by :func:`parse_json` is a UserError.
-
-    A file of more than ``max_bytes`` is refused before it is read.
-    """
+    """Read a JSON file; a missing, too large or refused one (:func:`parse_json`) is a UserError."""
     path = Path(path)
     allowed = f"a JSON file of at most {max_bytes / 1e6:.3g} MB"
     if not path.is_file():
@@ -58,8 +55,9 @@ def read_json(path: str | Path, max_bytes: int = MAX_BYTES) -> object:
 def parse_json(text: str | bytes, where: str) -> object:
     """Parse JSON text in UTF-8, with or without a byte order mark, of a size its caller bounds.
 
-    A :class:`UserError`: it is no UTF-8, no JSON, has a key twice in one object, is nested more
-    than 64 deep, or has a number that is not finite.
+    Raises:
+        UserError: It is no UTF-8, no JSON, has a key twice in one object, is nested more than 64
+            deep, or has a number that is not finite.
     """
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     bare = _STRING_BYTES.sub(b"", content)
@@ -134,8 +132,5 @@ def _may_overflow(bare: bytes) -> bool:
 
 
 def _bad(where: str, got: str) -> UserError:
-    return UserError(
-        f"{where}: {got}",
-        "UTF-8 JSON with finite numbers and each key once",
-        "correct the file or write it again",
-    )
+    allowed = "UTF-8 JSON with finite numbers and each key once"
+    return UserError(f"{where}: {got}", allowed, "correct the file or write it again")

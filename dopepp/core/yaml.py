@@ -13,17 +13,16 @@ import yaml
 
 from dopepp.core.errors import UserError
 
-MAX_BYTES: Final = 1_000_000
-"""Fifty times the largest config of a run."""
-
+MAX_BYTES: Final = 1_000_000  # Fifty times the largest config of a run
 MAX_DEPTH: Final = 32
 
 
 def read_yaml(path: Path) -> object:
     """Read a YAML file of mappings, lists, text, numbers, true/false and null.
 
-    A :class:`UserError`: the file cannot be read, is too large or damaged, is nested more than 32
-    deep, or has an anchor, an alias or a tag in it, none of which a run writes.
+    Raises:
+        UserError: The file cannot be read, is too large or damaged, is nested more than 32 deep, or
+            has an anchor, an alias or a tag.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -63,8 +62,5 @@ def _check_events(text: str) -> None:
 
 
 def _bad(where: Path | str, got: str) -> UserError:
-    return UserError(
-        f"{where}, {got}",
-        f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags",
-        "use a file that you trust, or restore it",
-    )
+    allowed = f"YAML of at most {MAX_BYTES / 1e6:g} MB, without anchors and tags"
+    return UserError(f"{where}, {got}", allowed, "use a file that you trust, or restore it")

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from dopepp.data.sample import Sample
 
-PADDING = -1
-"""``object_index`` of a slot without an instance."""
+PADDING = -1  # ``object_index`` of a slot without an instance
 
 
 @dataclass

@@ -43,8 +43,7 @@ from dopepp.parts.part import Part
 from dopepp.parts.size import Seen, widest
 from dopepp.virtual.backgrounds import Backgrounds
 
-_SEEN_ITEMS: Final = 200
-"""Images on which the range of sizes is measured."""
+_SEEN_ITEMS: Final = 200  # Images on which the range of sizes is measured
 
 
 class PoseDataModule(LightningDataModule):
@@ -74,11 +73,9 @@ class PoseDataModule(LightningDataModule):
         if masking is not None and backgrounds is None:
             raise ValueError("masking needs backgrounds, for objects that fill their picture")
         if len(train) < batch_size:
-            raise UserError(
-                f"{len(train)} training images for batches of {batch_size}",
-                "at least one full batch per epoch",
-                "lower data.batch_size or raise data.samples_per_epoch",
-            )
+            got = f"{len(train)} training images for batches of {batch_size}"
+            fix = "lower data.batch_size or raise data.samples_per_epoch"
+            raise UserError(got, "at least one full batch per epoch", fix)
         self.train_source, self.val_source, self.test_source = train, val, test
         self.object_names, self.input_size = list(object_names), input_size
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -128,11 +125,9 @@ class PoseDataModule(LightningDataModule):
         missing = [name for name in self.object_names if not self.train_source.contains(name)]
         if missing:
             sources = ", ".join(info.name for info in self.train_source.describe())
-            raise UserError(
-                f"no instance of {', '.join(missing)} in the training data ({sources})",
-                "objects with at least one instance in a training source",
-                "take the object out, or add a source that shows it (e.g. renders)",
-            )
+            got = f"no instance of {', '.join(missing)} in the training data ({sources})"
+            fix = "take the object out, or add a source that shows it (e.g. renders)"
+            raise UserError(got, "objects with at least one instance in a training source", fix)
 
     def seen(self, parts: Sequence[Part]) -> dict[str, Seen]:
         """Measure how large and how far away the parts are on validation, else training images."""

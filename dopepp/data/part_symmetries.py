@@ -55,10 +55,8 @@ def choose_symmetries(
     infos = _read_infos(choice)
     for part in parts:
         if part.name not in infos:
-            raise UserError(
-                f"data.symmetries={choice}, which has no {part.name}", ", ".join(infos),
-                f'add an entry with "name": "{part.name}"',
-            )  # fmt: skip
+            got, allowed = f"data.symmetries={choice}, which has no {part.name}", ", ".join(infos)
+            raise UserError(got, allowed, f'add an entry with "name": "{part.name}"')
     return [
         _with(part, infos[part.name].symmetries_discrete, infos[part.name].symmetries_continuous)
         for part in parts
@@ -70,15 +68,11 @@ def _with(part: Part, discrete: Discrete | None, continuous: Continuous) -> Part
 
 
 def with_found_symmetries(part: Part, tolerance: float = TOLERANCE) -> Part:
-    """Return a part with the symmetries of its mesh, and say in the log what they are.
-
-    ``tolerance`` is the largest distance of a moved surface point from the surface, in diameters.
-    """
+    """Return a part with the symmetries of its mesh, which the log states."""
     if part.mesh is None:
-        raise UserError(
-            f"part {part.name} without a mesh to find symmetries on", "parts with a mesh",
-            "state its symmetries in a file, or leave them out",
-        )  # fmt: skip
+        got = f"part {part.name} without a mesh to find symmetries on"
+        fix = "state its symmetries in a file, or leave them out"
+        raise UserError(got, "parts with a mesh", fix)
     discrete, continuous = find_symmetries(part.mesh, tolerance)
     _log.info(
         "%s: %d discrete symmetries and %d axes of continuous symmetry within %.3g mm",
@@ -105,11 +99,8 @@ def _read_infos(choice: str) -> dict[str, ModelInfo]:
     """Return a file's entries by the part's name."""
     path = Path(choice)
     if not path.is_file():
-        raise UserError(
-            f"data.symmetries={choice}, no such file",
-            f"null, {NONE}, {AUTO} or a models_info.json",
-            "check the path",
-        )
+        allowed = f"null, {NONE}, {AUTO} or a models_info.json"
+        raise UserError(f"data.symmetries={choice}, no such file", allowed, "check the path")
     records = read_json(path)
     if isinstance(records, dict) and "diameter" in records:
         records = {"1": records}  # one entry alone

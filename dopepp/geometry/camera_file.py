@@ -103,11 +103,9 @@ class Camera:
         elif own is None or own == size:
             K = check_camera(self.K, size, self.source, WHOLE)
         elif K_size is None or not _one_shape(size, own):
-            raise UserError(
-                f"{self.source}, whose K is of {_by(own)}, for a picture of {_by(size)}",
-                "K of the picture's size, or how the picture was made of one of the other",
-                _fix(size, own),
-            )
+            got = f"{self.source}, whose K is of {_by(own)}, for a picture of {_by(size)}"
+            allowed = "K of the picture's size, or how the picture was made of one of the other"
+            raise UserError(got, allowed, _fix(size, own))
         else:
             K = resize_camera(self.K, size[0] / own[0], size[1] / own[1])
         return replace(self, size=size, K=K)
@@ -126,7 +124,7 @@ def read_camera(path: Path | str) -> Camera:
 
 
 def camera_of_fields(fields: Mapping[str, object], source: str) -> Camera:
-    """Return the camera of named fields, as of a ROS message; a UserError as from a file."""
+    """Like :func:`read_camera`, for named fields, as of a ROS message."""
     return _camera(calibration_of_fields(fields, source), source)
 
 
@@ -134,18 +132,13 @@ def _camera(found: Calibration, source: str) -> Camera:
     """Check what was found of a camera."""
     K = pinhole_matrix(found.K, source)
     if min(K[0, 0], K[1, 1]) <= 0:
-        raise UserError(
-            f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}",
-            "focal lengths above 0 pixels",
-            "calibrate the camera: this one was not",
-        )
+        got = f"{source}: fx={K[0, 0]:g}, fy={K[1, 1]:g}"
+        fix = "calibrate the camera: this one was not"
+        raise UserError(got, "focal lengths above 0 pixels", fix)
     if len(found.distortion) not in COEFFICIENTS:
-        counts = ", ".join(map(str, COEFFICIENTS))
-        raise UserError(
-            f"{source}: {len(found.distortion)} distortion coefficients",
-            f"{counts} in OpenCV's order (k1, k2, p1, p2, k3, …)",
-            "add zeros for those that the calibration left out",
-        )
+        got = f"{source}: {len(found.distortion)} distortion coefficients"
+        allowed = f"{', '.join(map(str, COEFFICIENTS))} in OpenCV's order (k1, k2, p1, p2, k3, …)"
+        raise UserError(got, allowed, "add zeros for those that the calibration left out")
     lens = found.distortion if any(found.distortion) else ()
     return Camera(found.size, K, lens, source)
 
@@ -156,10 +149,9 @@ def _text(path: Path) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise UserError(f"camera file {path}: {error.strerror}", allowed, "check it") from error
-    except ValueError as error:  # a null character in its name
-        raise UserError(f"camera file {path!s:.200}: {error}", allowed, "check it") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in its name
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"camera file {path!s:.200}: {reason}", allowed, "check it") from error
     if len(content) > MAX_BYTES:
         size = f"more than {MAX_BYTES / 1e3:g} kB"
         raise UserError(f"camera file {path} of {size}", allowed, "pass the camera's file")

@@ -31,9 +31,7 @@ FORMATS: Final = (
 )
 _UNDISTORT: Final = "undistort the pictures and pass the K of the undistorted ones"
 
-_SIDE: Final = Range(1, 65_536, "pixels")
-"""Side of a calibrated picture."""
-
+_SIDE: Final = Range(1, 65_536, "pixels")  # Side of a calibrated picture
 _COLMAP_MODELS: Final = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -90,15 +88,12 @@ def _colmap(lines: Sequence[Sequence[str]], source: str) -> Calibration:
     """Parse ``cameras.txt``: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], of one camera."""
     if len(lines) > 1:
         numbers = ", ".join(words[0][:20] for words in lines[:10]) + ", …" * (len(lines) > 10)
-        raise UserError(
-            f"{source} of {len(lines)} cameras ({numbers})", "one camera",
-            "keep the line of the camera that took the picture",
-        )  # fmt: skip
+        fix = "keep the line of the camera that took the picture"
+        raise UserError(f"{source} of {len(lines)} cameras ({numbers})", "one camera", fix)
     _, model, *rest = lines[0]
     if model not in _COLMAP_MODELS:
-        raise UserError(
-            f"{source}: camera model {model:.40}", ", ".join(_COLMAP_MODELS), _UNDISTORT
-        )
+        allowed = ", ".join(_COLMAP_MODELS)
+        raise UserError(f"{source}: camera model {model:.40}", allowed, _UNDISTORT)
     values = _floats(rest)
     if values is None or len(values) != 2 + _COLMAP_MODELS[model]:
         allowed = f"WIDTH HEIGHT and {_COLMAP_MODELS[model]} numbers behind {model}"
@@ -158,7 +153,15 @@ def calibration_of_fields(content: Mapping[Any, object], source: str) -> Calibra
         "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distortion", "D"
     )
     distortion = () if lens is None else tuple(_numbers(*lens))
-    _check_model(fields, distortion)
+    # OpenCV's pinhole model describes no other lens.
+    fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
+    if fisheye is not None and fisheye[1] not in (0, "0"):
+        raise UserError(f"{source}: fisheye_model=1", "no fisheye lens", _UNDISTORT)
+    models: tuple[object, ...] = ("plumb_bob", "rational_polynomial")
+    models += () if any(distortion) else ("", None)
+    if model is not None and model[1] not in models:
+        allowed = "plumb_bob, rational_polynomial"
+        raise UserError(f"{model[0]}={shown(model[1], 80)}", allowed, _UNDISTORT)
     return Calibration(_size(fields), K, distortion)
 
 
@@ -197,32 +200,17 @@ def _key(name: str) -> str:
 def _size(fields: _Fields) -> Size | None:
     both = fields.find("image_size", "resolution")
     if both is not None:
-        sides = _numbers(*both)
+        name, sides = both[0], _numbers(*both)
         if len(sides) != 2:
-            got = f"{both[0]} of {len(sides)} numbers"
-            raise UserError(got, "width and height", "correct it")
-        return _side(both[0], sides[0]), _side(both[0], sides[1])
+            raise UserError(f"{name} of {len(sides)} numbers", "width and height", "correct it")
+        return _side(name, sides[0]), _side(name, sides[1])
     width, height = (fields.find(f"image_{side}", side) for side in ("width", "height"))
     if width is None and height is None:
         return None
     if width is None or height is None:
-        missing = "height" if width else "width"
-        raise UserError(
-            f"{fields.source} without image_{missing}", "both or none", f"add {missing}"
-        )
+        missing = "image_height" if width else "image_width"
+        raise UserError(f"{fields.source} without {missing}", "both or none", f"add {missing}")
     return _side(*width), _side(*height)
-
-
-def _check_model(fields: _Fields, distortion: Sequence[float]) -> None:
-    """Refuse a lens that OpenCV's pinhole model does not describe."""
-    fisheye, model = fields.find("fisheye_model"), fields.find("distortion_model")
-    if fisheye is not None and fisheye[1] not in (0, "0"):
-        raise UserError(f"{fields.source}: fisheye_model=1", "no fisheye lens", _UNDISTORT)
-    if model is None or (model[1] in (None, "") and not any(distortion)):
-        return
-    models = ("plumb_bob", "rational_polynomial")
-    if model[1] not in models:
-        raise UserError(f"{model[0]}={shown(model[1], 80)}", ", ".join(models), _UNDISTORT)
 
 
 def _numbers(name: str, value: object) -> list[float]:
@@ -232,10 +220,8 @@ def _numbers(name: str, value: object) -> list[float]:
         rows, columns = value.get("rows"), value.get("cols")
         stated = None not in (rows, columns)
         if stated and len(numbers) != _number(name, rows) * _number(name, columns):
-            raise UserError(
-                f"{name} of {rows}×{columns} with {len(numbers)} numbers",
-                "as many numbers as rows × cols", "write the file again",
-            )  # fmt: skip
+            got = f"{name} of {rows}×{columns} with {len(numbers)} numbers"
+            raise UserError(got, "as many numbers as rows × cols", "write the file again")
         return numbers
     rows = value if isinstance(value, list) else [value]
     flat = [entry for row in rows for entry in (row if isinstance(row, list) else [row])]

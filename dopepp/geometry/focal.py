@@ -16,9 +16,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from dopepp.geometry.camera import CameraMatrix, Transform, moved, project_keypoints
 from dopepp.geometry.cuboid import Cuboid
 
-MIN_POINTS: Final = 8
-"""With fewer of the nine keypoints, one that is off looks like perspective."""
-
+MIN_POINTS: Final = 8  # With fewer of the nine keypoints, one that is off looks like perspective
 MILD: Final = 0.02
 """Error of a keypoint, share of the part's extent, from which it counts less than quadratically."""
 

@@ -40,18 +40,14 @@ from dopepp.geometry.rotation import RotationMatrix, Vector
 MOST_LEFT_OUT: Final = 2
 """Outliers looked for by leaving points out; the robust cost bears more where these are mild."""
 
-NUM_STARTS: Final = 3
-"""How many of the poses from subsets are worth refining."""
-
+NUM_STARTS: Final = 3  # How many of the poses from subsets are worth refining
 MAX_DISTANCE: Final = 500.0
 """Farthest believable pose in object sizes: with a focal length of 1,000 px that is 2 px wide."""
 
 MAX_TANGENT: Final = 1000.0
 """Distance from the principal point in focal lengths: 89.9° off the axis, where no pixel is."""
 
-ROTATION_TOLERANCE: Final = 1e-6
-"""Error of a rotation matrix's entries that refinement may leave."""
-
+ROTATION_TOLERANCE: Final = 1e-6  # Error of a rotation matrix's entries that refinement may leave
 PLATE: Final = 0.3
 """Thickness over length up to which a part's mirrored tilt is tried as a start of its own."""
 

@@ -34,20 +34,15 @@ LEAST_DAMPING: Final = 1e-9
 MOST_DAMPING: Final = 1e6
 """Where steps are a millionth of Gauss–Newton's and still do not help, the pose has arrived."""
 
-NO_GATE: Final = 1e3
-"""So wide a gate that the cost is that of least squares."""
-
+NO_GATE: Final = 1e3  # So wide a gate that the cost is that of least squares
 _TINY_ANGLE: Final = 1e-8
 """Radians below which a turn's second-order term is below float64's rounding."""
 
 MIN_POINTS: Final = 4
 
-SMALLEST: Final = 1e-9
-LARGEST: Final = 1e9
-"""Extent of the object points, metres, outside of which they are no object."""
-
-SAME_PIXEL: Final = 1e-3
-"""Pixels by which two positions must differ to be two."""
+SMALLEST: Final = 1e-9  # Extent of the object points, metres, below which they are no object
+LARGEST: Final = 1e9  # and above which
+SAME_PIXEL: Final = 1e-3  # Pixels by which two positions must differ to be two
 
 
 @dataclass(frozen=True)

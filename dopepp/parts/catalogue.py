@@ -33,13 +33,9 @@ PLATE: Final = 0.5
 FRONT: Final = 3.5
 """Heights along z: the back face, the plate's front face, the top of the raised features."""
 
-RECESS: Final = 2.5
-SLOPE: Final = 1.5
-"""Depth of a recess, and how far a feature's walls lean inwards over its height."""
-
-SEGMENTS: Final = 64
-"""Sides of a circle: 0.03 mm of deviation on the largest one."""
-
+RECESS: Final = 2.5  # Depth of a recess
+SLOPE: Final = 1.5  # How far a feature's walls lean inwards over its height
+SEGMENTS: Final = 64  # Sides of a circle: 0.03 mm of deviation on the largest one
 TOLERANCE: Final = 1e-3
 """Edges shorter than this are the cuts' rounding, and would only make degenerate triangles."""
 
@@ -112,11 +108,8 @@ def load_part(path_or_name: str | Path, unit: str | None = None) -> Part:
         return BUILTIN[text]()
     path = Path(path_or_name)
     if path.suffix.lower() not in READERS:
-        raise UserError(
-            f"unknown part {text!r}",
-            f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}",
-            "check the spelling",
-        )
+        allowed = f"{', '.join(BUILTIN)}, or a path to {'/'.join(READERS)}"
+        raise UserError(f"unknown part {text!r}", allowed, "check the spelling")
     mesh, taken = read_in_unit(path, unit)
     part = replace(make_part(path.stem, mesh, unit=taken), unit=taken)
     _log.log(logging.INFO if is_plausible(part) else logging.WARNING, "%s", part_in_words(part))
@@ -148,10 +141,8 @@ def with_meshes(
             single = len(names) == len(given) == 1
             name = names[0] if single else text if text in BUILTIN else Path(text).stem
         if name not in names:
-            raise UserError(
-                f"--part {text}, which is no part of the checkpoint", ", ".join(names),
-                "name the part: --part NAME=FILE",
-            )  # fmt: skip
+            got, allowed = f"--part {text}, which is no part of the checkpoint", ", ".join(names)
+            raise UserError(got, allowed, "name the part: --part NAME=FILE")
         chosen[name] = path
     return [_with_mesh(part, chosen.get(part.name), unit) for part in parts]
 
@@ -161,11 +152,9 @@ def _with_mesh(part: Part, chosen: str | None, unit: str | None) -> Part:
     if chosen is None:
         if part.mesh is not None:
             return part
-        raise UserError(
-            f"no mesh of {part.name} in the checkpoint",
-            "a mesh file for every part without one",
-            f"add --part {part.name}=FILE and its --unit",
-        )
+        fix = f"add --part {part.name}=FILE and its --unit"
+        got = f"no mesh of {part.name} in the checkpoint"
+        raise UserError(got, "a mesh file for every part without one", fix)
     loaded = load_part(chosen, unit)
     if part.mesh_hash and loaded.mesh_hash != part.mesh_hash:
         _log.warning(

@@ -37,9 +37,7 @@ from dopepp.parts.mesh.decimate import MAX_FACES, decimate
 
 logger = logging.getLogger(__name__)
 
-UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
-"""Metres per unit of a mesh file."""
-
+UNITS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}  # Metres per unit of a mesh file
 SMALLEST_DIAMETER: Final = 0.005
 LARGEST_DIAMETER: Final = 5.0
 """Metres. Outside these, a part is far more likely to have been read in the wrong unit."""

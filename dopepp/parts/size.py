@@ -18,12 +18,8 @@ from dopepp.geometry.rotation import Vector
 from dopepp.parts.mesh import Faces, Vertices, weld
 from dopepp.parts.part import Part
 
-_PLAUSIBLE: Final = (0.01, 2.0)
-"""Diameters that a hand or a robot's gripper holds, metres."""
-
-_LISTED: Final = 3
-"""Most bodies whose sizes the log lists."""
-
+_PLAUSIBLE: Final = (0.01, 2.0)  # Diameters that a hand or a robot's gripper holds, metres
+_LISTED: Final = 3  # Most bodies whose sizes the log lists
 _MANY_CAVITIES: Final = 1000
 """More surfaces than a part's cavities have: what else faces inwards counts as a body."""
 

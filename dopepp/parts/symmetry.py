@@ -33,15 +33,11 @@ _GIVE: Final = 0.02
 """Distance, in diameters, from which on a point pulls with constant force: it may belong to a
 feature that has no counterpart."""
 
-TOLERANCE: Final = 0.01
-"""Share of the diameter by which a symmetry may miss the surface."""
-
+TOLERANCE: Final = 0.01  # Share of the diameter by which a symmetry may miss the surface
 LARGEST_TOLERANCE: Final = 0.1
 SMALLEST_TOLERANCE: Final = 1e-4
 
-MAX_ORDER: Final = 12
-"""Turns in a full one about an axis of discrete symmetry, at most."""
-
+MAX_ORDER: Final = 12  # Turns in a full one about an axis of discrete symmetry, at most
 _NUM_PROBES: Final = 8000
 
 Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry, ...]]
@@ -50,16 +46,18 @@ Symmetries = tuple[Float[np.ndarray, "symmetries 4 4"], tuple[ContinuousSymmetry
 def find_symmetries(mesh: Mesh, tolerance: float = TOLERANCE) -> Symmetries:
     """Find the rigid transforms that map a mesh onto itself, however its surface is cut.
 
-    The discrete ones come without the identity, metres: with the identity they form a group, and a
-    round part's flip stands for all its flips. Then come the axes of continuous symmetry as (axis,
-    offset), three for a ball. ``tolerance`` is the largest distance of a moved surface point from
-    the surface, in diameters; a UserError, if it is not in 1e-4 … 0.1.
+    Returns:
+        The discrete ones without the identity, metres (with it they form a group; a round part's
+        flip stands for all its flips), and the axes of continuous symmetry, three for a ball.
+
+    Raises:
+        UserError: ``tolerance``, the largest distance of a moved surface point from the surface in
+            diameters, is not in 1e-4 … 0.1.
     """
     if not SMALLEST_TOLERANCE <= tolerance <= LARGEST_TOLERANCE:
-        raise UserError(
-            f"a tolerance of {tolerance}", f"{SMALLEST_TOLERANCE} – {LARGEST_TOLERANCE} diameters",
-            "choose how far a symmetry may miss the surface",
-        )  # fmt: skip
+        allowed = f"{SMALLEST_TOLERANCE} – {LARGEST_TOLERANCE} diameters"
+        fix = "choose how far a symmetry may miss the surface"
+        raise UserError(f"a tolerance of {tolerance}", allowed, fix)
     shape = _Shape(mesh, tolerance)
     axis, generators = _search(shape)
     if axis is None:
@@ -93,8 +91,7 @@ class _Shape:
         """Tell whether the turned surface lies on the surface."""
         for probes in (self._few, self._many):
             moved = probes @ rotation.T
-            # One triangle a point is quick, and never too near; what misses it gets a closer look,
-            # the farthest first.
+            # One triangle a point is quick, and never too near; misses get a closer look.
             rough = self.surface.distances(moved, neighbours=1)
             doubtful = moved[np.argsort(-rough)[: (rough > self.tolerance).sum()]]
             for start in range(0, len(doubtful), 300):
@@ -246,11 +243,9 @@ def second_moments(surface: SurfaceTree) -> Float[np.ndarray, "3 3"]:
 
 
 def special_axes(surface: SurfaceTree) -> Float[np.ndarray, "axes 3"]:
-    """Return axes that are exact where they are right.
+    """Return the axes of coordinates, of the moments and of the largest flat areas.
 
-    They are the coordinate axes, the principal axes of the moments, the directions of the largest
-    flat areas, and these directions' sums, differences and cross products, which are the axes of
-    regular solids.
+    These directions' sums, differences and cross products are the axes of regular solids.
     """
     normals = _main_normals(surface)
     first, second = np.triu_indices(len(normals), 1)

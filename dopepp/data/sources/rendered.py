@@ -128,11 +128,9 @@ def _in_file(path: Path, dtype: np.dtype[Any], num_items: int) -> Shaped[np.ndar
         with path.open("r+b") as file:
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype)
     except OSError as error:
-        raise UserError(
-            f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}",
-            "a folder with as much free space",
-            "set data.cache_dir to another disk, or data.cache=none",
-        ) from error
+        got = f"data.cache=disk, {size / 1e9:.2f} GB in {path.parent}: {error.strerror}"
+        fix = "set data.cache_dir to another disk, or data.cache=none"
+        raise UserError(got, "a folder with as much free space", fix) from error
 
 
 class CachedSource:
@@ -171,12 +169,11 @@ class CachedSource:
         if folder is None:
             available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
             if self.num_bytes > available / 2:
-                raise UserError(
-                    f"data.cache=memory for {len(source)} images of {source.name}: "
-                    f"{self.num_bytes / 1e9:.1f} GB",
-                    f"at most half of this machine's {available / 1e9:.1f} GB",
-                    "set data.cache=none or disk, a smaller input size or fewer samples per epoch",
-                )
+                size = f"{self.num_bytes / 1e9:.1f} GB"
+                got = f"data.cache=memory for {len(source)} images of {source.name}: {size}"
+                allowed = f"at most half of this machine's {available / 1e9:.1f} GB"
+                fix = "set data.cache=none or disk, a smaller input size or fewer samples per epoch"
+                raise UserError(got, allowed, fix)
             self._slots = _in_memory(slot, len(source))
             self._checksums = _in_memory(np.dtype("u8"), len(source))
         else:
@@ -240,13 +237,10 @@ class CachedSource:
         """Refuse what a slot would cut off or mix up without a word."""
         if len(sample.instances) > _MAX_INSTANCES:
             raise ValueError(f"{len(sample.instances)} instances; at most {_MAX_INSTANCES}")
-        if (sample.image.shape[:2], sample.source, sample.depth is not None) != (
-            self._shape, self._source_name, self._has_depth,
-        ):  # fmt: skip
-            raise ValueError(
-                f"a {sample.size} image of {sample.source}; a cache keeps one size and one source, "
-                "and depth of all or none"
-            )
+        kept = (self._shape, self._source_name, self._has_depth)
+        if (sample.image.shape[:2], sample.source, sample.depth is not None) != kept:
+            rule = "a cache keeps one size and one source, and depth of all or none"
+            raise ValueError(f"a {sample.size} image of {sample.source}; {rule}")
         texts = [sample.key, *(instance.label for instance in sample.instances)]
         if max(map(len, texts)) > _TEXT_LENGTH:
             raise ValueError(f"one of {texts} has more than {_TEXT_LENGTH} characters")

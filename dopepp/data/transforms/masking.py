@@ -22,15 +22,12 @@ from dopepp.data.sample import Instance, Sample, silhouette
 from dopepp.drawing.pictures import Mask, Picture, Size
 from dopepp.virtual.backgrounds import Backgrounds
 
-MIN_PATCH_PX: Final = 2
-"""A patch of one pixel is a solid colour, whatever it shows."""
-
+MIN_PATCH_PX: Final = 2  # A patch of one pixel is a solid colour, whatever it shows
 MIN_CONTRAST: Final = 3.0
 """A crop counts as solid when no colour channel's standard deviation reaches this many grey
 levels."""
 
-MAX_DRAWS: Final = 8
-"""Crops drawn from a picture until one is not solid."""
+MAX_DRAWS: Final = 8  # Crops drawn from a picture until one is not solid
 
 
 class BackgroundCrops:

@@ -24,9 +24,7 @@ from dopepp.data.sample import Instance, Purpose, Sample, item_rng, silhouette
 from dopepp.data.transforms.masking import MIN_PATCH_PX, BackgroundCrops, covered_instances
 from dopepp.drawing.pictures import Mask, Picture
 
-TOLERANCE: Final = 0.02
-"""How far the covered share may be from the asked one."""
-
+TOLERANCE: Final = 0.02  # How far the covered share may be from the asked one
 _SIDES: Final = (0.15, 0.5)
 """A patch's sides as shares of the box's: small enough for several, large enough to hide edges."""
 

@@ -20,8 +20,7 @@ from dopepp.parts.mesh import Faces, Vertices, face_areas
 MAX_FACES: Final = 200_000
 """Triangles of a part's mesh: on a part that fills 640×480 pixels, over one for two pixels."""
 
-_WELL_USED: Final = 0.85
-"""Share of the limit that is good enough to stop trying."""
+_WELL_USED: Final = 0.85  # Share of the limit that is good enough to stop trying
 
 
 def decimate(

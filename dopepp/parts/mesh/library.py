@@ -1,10 +1,9 @@
 """STL, 3MF and GLB files: checked to be whole and harmless, then read by trimesh.
 
 trimesh takes a file that ends too early for a smaller mesh, passes over what it does not know, and
-spends what memory and time a file asks for; ``tests/parts/mesh/test_library.py`` and
-``tests/security/test_hostile_scenes.py`` hold the cases. So of GLB, which is glTF in one file,
-compressed, quantised and sparse data, triangle fans and moved textures are refused. Lines, points,
-colours, normals, skins and animations are left out: a part's look is its shape and its texture.
+spends what memory and time a file asks for (``tests/parts/mesh/test_library.py``,
+``tests/security/test_hostile_scenes.py``). So of GLB, glTF in one file, compressed, quantised and
+sparse data, triangle fans and moved textures are refused. All but shape and texture is left out.
 
 To add a format that trimesh reads, check its file first and hand it to :func:`read_scene`.
 """
@@ -33,9 +32,7 @@ MAX_UNPACKED_BYTES: Final = 50_000_000
 MAX_PIECES: Final = 1000
 """Meshes that make up one part: far above any part's bodies, and a bound on time."""
 
-MAX_TRIANGLES: Final = 5_000_000
-"""Of all pieces, each counted as often as it is shown."""
-
+MAX_TRIANGLES: Final = 5_000_000  # Of all pieces, each counted as often as it is shown
 UNITS_3MF: Final = {"millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "inch"}
 """Ours by 3MF's name, which also has feet and micrometres."""
 
@@ -43,15 +40,12 @@ _STL_HEADER: Final = 84
 _STL_TRIANGLE: Final = 50
 """Bytes. A binary STL file is a title, the number of triangles (uint32), and the triangles."""
 
-MAX_HEADER_BYTES: Final = 10_000_000
-"""Of the JSON: Python takes twenty times as much memory."""
-
+MAX_HEADER_BYTES: Final = 10_000_000  # Of the JSON: Python takes twenty times as much memory
 MAX_VALUES: Final = 30_000_000
 """Numbers and vectors that primitives use: each gets a copy, of an array that others use too."""
 
-_FLOAT: Final = 5126
-_TRIANGLES: Final = 4
-"""glTF's numbers of a type and of a mode; lower modes are points and lines."""
+_FLOAT: Final = 5126  # glTF's number of the type
+_TRIANGLES: Final = 4  # glTF's number of the mode; lower ones are points and lines
 
 
 def read_stl(path: Path) -> RawMesh:
@@ -66,10 +60,8 @@ def read_stl(path: Path) -> RawMesh:
     # Binary headers may begin with the text format's "solid"; the length cannot be mistaken.
     is_text = len(data) != promised or not num_triangles
     if is_text and b"\0" in data:  # never in text
-        raise ValueError(
-            f"{len(data)} bytes where its header promises {num_triangles} triangles, "
-            f"{promised} bytes"
-        )
+        said = f"{num_triangles} triangles, {promised} bytes"
+        raise ValueError(f"{len(data)} bytes where its header promises {said}")
     (vertices, faces, *_), _ = read_scene(data, "stl")
     # trimesh leaves out a text file's last solid if it is cut short.
     facets = re.finditer(rb"\bfacet\s+normal\b", data, re.IGNORECASE)
@@ -78,11 +70,9 @@ def read_stl(path: Path) -> RawMesh:
         raise ValueError(f"{begun} facets begun and {len(faces)} ended")
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():  # named here, where triangles have their numbers
-        corner = int(np.flatnonzero(~finite[faces.reshape(-1)])[0])
-        raise ValueError(
-            f"a coordinate that is not a finite number, triangle {corner // 3 + 1}, "
-            f"vertex {corner % 3 + 1}"
-        )
+        triangle, vertex = divmod(int(np.flatnonzero(~finite[faces.reshape(-1)])[0]), 3)
+        place = f"triangle {triangle + 1}, vertex {vertex + 1}"
+        raise ValueError(f"a coordinate that is not a finite number, {place}")
     return RawMesh(*weld(vertices, faces))
 
 
@@ -112,9 +102,8 @@ def read_3mf(path: Path) -> RawMesh:
         raise ValueError(f"{num_pieces} objects shown, {num_read} read")
     unit = str(mesh.unit).removesuffix("s")  # it calls the default one "millimeters"
     if unit not in UNITS_3MF:
-        raise UserError(
-            f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF), "export it in millimetres"
-        )
+        got, allowed = f"mesh {path} in the unit {unit!r}", ", ".join(UNITS_3MF)
+        raise UserError(got, allowed, "export it in millimetres")
     return mesh._replace(unit=UNITS_3MF[unit])
 
 
@@ -159,21 +148,17 @@ def read_glb(path: Path) -> RawMesh:
     header, binary = _chunks(path.read_bytes())
     files = [entry for kind in ("buffers", "images") for entry in header.get(kind, ())]
     if outside := [entry["uri"] for entry in files if "uri" in entry]:
-        raise UserError(
-            f"mesh {path} that needs the file {str(outside[0])[:60]!r}",
-            "a GLB file with its arrays and textures inside",
-            "export the mesh again as one binary file",
-        )
+        got = f"mesh {path} that needs the file {str(outside[0])[:60]!r}"
+        allowed = "a GLB file with its arrays and textures inside"
+        raise UserError(got, allowed, "export the mesh again as one binary file")
     primitives = [p for mesh in header.get("meshes", ()) for p in mesh["primitives"]]
     _check(header, primitives, len(binary))
     drawn = [p for p in primitives if p.get("mode", _TRIANGLES) >= _TRIANGLES]
     pictures = {_picture(header, primitive) for primitive in drawn}
     if len(pictures) > 1:
-        raise UserError(
-            f"mesh {path} with faces of {len(pictures)} textures",
-            "one texture for all faces, or none",
-            "bake them into one texture, or remove them",
-        )
+        got = f"mesh {path} with faces of {len(pictures)} textures"
+        fix = "bake them into one texture, or remove them"
+        raise UserError(got, "one texture for all faces, or none", fix)
     picture = next(iter(pictures), None)
     texture = None
     if picture is not None:

@@ -1,13 +1,11 @@
 """OBJ files with one texture, OFF files, and polygons cut into triangles.
 
-trimesh does not read OBJ files: it leaves out faces that are cut short or written with tabs, takes
-index 0 for a vertex and relative ones from the file's end, loses a texture without a word, and
-splits vertices where normals differ, so that the mesh would be another one
-(``tests/parts/mesh/test_library.py``). Here a damaged line is an error that names it. Normals,
-groups, lines, colours and all maps but ``map_Kd`` are left out: a part's look is its shape and its
-texture. The files that a mesh names are looked for in its own folder only. Nor does trimesh read
-OFF files: of one that is cut short it makes a smaller mesh, and it fails at polygons of more than
-four corners.
+trimesh does not read them (``tests/parts/mesh/test_library.py``). Of OBJ files it leaves out faces
+that are cut short or written with tabs, takes index 0 for a vertex and relative indices from the
+file's end, loses a texture without a word, and splits vertices where normals differ. Of an OFF file
+that is cut short it makes a smaller mesh, and it fails at pentagons. Here a damaged line is an
+error that names it. All but shape and ``map_Kd`` texture is left out. The files that a mesh names
+are looked for in its own folder only.
 """
 
 from __future__ import annotations
@@ -26,22 +24,19 @@ from dopepp.core.errors import UserError
 from dopepp.drawing.pictures import FORMATS, MAX_SIDE, Picture, read_picture
 from dopepp.parts.mesh import Faces, RawMesh, Vertices
 
-MAX_OFF_BYTES: Final = 50_000_000
-"""Of an OFF file: its words take fifteen times as much memory."""
-
+MAX_OFF_BYTES: Final = 50_000_000  # Of an OFF file: its words take fifteen times as much memory
 MAX_MATERIAL_BYTES: Final = 10_000_000
 """Size of a material file: a hundred thousand materials, and a bound on memory."""
 
-NO_COORDINATE: Final = -1
-"""Index of the texture coordinate of a corner that has none."""
+NO_COORDINATE: Final = -1  # Index of the texture coordinate of a corner that has none
 
 
 def read_obj(path: Path) -> RawMesh:
-    """Read an OBJ file: vertices in the file's unit, faces, and uv and texture where it has one.
+    """Read an OBJ file; a vertex with several texture coordinates (on a seam) becomes several.
 
-    A textured vertex that has several texture coordinates (on a seam) becomes several vertices. A
-    UserError: a line is damaged, a polygon is not convex, a material file or a texture is missing,
-    outside of the folder or damaged, or there is more than one texture.
+    Raises:
+        UserError: A line is damaged, a polygon is not convex, a material file or a texture is
+            missing, outside of the folder or damaged, or there is more than one texture.
     """
     obj = ObjFile()
     for number, line in enumerate(_text(path).replace("\\\n", " ").split("\n"), start=1):
@@ -58,20 +53,16 @@ def read_obj(path: Path) -> RawMesh:
     try:
         corners = corners[fans(positions, corners[:, 0], np.array(obj.counts, np.int64))]
     except FoldedPolygonError as error:
-        raise UserError(
-            f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}",
-            "triangles and convex polygons",
-            "switch on 'triangulate' when exporting the mesh",
-        ) from error
+        got = f"mesh {path} with a polygon that is not convex in line {obj.lines[error.number]}"
+        fix = "switch on 'triangulate' when exporting the mesh"
+        raise UserError(got, "triangles and convex polygons", fix) from error
     texture = _texture(obj, path)
     if texture is None:
         return RawMesh(positions, corners[..., 0])
     if (corners[..., 1] == NO_COORDINATE).any():
-        raise UserError(
-            f"textured mesh {path} with faces without texture coordinates",
-            "texture coordinates (vt) on every face",
-            "unwrap the whole mesh, or delete its map_Kd line",
-        )
+        got = f"textured mesh {path} with faces without texture coordinates"
+        fix = "unwrap the whole mesh, or delete its map_Kd line"
+        raise UserError(got, "texture coordinates (vt) on every face", fix)
     pairs, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     uv = np.array(obj.coordinates, np.float64).reshape(-1, 2)[pairs[:, 1]]
     return RawMesh(positions[pairs[:, 0]], faces.reshape(-1, 3), uv, texture)
@@ -79,21 +70,14 @@ def read_obj(path: Path) -> RawMesh:
 
 @dataclass
 class ObjFile:
-    """An OBJ file's statements, indices from 0; arrays take a tenth of the memory of lists.
+    """An OBJ file's statements, indices from 0; arrays take a tenth of the memory of lists."""
 
-    Attributes:
-        positions: x, y, z of each ``v`` line, one after the other.
-        coordinates: u, v of each ``vt`` line.
-        corners: Position and coordinate index of each corner of each ``f`` line.
-        materials: Names of the materials that faces use; None for faces before any ``usemtl``.
-    """
-
-    positions: array[float] = field(default_factory=lambda: array("d"))
-    coordinates: array[float] = field(default_factory=lambda: array("d"))
-    corners: array[int] = field(default_factory=lambda: array("q"))
-    counts: array[int] = field(default_factory=lambda: array("q"))
-    lines: array[int] = field(default_factory=lambda: array("q"))
-    materials: set[str | None] = field(default_factory=set)
+    positions: array[float] = field(default_factory=lambda: array("d"))  # x, y, z of each v
+    coordinates: array[float] = field(default_factory=lambda: array("d"))  # u, v of each vt
+    corners: array[int] = field(default_factory=lambda: array("q"))  # position, coordinate index
+    counts: array[int] = field(default_factory=lambda: array("q"))  # corners of each f
+    lines: array[int] = field(default_factory=lambda: array("q"))  # line number of each f
+    materials: set[str | None] = field(default_factory=set)  # None: before any usemtl
     libraries: list[str] = field(default_factory=list)
     _material: str | None = None
 
@@ -147,31 +131,25 @@ def _texture(obj: ObjFile, path: Path) -> Picture | None:
         maps |= _colour_maps(companion_path(path, library, "mtllib"))
     unknown = sorted(name for name in obj.materials if name not in maps and name is not None)
     if unknown:
-        raise UserError(
-            f"mesh {path} that uses the material {unknown[0]!r}",
-            f"materials of {', '.join(obj.libraries)}",
-            "export the mesh again together with its materials",
-        )
+        got = f"mesh {path} that uses the material {unknown[0]!r}"
+        allowed = f"materials of {', '.join(obj.libraries)}"
+        fix = "export the mesh again together with its materials"
+        raise UserError(got, allowed, fix)
     used = {maps[name] for name in obj.materials}
     if len(used) > 1:
-        raise UserError(
-            f"mesh {path} with faces of {len(used)} textures ({', '.join(map(str, used))})",
-            "one texture for all faces, or none",
-            "bake them into one texture, or delete the map_Kd lines",
-        )
+        got = f"mesh {path} with faces of {len(used)} textures ({', '.join(map(str, used))})"
+        fix = "bake them into one texture, or delete the map_Kd lines"
+        raise UserError(got, "one texture for all faces, or none", fix)
     name = next(iter(used), None)
     return None if name is None else read_texture(companion_path(path, name, "map_Kd"))
 
 
 def _colour_maps(path: Path) -> dict[str | None, str | None]:
     """Return the file name of each MTL material's colour map, None for one without."""
-    # A map with options is refused, as they would change how it lies on the part.
-    if path.stat().st_size > MAX_MATERIAL_BYTES:
-        raise UserError(
-            f"material file {path} of {path.stat().st_size / 1e6:.0f} MB",
-            f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB",
-            "keep only the materials that the mesh uses",
-        )
+    if (size := path.stat().st_size) > MAX_MATERIAL_BYTES:
+        allowed = f"up to {MAX_MATERIAL_BYTES / 1e6:.0f} MB"
+        fix = "keep only the materials that the mesh uses"
+        raise UserError(f"material file {path} of {size / 1e6:.0f} MB", allowed, fix)
     maps: dict[str | None, str | None] = {}
     material: str | None = None
     for line in _text(path).split("\n"):
@@ -180,12 +158,10 @@ def _colour_maps(path: Path) -> dict[str | None, str | None]:
             material = " ".join(rest.split())
             maps[material] = None
         elif keyword.lower() == "map_kd":
-            if rest.strip().startswith("-"):
-                raise UserError(
-                    f"material file {path} with map_Kd {rest.strip()!r}",
-                    "a file name without options",
-                    "bake scale and offset into the texture coordinates",
-                )
+            if rest.strip().startswith("-"):  # options change how a map lies on the part
+                got = f"material file {path} with map_Kd {rest.strip()!r}"
+                fix = "bake scale and offset into the texture coordinates"
+                raise UserError(got, "a file name without options", fix)
             maps[material] = rest.strip()
     return maps
 
@@ -196,27 +172,21 @@ def _text(path: Path) -> str:
 
 
 def companion_path(mesh_path: Path, name: str, statement: str) -> Path:
-    """Return the path of a file that a mesh file names.
+    """Return the path of a file that a statement of a mesh file names.
 
-    ``name`` is relative to the mesh's folder, Windows separators are understood; ``statement``
-    tells, for the error, where it stands. A UserError: the name leads out of the mesh's folder, or
-    there is no such file.
+    Raises:
+        UserError: The name leads out of the mesh's folder, or there is no such file.
     """
     folder = mesh_path.parent.resolve()
     written = PureWindowsPath(name)  # splits at / and at \, and knows C:
     path = (folder / written.as_posix()).resolve()
+    got = f"{mesh_path} whose {statement} {name!r}"
     if written.anchor or not path.is_relative_to(folder):
-        raise UserError(
-            f"{mesh_path} whose {statement} {name!r} lies outside of its folder",
-            "files in the mesh's folder or below it",
-            "copy the file beside the mesh and write its plain name",
-        )
+        fix = "copy the file beside the mesh and write its plain name"
+        raise UserError(f"{got} lies outside of its folder", "files in it or below it", fix)
     if not path.is_file():
-        raise UserError(
-            f"{mesh_path} whose {statement} {name!r} does not exist",
-            "a file in the mesh's folder",
-            "put the file there, or delete the line for a part without texture",
-        )
+        fix = "put the file there, or delete the line for a part without texture"
+        raise UserError(f"{got} does not exist", "a file in the mesh's folder", fix)
     return path
 
 
@@ -225,19 +195,12 @@ def read_texture(path: Path) -> Picture:
     try:
         return read_picture(path)
     except ValueError as error:
-        raise UserError(
-            f"texture {path}: {error}",
-            f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels",
-            "replace the image",
-        ) from error
+        allowed = f"a whole {', '.join(FORMATS)} image of at most {MAX_SIDE}×{MAX_SIDE} pixels"
+        raise UserError(f"texture {path}: {error}", allowed, "replace the image") from error
 
 
 def read_off(path: Path) -> RawMesh:
-    """Read an OFF file of triangles and convex polygons; colours are left out.
-
-    A ValueError: the file has other lines than it promises, a line fewer numbers than it promises,
-    or a polygon is not convex.
-    """
+    """Read an OFF file of triangles and convex polygons, without colours; else a ValueError."""
     if path.stat().st_size > MAX_OFF_BYTES:
         raise ValueError(f"over {MAX_OFF_BYTES / 1e6:.0f} MB of text")
     header, mark, text = re.sub("#.*", "", path.read_text("utf-8")).partition("OFF")
@@ -265,9 +228,12 @@ def fans(
 ) -> Int[np.ndarray, "triangles 3"]:
     """Cut polygons into fans of triangles around their first corners, as places in ``corners``.
 
-    ``corners`` has the vertex at each corner, one polygon behind the other; ``counts`` the corners
-    of each. A ValueError: a polygon has fewer than three corners or, as a
-    :class:`FoldedPolygonError`, is not convex. A vertex that is not there is the caller's to name.
+    ``corners`` has the vertex at each corner, polygon by polygon, and ``counts`` their numbers of
+    corners. The caller refuses vertices that do not exist.
+
+    Raises:
+        FoldedPolygonError: A polygon is not convex.
+        ValueError: A polygon has fewer than three corners.
     """
     if (counts < 3).any():
         raise ValueError(f"face {int((counts < 3).argmax())} of fewer than 3 corners")

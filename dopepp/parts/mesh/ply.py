@@ -1,10 +1,9 @@
 """PLY files: text and both byte orders, polygons, any further elements and properties.
 
-trimesh does not read them, as only who reads a file's every list can tell that it is whole: it
-refuses a binary file of triangles and quads, or takes it for others where their sizes happen to
-agree, and of a text that ends too early it makes a smaller mesh. It would also put a quad's
-triangles in another order, and a mesh's hash is what checkpoints and render caches know it by
-(``tests/parts/mesh/test_library.py``).
+trimesh does not read them (``tests/parts/mesh/test_library.py``): it refuses a binary file of
+triangles and quads, or takes it for others where their sizes agree, makes a smaller mesh of a text
+that ends too early, and puts a quad's triangles in another order, which changes the mesh's hash.
+plyfile's licence is the GPL.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ _ROUNDING: Final = 1e-3
 
 
 class Column(NamedTuple):
-    """A property: its name, the type of its numbers and, of a list, that of its length.
-
-    Numbers of a text are doubles, whatever type is ``declared``.
-    """
+    """A property: its name, the type of its numbers (doubles in a text) and of a list's length."""
 
     name: str
     number: np.dtype[Any]
@@ -70,13 +66,14 @@ Table = dict[str, NDArray[Any]]
 
 
 def read_ply(path: Path) -> RawMesh:
-    """Read a PLY file with its vertices' colours and normals, and the texture that it names.
+    """Read a PLY file with its vertices' colours and normals.
 
-    The texture stands in a ``TextureFile`` comment and takes the colours' place.
+    A texture, named by a ``TextureFile`` comment, takes the colours' place.
 
-    A UserError: the texture is missing, damaged or outside of the folder. Other ValueErrors: the
-    file is damaged, has no vertices or faces, has a polygon that is not convex or a colour that is
-    none, or names several textures, or one without texture coordinates per vertex.
+    Raises:
+        UserError: The texture is missing, damaged or outside of the folder.
+        ValueError: The file is damaged, has no vertices or faces, a polygon that is not convex, a
+            colour out of range, several textures, or one without coordinates per vertex.
     """
     header, body = _split(path.read_bytes())
     lines = [line.split() for line in header.decode("utf-8", "surrogateescape").splitlines()]

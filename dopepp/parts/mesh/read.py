@@ -1,8 +1,7 @@
 """Mesh files and YCB-Video models, in metres, checked before they are used.
 
-Triangles are made to face the same way, and no vertex is moved. Self-intersecting triangles are not
-looked for: the depth test of every renderer shows the outermost surface whether triangles pass
-through each other or not.
+Triangles are made to face the same way, and no vertex is moved. Triangles may pass through each
+other: the depth test of every renderer shows the outermost surface.
 
 To add a format, write a reader that returns a :class:`RawMesh` and raises for a damaged file, and
 one line in :data:`READERS`.
@@ -29,15 +28,11 @@ from dopepp.parts.mesh.ply import read_ply
 from dopepp.parts.part import UNITS, Mesh, Part, make_part
 
 logger = logging.getLogger(__name__)
-ASSUMED_UNIT: Final = "mm"
-"""What CAD programs write into files that cannot state a unit."""
-
+ASSUMED_UNIT: Final = "mm"  # What CAD programs write into files that cannot state a unit
 MAX_BYTES: Final = 250_000_000
 """Five million triangles: far beyond any use here, and a bound on memory."""
 
-MAX_POINTS_BYTES: Final = 20_000_000
-"""Of a ``points.xyz``: half a million points."""
-
+MAX_POINTS_BYTES: Final = 20_000_000  # Of a ``points.xyz``: half a million points
 READERS: Final[dict[str, Callable[[Path], RawMesh]]] = {
     ".stl": read_stl,
     ".obj": read_obj,
@@ -91,10 +86,9 @@ def read_in_unit(path: str | Path, unit: str | None = None) -> tuple[Mesh, str]:
         raw = reader(path)
     except UserError:
         raise
-    except ValueError as error:
-        raise _damaged(path, str(error)) from error
     except Exception as error:  # whatever a parser makes of a damaged file
-        raise _damaged(path, f"{type(error).__name__}: {error}") from error
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise _damaged(path, f"{kind}{error}") from error
     taken = unit or raw.unit or ASSUMED_UNIT
     mesh = _checked(path, raw._replace(vertices=UNITS[taken] * raw.vertices))
     if unit is None and raw.unit is None:
