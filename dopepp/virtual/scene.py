@@ -16,11 +16,9 @@ from dopepp.parts.part import Part
 from dopepp.virtual.sensor import Sensor
 from dopepp.virtual.surface import Surface
 
-NEAR: Final = 0.01
-"""Metres; nothing closer to the camera is drawn."""
+NEAR: Final = 0.01  # metres; nothing closer to the camera is drawn
 
-Triple = tuple[float, float, float]
-"""A vector or a colour, so that what holds one can be compared and shown."""
+Triple = tuple[float, float, float]  # a vector or a colour that can be compared and shown
 
 
 def triple(values: Iterable[float]) -> Triple:
@@ -31,13 +29,11 @@ def triple(values: Iterable[float]) -> Triple:
 
 @dataclass(frozen=True)
 class Grooves:
-    """Fine parallel grooves: the layer lines of a 3D print, the streaks of brushed metal.
-
-    They tilt the surface's normal. Finer than a pixel they only widen the highlight.
+    """Fine parallel grooves that tilt a surface's normal: layer lines of a print, brushed metal.
 
     Attributes:
         axis: Unit vector, object frame, along which groove follows groove.
-        pitch: Metres from one groove to the next.
+        pitch: Metres from one groove to the next; finer than a pixel, they widen the highlight.
         slope: Largest slope of a groove's flanks, the tangent of the normal's tilt.
         irregularity: 0 for even grooves (layer lines), 1 for random depths and widths (brushing).
     """
@@ -48,8 +44,7 @@ class Grooves:
     irregularity: float = 0.0
 
 
-NOISE_LIMITS: Final = (0.05, 2.0)
-"""Least and greatest factor of a material's noise on its albedo."""
+NOISE_LIMITS: Final = (0.05, 2.0)  # factors of a material's noise on its albedo
 
 
 @dataclass(frozen=True)
@@ -57,14 +52,11 @@ class Material:
     """How a surface reflects light (Lambert plus GGX, metallic workflow).
 
     Attributes:
-        colour: Linear albedo in [0, 1] per channel; a factor on a surface's own colours where it
-            has some.
+        colour: Linear albedo in [0, 1] per channel; a factor on colours of the surface's own.
         roughness: GGX roughness in (0, 1]; 1 is chalk.
         specular: Reflectance at normal incidence of the dielectric part, 0.04 for plastics.
-        metallic: 0 is a dielectric, 1 a metal: no diffuse light, and the colour is its reflectance
-            at normal incidence.
-        noise: Relative amplitude of the albedo's variation over the surface, which is kept within
-            :data:`NOISE_LIMITS` times the albedo.
+        metallic: 1 for a metal: no diffuse light, and the colour is its reflectance.
+        noise: Relative amplitude of the albedo's variation, kept within :data:`NOISE_LIMITS`.
         noise_pitch: Size of that variation, metres.
     """
 
@@ -93,10 +85,9 @@ class Light:
 
 @dataclass(frozen=True)
 class Ambient:
-    """Light from everywhere: a hemisphere above and one below.
+    """Light from everywhere: linear RGB of a hemisphere ``above`` and one ``below``.
 
-    ``up`` is a unit vector to the upper hemisphere, camera frame; ``above`` and ``below`` are
-    linear RGB.
+    ``up`` is a unit vector to the upper hemisphere, camera frame.
     """
 
     up: Triple = (0.0, -1.0, 0.0)
@@ -106,15 +97,14 @@ class Ambient:
 
 @dataclass(frozen=True)
 class Plane:
-    """A supporting plane, unbounded: the table the objects lie on.
+    """An unbounded supporting plane: the table that objects lie on.
 
     Its look is the scene's background, which is a picture of it already; a renderer only darkens
-    it where objects keep light from it. It belongs to the depth, not to the instances.
+    the plane where objects keep light from it. It belongs to the depth, not to the instances.
 
     Attributes:
         normal: Unit vector away from the plane, on the camera's side, camera frame.
-        offset: ``normal · x`` of the plane's points, metres; negative, because the camera (at 0)
-            is above the plane.
+        offset: ``normal · x`` of the plane's points, metres; negative, as the camera is above.
     """
 
     normal: Triple

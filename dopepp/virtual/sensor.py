@@ -1,8 +1,8 @@
 """The sensor: what lens, chip and file make of an ideal picture, and how often they do.
 
-Every step is a pure function of its arguments. To add one, write a function like those below, give
-:class:`~dopepp.virtual.scene.Sensor` its parameter, :class:`Sensors` its probability and range, and
-call it in :func:`capture`, where the order is the order of a camera: exposure, lens, chip, file.
+To add a step, write a function like those below, give :class:`Sensor` its parameter,
+:class:`Sensors` its probability and range, and call it in :func:`capture`, in a camera's order:
+exposure, lens, chip, file. The end of the module holds sRGB and the camera's tone curve.
 """
 
 from __future__ import annotations
@@ -25,11 +25,8 @@ from dopepp.drawing.pictures import Picture
 
 Probability = Annotated[float, Range(0.0, 1.0, "probability")]
 
-_NOISE_VALUES: Final = 65536
-"""Length of the table of normal values that noise is read from; a power of two."""
-
-_NOISE_RUN: Final = 1024
-"""So many values are read in a row; then the hash chooses another place of the table and a sign."""
+_NOISE_VALUES: Final = 65536  # length of the table of normal values; a power of two
+_NOISE_RUN: Final = 1024  # values read in a row; then the hash chooses another place and a sign
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,7 @@ class Sensor:
         exposure_ev: Stops by which the picture is brighter; 1 doubles the light.
         motion_px: Displacement (x, y) of the image during the exposure, pixels.
         read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of the signal-dependent noise at white, grey levels of 255;
-            it falls with the square root of the signal.
+        shot_noise: That of the signal-dependent noise at white; it falls with the signal's root.
     """
 
     exposure_ev: float = 0.0
@@ -55,17 +51,9 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Sensors(Checked):
-    """Probabilities and ranges of what a camera does to the light.
+    """Probabilities and ranges of a :class:`Sensor`; ``motion_px`` is the displacement's length.
 
     Blur and motion belong to the preset's image size and follow it when it is resized.
-
-    Attributes:
-        exposure_ev: By how much, stops.
-        blur_px: Its standard deviation, pixels.
-        motion_px: Its length, pixels.
-        read_noise: Standard deviation of the signal-independent noise, grey levels of 255.
-        shot_noise: Standard deviation of the signal-dependent noise at white, grey levels.
-        jpeg_quality: Its quality, 1 to 100.
     """
 
     exposure_probability: Probability = 0.5
@@ -87,10 +75,8 @@ class Sensors(Checked):
 
     def draw(self, rng: Generator) -> Sensor:
         """Draw a sensor's settings."""
-        on = rng.random(5) < (
-            self.exposure_probability, self.blur_probability, self.motion_probability,
-            self.noise_probability, self.jpeg_probability,
-        )  # fmt: skip
+        steps = ("exposure", "blur", "motion", "noise", "jpeg")
+        on = rng.random(5) < [getattr(self, f"{step}_probability") for step in steps]
         direction, length = rng.uniform(0, 2 * np.pi), rng.uniform(*self.motion_px)
         motion = (float(length * np.cos(direction)), float(length * np.sin(direction)))
         # Every number is drawn whether it is used or not, so a probability changes nothing else.
@@ -142,9 +128,8 @@ def motion_blur(image: Picture, motion_px: tuple[float, float]) -> Picture:
 def add_noise(image: Picture, read: float, shot: float, seed: int) -> Picture:
     """Add Gaussian noise, independent per pixel and channel.
 
-    ``read`` and ``shot`` are standard deviations in grey levels of 255: of the signal-independent
-    part, and at white of the signal-dependent one, whose square is proportional to the grey level.
-    The same ``seed`` (0 to 2³² − 1) gives the same noise.
+    ``read`` and ``shot`` are as in :class:`Sensor`; the same ``seed`` (0 to 2³² − 1) gives the same
+    noise.
     """
     noisy = np.empty(image.shape, np.uint8)
     values = np.ascontiguousarray(image).reshape(-1)
@@ -206,11 +191,10 @@ def _shuffle(values: Array) -> None:
 def _add_noise(
     image: Array, read: np.float32, shot: np.float32, table: Array, seed: int, noisy: Array
 ) -> None:
-    """Add noise from the table (normal values, ``_NOISE_RUN`` more than a power of two), in runs.
+    """Add noise from the table (``_NOISE_RUN`` more values than a power of two) in runs.
 
-    ``image`` and ``noisy``, the result, are flat uint8. ``read`` is the variance of the
-    signal-independent part, squared grey levels; ``shot`` that of the signal-dependent part per
-    grey level.
+    ``image`` and ``noisy`` are flat uint8; ``read`` is a variance in squared grey levels, ``shot``
+    one per grey level.
     """
     count, mask = image.shape[0], np.uint32(table.shape[0] - _NOISE_RUN - 1)
     start = _mixed(np.uint32(seed) ^ np.uint32(0x9E3779B9))
@@ -249,17 +233,14 @@ def encode_srgb(light: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 SRGB_TO_LINEAR: Final[NDArray[np.float32]] = decode_srgb(np.arange(256) / 255).astype(np.float32)
 """sRGB code 0–255 to linear light in [0, 1]."""
 
-CODE_STEPS: Final = 4096
-"""Steps of the tables that encode light, per unit of light."""
+CODE_STEPS: Final = 4096  # of the tables that encode light, per unit of light
 
 LINEAR_TO_SRGB: Final[NDArray[np.float32]] = (
     255 * encode_srgb(np.arange(CODE_STEPS + 1) / CODE_STEPS)
 ).astype(np.float32)
 """Linear light in steps of 1/4096 to an sRGB value of 0–255, the inverse of SRGB_TO_LINEAR."""
 
-TONE_LIMIT: Final = 4.0
-"""Radiance at which the tone curve ends, white to 1/1000."""
-
+TONE_LIMIT: Final = 4.0  # radiance at which the tone curve ends, white to 1/1000
 _SHOULDER: Final = 0.5
 _radiance = np.arange(int(TONE_LIMIT) * CODE_STEPS + 1) / CODE_STEPS
 # Linear up to the shoulder; above, it bends smoothly towards 1, as a camera's curve does, so that

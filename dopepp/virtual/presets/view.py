@@ -1,7 +1,7 @@
 """A camera at work: from a lens, distances and parts to pictures as that camera takes them.
 
-The network sees the camera's pictures scaled down, so that parts have the sizes in pixels that
-networks learn well, and learns on windows of them: a part covers a small share of a large picture.
+The network sees these pictures scaled down, so that parts have the sizes in pixels that networks
+learn well, and learns on windows of them: a part covers a small share of a large picture.
 """
 
 from __future__ import annotations
@@ -24,27 +24,25 @@ from dopepp.virtual.sensor import Sensors
 
 _log = logging.getLogger(__name__)
 
+# Diameters of a part in the network's picture. Networks here fail below the first, and learn with
+# parts of 45 to 110 pixels, 70 in the geometric mean; a range of sizes whose ends differ by more
+# than the ratio takes much longer to learn.
 FEWEST_PX: Final = 25.0
-"""Of a part's diameter in the network's picture; networks here fail below."""
-
 _FINE_PX: Final = 45.0
 _USUAL_PX: Final = 70.0
 _WIDE_RATIO: Final = 3.5
-"""Networks here learn with parts of 45 to 110 pixels, 70 in the geometric mean. Of a range of
-sizes whose ends differ by more than the ratio, they have to learn much more."""
 
 _ROOM: Final = 1.3
 """The shorter side of a window over the diameter of the largest part in it."""
 
 _MULTIPLE: Final = 32
-"""What both sides of a window are multiples of, pixels."""
+"""Both sides of a window are multiples of it, pixels."""
 
 _MOST_BLUR: Final = 10.0
-"""A sharp lens takes large pictures: in them, blur is at most so many times that of small ones."""
+"""A sharp lens takes large pictures: blur in them is at most so many times that of small ones."""
 
 _BEYOND: Final = 1.25
-"""On a table, parts are at other depths than the point that the camera looks at, by this at most.
-"""
+"""On a table, a part's depth differs from that of the point the camera looks at by this at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,32 +82,31 @@ class View:
         return focal * min(diameters) / far, focal * max(diameters) / near
 
     def check(self, parts: Sequence[Part], scale: float = 1.0) -> None:
-        """Refuse parts that are larger than the picture, or too small in it, with what would do."""
+        """Refuse parts that are larger than the picture, or too small in it."""
         smallest, largest = self.sizes_px(parts)
         width, height = self.size
         if largest > min(width, height):
-            nearest = self.distance[0] * largest / min(width, height)
+            nearest = math.ceil(1000 * self.distance[0] * largest / min(width, height)) / 1000
             raise UserError(
                 f"working_distance from {self.distance[0]:g} m, where {_named(parts, max)} has "
                 f"{largest:.0f} pixels in pictures of {width}×{height}",
                 "parts that fit into the picture, however they are turned",
-                f"start at {_rounded(nearest, math.ceil):g} m",
+                f"start at {nearest:g} m",
             )
         if scale * smallest < FEWEST_PX:
-            farthest = self.distance[1] * scale * smallest / FEWEST_PX
+            farthest = math.floor(1000 * self.distance[1] * scale * smallest / FEWEST_PX) / 1000
             raise UserError(
                 f"working_distance to {self.distance[1]:g} m, where {_named(parts, min)} has "
                 f"{scale * smallest:.0f} pixels in the camera's picture scaled by {scale:g}",
                 f"at least {FEWEST_PX:g} pixels",
-                f"end at {_rounded(farthest, math.floor):g} m, or take a longer lens or larger "
-                "pictures",
+                f"end at {farthest:g} m, or take a longer lens or larger pictures",
             )
 
     def scale_for(self, parts: Sequence[Part], window: Size | None = None) -> float:
-        """Choose how much the network sees the camera's pictures scaled by, at most 1.
+        """Choose by how much the network sees the camera's pictures scaled, at most 1.
 
-        Parts are to have the sizes that networks learn well: the farthest no fewer than 45 pixels
-        where the camera gives so many. The nearest is to fit into a given window.
+        The farthest part has no fewer than 45 pixels where the camera gives so many; the nearest
+        fits into a given window.
         """
         smallest, largest = self.sizes_px(parts)
         scale = max(_USUAL_PX / math.sqrt(smallest * largest), _FINE_PX / smallest)
@@ -119,22 +116,16 @@ class View:
 
     def window_for(self, parts: Sequence[Part], scale: float) -> Size:
         """Choose the window's size: a square with room for the largest part."""
-        width, height = (_multiple(scale * side) for side in self.size)
-        side = _multiple(_ROOM * self.sizes_px(parts, scale)[1])
+        lengths = _ROOM * self.sizes_px(parts, scale)[1], *(scale * side for side in self.size)
+        side, width, height = (_MULTIPLE * math.ceil(length / _MULTIPLE) for length in lengths)
         return min(side, width), min(side, height)
 
     def window(self, preset: Preset, scale: float, size: Size) -> Preset:
-        """Return a preset's scenes as the network sees this camera's pictures, in windows.
-
-        The preset's sensors belong to these pixels.
-        """
+        """Return a preset's scenes, whose sensors stay, in windows of what the network sees."""
         return self._seen(preset, scale, preset.sensors, size)
 
     def whole(self, preset: Preset, scale: float) -> Preset:
-        """Return a preset's scenes in this camera's whole pictures.
-
-        Scaled to what the network sees, they are as blurred as :meth:`window`.
-        """
+        """Return a preset's scenes in this camera's whole pictures; scaled, as blurred as there."""
         return self._seen(preset, 1.0, preset.sensors.resized(min(1 / scale, _MOST_BLUR)), None)
 
     def _seen(self, preset: Preset, scale: float, sensors: Sensors, window: Size | None) -> Preset:
@@ -152,7 +143,7 @@ class View:
     def in_words(
         self, parts: Sequence[Part], scale: float = 1.0, window: Size | None = None
     ) -> list[str]:
-        """Say how large parts are in what the network sees, and what is unfavourable about it."""
+        """Describe how large the network sees parts, and what is unfavourable about that."""
         near, far = (1000 * end / (scale * focal_length(self.K)) for end in self.distance)
         smallest, largest = self.sizes_px(parts, scale)
         across, down = (
@@ -189,8 +180,8 @@ class View:
 def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
     """Read a camera's file and return the size of its pictures and K, pixels.
 
-    Pictures are rendered without distortion, which the log says of a lens that has any. A
-    UserError: the file cannot be read, or does not state the size.
+    Raises:
+        UserError: The file cannot be read, or does not state the size.
     """
     camera = read_camera(path)
     if camera.size is None:
@@ -204,16 +195,7 @@ def read_lens(path: str | Path) -> tuple[Size, CameraMatrix]:
     return camera.size, camera.K
 
 
-def _multiple(length: float) -> int:
-    return _MULTIPLE * math.ceil(length / _MULTIPLE)
-
-
 def _named(parts: Sequence[Part], choose: Callable[..., Part]) -> str:
     """Name the part that is chosen by its diameter."""
-    part = choose(parts, key=lambda one: one.diameter)
+    part = choose(parts, key=lambda part: part.diameter)
     return f"{part.name} ({1000 * part.diameter:.0f} mm across)"
-
-
-def _rounded(metres: float, towards: Callable[[float], int]) -> float:
-    """Round to millimetres, up or down."""
-    return towards(1000 * metres) / 1000

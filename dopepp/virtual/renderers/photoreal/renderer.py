@@ -2,15 +2,19 @@
 
 Objects stand in the light that the rasteriser gives them, but lamps have a size, light goes from
 object to object, and surfaces mirror their surroundings. The picture is laid over the background
-in linear light; what objects do to the light on a supporting plane is in ``table``.
+in linear light.
+
+A matt disc stands for a supporting plane, whose picture is the background. Where the path tracer
+sees the disc, its light over its light without objects is the factor for the background: shadows,
+and light that objects throw on it.
 
 The same scene gives the same bytes on the same machine, whatever the number of threads. Workers
-must be spawned, or forked before the first image. ``variant`` lists the environment variables that
+must be spawned, or forked before the first image. The package lists the environment variables that
 choose Mitsuba's variant and the number of threads.
 
-Importing this needs the extra ``photoreal``. pyoidn's C interface is called directly: the package
-itself imports torch wherever that is installed, which takes seconds and memory that rendering does
-without.
+Importing this module needs the extra ``photoreal``. pyoidn's C interface is called directly: the
+package itself imports torch wherever that is installed, which takes seconds and memory that
+rendering does without.
 """
 
 from __future__ import annotations
@@ -23,30 +27,35 @@ from runpy import run_path
 from types import SimpleNamespace
 from typing import Any, Final
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from dopepp.core.errors import require
 from dopepp.drawing.pictures import Picture
+from dopepp.geometry.rotation import Vector
 from dopepp.virtual.renderers.photoreal import mitsuba, num_threads
-from dopepp.virtual.renderers.photoreal.scene import bounding_sphere, make_shapes, make_surroundings
-from dopepp.virtual.renderers.photoreal.table import (
-    Area,
-    TableTop,
-    View,
+from dopepp.virtual.renderers.photoreal.scene import (
+    Film,
+    bounding_sphere,
     cast,
-    make_view,
+    make_film,
+    make_shapes,
+    make_surroundings,
     pixel_rays,
-    shadowed,
-    split_light,
+    rgb,
 )
 from dopepp.virtual.renderers.raster import visible_fractions
 from dopepp.virtual.renderers.raster.visibility import Box, backdrop, box_around, project_object
 from dopepp.virtual.scene import Rendered, Scene
-from dopepp.virtual.sensor import CODE_STEPS, TONE_CURVE
+from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR, TONE_CURVE
 
 require("mitsuba", "renderer 'photoreal'", "photoreal")
 require("pyoidn", "renderer 'photoreal'", "photoreal")
+
+Area = tuple[slice, slice]
+Colours = Float[np.ndarray, "height width 3"]
+Depth = Float32[np.ndarray, "height width"]
 
 SAMPLES_PER_PIXEL: Final = 16
 
@@ -54,41 +63,44 @@ _PATHS: Final = {"type": "path", "max_depth": 6, "hide_emitters": True}
 """Light that bounces off at most five surfaces; lamps are seen in reflections only."""
 
 _GUIDES: Final = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
-"""What the denoiser is told of the surfaces; in one pass with the light it takes far longer."""
+"""What the denoiser learns of the surfaces; in one pass with the light it takes far longer."""
 
-_MARGIN_PX: Final = 1
-"""Around the objects' pixels: what covers a pixel's rim, and what the denoiser looks at."""
+_MARGIN_PX: Final = 1  # around the objects: what covers a pixel's rim, and what the denoiser sees
 
 _RADIANCE_OF_CODE: Final = np.interp(
     np.arange(256), TONE_CURVE, np.arange(len(TONE_CURVE)) / CODE_STEPS
 ).astype(np.float32)
 """The radiance that the tone curve shows as a code of 0–255."""
 
-_FLOAT3: Final = 3
-"""``OIDN_FORMAT_FLOAT3``."""
+_ALBEDO: Final = (0.05, 0.8)  # bounds of the disc's albedo, estimated from its picture and light
+_LEAST_LIGHT: Final = 1e-3  # radiance of a white table below which no shadow is cast
+_SPREAD_PX: Final = 2.0  # width over which a shadow is carried on under an object's rim
+_FLOAT3: Final = 3  # OIDN_FORMAT_FLOAT3
 
 
 def render(scene: Scene) -> Rendered:
     """Render a scene; one without objects is its background.
 
-    A UserError, where Mitsuba cannot run in this process (see ``variant``).
+    Raises:
+        UserError: Mitsuba cannot run in this process (see the package).
     """
     image, depth, instances = backdrop(scene)
     fractions = visible_fractions(scene)
     window = _objects_window(scene)
-    if window is None and (scene.plane is None or not scene.objects):
-        return Rendered(image, depth, instances, fractions, scene)
-    mi = mitsuba()
-    shapes = make_shapes(mi, scene)
-    if scene.plane is not None:
-        _paint_on_table(mi, scene, shapes, window, depth, image)
-    if window is not None:
-        _label(mi, scene, shapes, window, depth, instances)
-        if scene.plane is None:
-            view = make_view(scene.K, window)
-            film = view.resampled(_trace(mi, scene, _world(shapes), view))
+    if window is not None or (scene.plane is not None and scene.objects):
+        tracer = Tracer(scene)
+        if scene.plane is not None:
+            tracer.paint_on_table(window, depth, image)
+        if window is not None:
             area = _slices(window)
-            image[area] = _over(film[..., :3], film[..., 3], image[area])
+            seen, numbers = tracer.cast(window)
+            nearer = (numbers >= 0) & ((depth[area] == 0) | (seen < depth[area]))
+            depth[area] = np.where(nearer, seen, depth[area])
+            instances[area] = np.where(nearer, numbers, -1)
+            if scene.plane is None:
+                film = make_film(scene.K, window)
+                traced = film.resampled(tracer.trace(tracer.world, film))
+                image[area] = _over(traced[..., :3], traced[..., 3], image[area])
     return Rendered(image, depth, instances, fractions, scene)
 
 
@@ -104,89 +116,68 @@ def _objects_window(scene: Scene) -> Box | None:
     )  # fmt: skip
 
 
-def _label(
-    mi: Any,
-    scene: Scene,
-    shapes: list[Any],
-    window: Box,
-    depth: Float32[np.ndarray, "height width"],
-    instances: np.ndarray,
-) -> None:
-    """Write what the pixels' centres see over the plane's depth."""
-    world = mi.load_dict(_world(shapes), parallel=False)
-    seen, numbers = cast(mi, world, shapes, pixel_rays(scene.K, window))
-    area = _slices(window)
-    nearer = (numbers >= 0) & ((depth[area] == 0) | (seen < depth[area]))
-    depth[area] = np.where(nearer, seen, depth[area])
-    instances[area] = np.where(nearer, numbers, -1)
+class Tracer:
+    """Mitsuba's view of a scene with objects.
+
+    Attributes:
+        world: Mitsuba's description of the objects.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._mi = scene, mitsuba()
+        self._shapes = make_shapes(self._mi, scene)
+        objects = {f"object{number}": shape for number, shape in enumerate(self._shapes)}
+        self.world: dict[str, Any] = {"type": "scene"} | objects
+        # A seed that is the scene's own, so that no two images share their noise.
+        poses = b"".join(np.asarray(item.T_cam_obj, np.float64).tobytes() for item in scene.objects)
+        noise_seed = scene.sensor.noise_seed.to_bytes(16, "little", signed=True)
+        self._seed = zlib.crc32(poses + noise_seed)
+
+    def cast(self, window: Box) -> tuple[Depth, np.ndarray]:
+        """Return the depth and the object that a window's pixel centres see."""
+        world = self._mi.load_dict(self.world, parallel=False)
+        return cast(self._mi, world, self._shapes, pixel_rays(self._scene.K, window))
+
+    def trace(
+        self, world: dict[str, Any], film: Film
+    ) -> Float32[np.ndarray, "film_height film_width 4"]:
+        """Return the light that reaches a film's pixels, denoised, and their coverage."""
+        lit = {**world, **make_surroundings(self._mi, self._scene)}
+        traced = self._measure(lit, film, _PATHS, SAMPLES_PER_PIXEL)
+        # Four samples a pixel, as it is far less noisy than light.
+        guides = self._measure(world, film, _GUIDES, 4)
+        traced[..., :3] = denoise(traced[..., :3], guides[..., :3], guides[..., 3:6])
+        return traced
+
+    def paint_on_table(self, window: Box | None, plane: Depth, image: Picture) -> None:
+        """Paint objects and their shadows; ``plane`` is the plane's depth."""
+        table = TableTop(self._scene, plane)
+        window = table.window(window)
+        if window is None:
+            return
+        area, film = _slices(window), make_film(self._scene.K, window)
+        traced = self.trace({**self.world, "table": table.shape(self._mi)}, film)
+        # Whether light comes from an object or from the table is a second, cheap picture: the
+        # fourth channel of any integrator is the share of rays that hit something.
+        hit = self._measure(self.world, film, {"type": "depth"}, SAMPLES_PER_PIXEL)
+        traced[..., 3] = hit[..., 3]
+        traced = film.resampled(traced)
+        alpha = np.clip(traced[..., 3], 0.0, 1.0)
+        light, kept = split_light(traced[..., :3], alpha, table.unshadowed(area))
+        image[area] = shadowed(image[area], table.faded(kept, area))
+        image[area] = _over(light, alpha, image[area])
+
+    def _measure(
+        self, world: dict[str, Any], film: Film, integrator: dict[str, Any], samples: int
+    ) -> Float32[np.ndarray, "film_height film_width channels"]:
+        """Return what an integrator measures in every pixel of a film."""
+        whole = {**world, "sensor": film.sensor(self._mi, samples), "integrator": integrator}
+        # Loaded in parallel, objects come in random order, and every order is compiled anew.
+        loaded = self._mi.load_dict(whole, parallel=False)
+        return np.array(self._mi.render(loaded, seed=self._seed), np.float32)
 
 
-def _paint_on_table(
-    mi: Any,
-    scene: Scene,
-    shapes: list[Any],
-    window: Box | None,
-    plane: Float32[np.ndarray, "height width"],
-    image: Picture,
-) -> None:
-    """Paint objects and their shadows; ``plane`` is the plane's depth."""
-    table = TableTop(scene, plane)
-    window = table.window(window)
-    if window is None:
-        return
-    area, view = _slices(window), make_view(scene.K, window)
-    film = _trace(mi, scene, {**_world(shapes), "table": table.shape(mi)}, view)
-    # Whether light comes from an object or from the table is a second, cheap picture: the fourth
-    # channel of any integrator is the share of rays that hit something.
-    depth = {"type": "depth"}
-    hit = _picture(mi, _world(shapes), view, depth, SAMPLES_PER_PIXEL, _seed(scene))
-    film[..., 3] = hit[..., 3]
-    film = view.resampled(film)
-    alpha = np.clip(film[..., 3], 0.0, 1.0)
-    light, kept = split_light(film[..., :3], alpha, table.unshadowed(area))
-    image[area] = shadowed(image[area], table.faded(kept, area))
-    image[area] = _over(light, alpha, image[area])
-
-
-def _world(shapes: list[Any]) -> dict[str, Any]:
-    return {"type": "scene"} | {f"object{number}": shape for number, shape in enumerate(shapes)}
-
-
-def _trace(
-    mi: Any, scene: Scene, world: dict[str, Any], view: View
-) -> Float32[np.ndarray, "height width 4"]:
-    """Return the light that reaches the view's pixels, denoised, and their coverage."""
-    surroundings = make_surroundings(mi, scene, bounding_sphere(scene))
-    lit = {**world, **surroundings}
-    film = _picture(mi, lit, view, _PATHS, SAMPLES_PER_PIXEL, _seed(scene))
-    # Four samples a pixel, as it is far less noisy than light.
-    guides = _picture(mi, world, view, _GUIDES, 4, _seed(scene))
-    film[..., :3] = denoise(film[..., :3], guides[..., :3], guides[..., 3:6])
-    return film
-
-
-def _picture(
-    mi: Any, world: dict[str, Any], view: View, integrator: dict[str, Any], samples: int, seed: int
-) -> Float32[np.ndarray, "height width channels"]:
-    """Return what an integrator measures in every pixel of a view."""
-    # Loaded in parallel, objects come in random order, and every order is compiled anew.
-    loaded = mi.load_dict(
-        {**world, "sensor": view.sensor(mi, samples), "integrator": integrator}, parallel=False
-    )
-    return np.array(mi.render(loaded, seed=seed), np.float32)
-
-
-def _seed(scene: Scene) -> int:
-    """Return a seed that is the scene's own, so that no two images share their noise."""
-    poses = b"".join(np.asarray(item.T_cam_obj, np.float64).tobytes() for item in scene.objects)
-    return zlib.crc32(poses + scene.sensor.noise_seed.to_bytes(16, "little", signed=True))
-
-
-def _over(
-    light: Float32[np.ndarray, "height width 3"],
-    alpha: Float32[np.ndarray, "height width"],
-    behind: Picture,
-) -> Picture:
+def _over(light: Colours, alpha: Depth, behind: Picture) -> Picture:
     """Lay light that covers a share of each pixel over a picture, in linear light."""
     alpha = np.clip(alpha, 0.0, 1.0)[..., None]
     total = light + (1 - alpha) * _RADIANCE_OF_CODE[behind]
@@ -199,15 +190,112 @@ def _slices(window: Box) -> Area:
     return slice(top, bottom), slice(left, right)
 
 
-def denoise(
-    colour: Float32[np.ndarray, "height width 3"],
-    albedo: Float32[np.ndarray, "height width 3"],
-    normal: Float32[np.ndarray, "height width 3"],
-) -> Float32[np.ndarray, "height width 3"]:
-    """Return a picture in linear light without its noise; a RuntimeError where the library fails.
+class TableTop:
+    """The disc that stands for a scene's plane.
 
-    ``albedo`` is the share of light that the surface scatters, in [0, 1]; ``normal`` a unit vector
-    in any frame, 0 on the background.
+    ``depth`` is the plane's at pixel centres, metres; 0 where it is not seen.
+    """
+
+    def __init__(self, scene: Scene, depth: Depth) -> None:
+        assert scene.plane is not None
+        self._scene, self._normal = scene, np.array(scene.plane.normal, np.float64)
+        middle, radius = bounding_sphere(scene)
+        self.centre = middle - (self._normal @ middle - scene.plane.offset) * self._normal
+        self.radius = 6 * radius
+        self._points = pixel_rays(scene.K, (0, 0, *scene.size)) * depth[..., None]
+        away = np.linalg.norm(self._points - self.centre, axis=-1) / self.radius
+        self._away = np.where(depth > 0, away, np.inf)
+        self._light = np.where((self._away < 1)[..., None], self._full_light(), 0.0)
+        self.albedo = self._estimated_albedo()
+
+    def window(self, objects: Box | None) -> Box | None:
+        """Return the part of the image with the disc and the objects; None if neither is seen."""
+        seen = self._away < 1
+        if objects is not None:
+            seen[_slices(objects)] = True
+        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        if not len(rows):
+            return None
+        return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+    def shape(self, mi: Any) -> dict[str, Any]:
+        """Return the disc for Mitsuba."""
+        up = np.eye(3)[np.abs(self._normal).argmin()]
+        place = mi.ScalarTransform4f().look_at(
+            list(self.centre), list(self.centre + self._normal), list(up)
+        )
+        bsdf = {"type": "diffuse", "reflectance": rgb(self.albedo)}
+        return {"type": "disk", "to_world": place.scale(self.radius), "bsdf": bsdf}
+
+    def unshadowed(self, area: Area) -> Colours:
+        """Return the disc's radiance without objects; 0 beside it."""
+        return np.asarray(self.albedo * self._light[area])
+
+    def faded(self, kept: Colours, area: Area) -> Colours:
+        """Return the shares of light with no step at the disc's rim, and 1 beside it."""
+        share = np.clip((1 - self._away[area]) / (1 - 0.6), 0.0, 1.0)[..., None]
+        # Smoothstep: no visible line where the fading begins and ends.
+        return 1 + (kept - 1) * share * share * (3 - 2 * share)
+
+    def _full_light(self) -> Colours:
+        """Return the radiance of a white table without objects, in closed form."""
+        ambient = self._scene.ambient
+        above = 0.5 + 0.5 * float(self._normal @ np.array(ambient.up))
+        sky = above * np.array(ambient.above) + (1 - above) * np.array(ambient.below)
+        light = np.broadcast_to(sky, self._points.shape).copy()
+        for lamp in self._scene.lights:
+            towards = np.array(lamp.position) - self._points
+            distance = np.maximum(np.linalg.norm(towards, axis=-1), 1e-9)
+            facing = np.maximum(towards @ self._normal / distance, 0.0)
+            strength = facing * (lamp.reach / distance) ** 2
+            light += strength[..., None] * np.array(lamp.intensity)
+        return light
+
+    def _estimated_albedo(self) -> Vector:
+        """Return the albedo with which the disc is as bright as its picture, within reason."""
+        seen = self._away < 1
+        if not seen.any():
+            return np.full(3, np.mean(_ALBEDO))
+        shown = SRGB_TO_LINEAR[self._scene.background[seen]].mean(axis=0)
+        light = np.maximum(self._light[seen].mean(axis=0), _LEAST_LIGHT)
+        return np.asarray(np.clip(shown / light, *_ALBEDO))
+
+
+def split_light(light: Colours, alpha: Depth, unshadowed: Colours) -> tuple[Colours, Colours]:
+    """Return the objects' share of each pixel's radiance, and the share of light left on the disc.
+
+    ``light`` is the radiance of objects and disc together, ``alpha`` the share of each pixel that
+    objects cover, ``unshadowed`` the disc's radiance without objects, 0 beside it.
+    """
+    known = (alpha <= 0) & (unshadowed.min(axis=-1) > _LEAST_LIGHT)
+    kept = np.where(known[..., None], light / np.maximum(unshadowed, _LEAST_LIGHT), 1.0)
+    kept = np.clip(kept, 0.0, 4.0)  # over 1: light thrown on a table in deep shade
+    # At an object's rim both are mixed; the shadow beside it goes on there.
+    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), _SPREAD_PX)[..., None]
+    spread = cv2.GaussianBlur(np.where(known[..., None], kept, 0.0), (0, 0), _SPREAD_PX)
+    carried = np.where(weight > 1e-3, spread / np.maximum(weight, 1e-3), 1.0)
+    kept = np.where(known[..., None], kept, carried)
+    own = light - (1 - alpha[..., None]) * unshadowed * kept
+    return np.where(alpha[..., None] > 0, np.maximum(own, 0), 0).astype(np.float32), kept
+
+
+def shadowed(picture: Picture, kept: Colours) -> Picture:
+    """Return a picture of which shares of the light are left."""
+    steps = np.minimum(SRGB_TO_LINEAR[picture] * kept * CODE_STEPS + 0.5, CODE_STEPS)
+    changed = (LINEAR_TO_SRGB[steps.astype(np.int32)] + 0.5).astype(np.uint8)
+    return np.where(kept == 1.0, picture, changed)
+
+
+def denoise(colour: Colours, albedo: Colours, normal: Colours) -> Colours:
+    """Return a picture in linear light without its noise.
+
+    Args:
+        colour: The picture, float32 like the guides.
+        albedo: Share of light that the surface scatters, in [0, 1].
+        normal: Unit vectors in any frame, 0 on the background.
+
+    Raises:
+        RuntimeError: The library fails.
     """
     interface, device = _device()
     ffi, library = interface.oidn_ffi, interface.oidn_Capi

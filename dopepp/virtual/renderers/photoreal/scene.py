@@ -1,9 +1,8 @@
-"""A scene as Mitsuba takes it: meshes, reflectance, lamps and the sky.
+"""A scene as Mitsuba takes it: meshes, reflectance, lamps and the sky, and the film that sees them.
 
-Everything stands in the camera frame, as in the rest of the package. Light is matched to
-``raster.shading``: a lamp is a sphere that gives a surface what the point light gives
-it, and the sky is two hemispheres. What differs is what path tracing adds: soft shadows, light
-from object to object, reflections of the lamps and the surroundings.
+Everything stands in the camera frame. Light is matched to ``raster.shading``: a lamp is a sphere
+that gives a surface what the point light gives it, and the sky is two hemispheres. Path tracing
+adds soft shadows, light from object to object, and reflections of lamps and surroundings.
 
 Grooves finer than a pixel only widen the highlight, and that is how all of them are drawn here: by
 roughness. The albedo's variation is drawn on untextured surfaces.
@@ -12,46 +11,43 @@ roughness. The albedo's variation is drawn on untextured surfaces.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Final
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int16
 
-from dopepp.geometry.camera import CameraMatrix, Transform, transform
+from dopepp.drawing.pictures import Size
+from dopepp.geometry.camera import CameraMatrix, crop_camera, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.parts.mesh import face_areas
-from dopepp.virtual.scene import NOISE_LIMITS, Ambient, Light, Material, Scene, SceneObject
+from dopepp.virtual.renderers.raster.visibility import Box
+from dopepp.virtual.scene import NEAR, NOISE_LIMITS, Ambient, Light, Scene, SceneObject
 from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface import Surface
-from dopepp.virtual.surface.texture import Texture
 
-Sphere = tuple[Vector, float]
-"""Centre and radius, camera frame, metres."""
+Sphere = tuple[Vector, float]  # centre and radius, camera frame, metres
 
-LAMP_SHARE: Final = 0.06
-"""A lamp's radius over its distance: a bulb of 6 cm across at half a metre."""
-
-_MAX_ALBEDO: Final = 0.95
+LAMP_SHARE: Final = 0.06  # a lamp's radius over its distance: a bulb 6 cm across at half a metre
+_MAX_ALBEDO: Final = 0.95  # nothing reflects all light; more would keep paths alive without end
 _VERTEX_COLOUR: Final = "vertex_colour"
-"""Nothing reflects all light; more would also keep paths alive without end."""
-
 _SKY_ROWS: Final = 64
-_NOISE_CELLS: Final = 64
-"""Side of the repeating lattice of random albedos, cells."""
+_NOISE_CELLS: Final = 64  # side of the repeating lattice of random albedos
 
 
 def make_shapes(mi: Any, scene: Scene) -> list[Any]:
     """Return one Mitsuba mesh per object, in the scene's order."""
-    shapes = []
-    for item in scene.objects:
-        reflectance = mi.load_dict(_reflectance(mi, item, scene.K), parallel=False)
-        shapes.append(_mesh(mi, item, reflectance))
-    return shapes
+    reflectances = [
+        mi.load_dict(_reflectance(mi, item, scene.K), parallel=False) for item in scene.objects
+    ]
+    return [_mesh(mi, *pair) for pair in zip(scene.objects, reflectances, strict=True)]
 
 
-def make_surroundings(mi: Any, scene: Scene, bounds: Sphere) -> dict[str, Any]:
+def make_surroundings(mi: Any, scene: Scene) -> dict[str, Any]:
     """Return the lamps and the sky, to be merged into Mitsuba's description of the scene."""
     entries: dict[str, Any] = {"sky": _sky(mi, scene.ambient)}
+    bounds = bounding_sphere(scene)
     for number, light in enumerate(scene.lights):
         radius = lamp_radius(light, scene, bounds)
         radiance = np.array(light.intensity) * (light.reach / radius) ** 2
@@ -66,9 +62,8 @@ def make_surroundings(mi: Any, scene: Scene, bounds: Sphere) -> dict[str, Any]:
 
 def bounding_sphere(scene: Scene) -> Sphere:
     """Return a sphere around all objects of a scene that has some."""
-    points = np.concatenate(
-        [transform(item.T_cam_obj, item.surface.hull) for item in scene.objects]
-    )
+    hulls = [transform(item.T_cam_obj, item.surface.hull) for item in scene.objects]
+    points = np.concatenate(hulls)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     return middle, float(np.linalg.norm(points - middle, axis=1).max())
 
@@ -78,10 +73,9 @@ def lamp_radius(light: Light, scene: Scene, bounds: Sphere) -> float:
     position = np.array(light.position)
     distance = float(np.linalg.norm(position - bounds[0]))
     room = [float(np.linalg.norm(position))]
-    room += [
-        float(np.linalg.norm(transform(item.T_cam_obj, item.surface.hull) - position, axis=1).min())
-        for item in scene.objects
-    ]
+    for item in scene.objects:
+        away = transform(item.T_cam_obj, item.surface.hull) - position
+        room.append(float(np.linalg.norm(away, axis=1).min()))
     if scene.plane is not None:
         room.append(float(np.array(scene.plane.normal) @ position) - scene.plane.offset)
     # It reaches at most half of the way to an object, the camera or the table.
@@ -104,8 +98,8 @@ def _mesh(mi: Any, item: SceneObject, reflectance: Any) -> Any:
         has_vertex_normals=True, has_vertex_texcoords=True,
     )  # fmt: skip
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ravel(corners).astype(np.float32)
     normals = surface.normals.reshape(-1, 3) @ rotation.T
+    parameters["vertex_positions"] = np.ravel(corners).astype(np.float32)
     parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
     parameters["vertex_texcoords"] = np.ravel(_corner_uv(surface)).astype(np.float32)
     parameters["faces"] = np.arange(len(corners), dtype=np.uint32)
@@ -131,28 +125,22 @@ def _corner_uv(surface: Surface) -> Float[np.ndarray, "corners 2"]:
 def _reflectance(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     """Return the material: Lambert and GGX with a metallic workflow, on both sides."""
     material = item.material
-    root = math.sqrt(min(max(material.specular, 1e-4), 0.9))
-    return {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": _colour(mi, item, K),
-            "roughness": _roughness(material),
-            "metallic": float(material.metallic),
-            # Fresnel's reflectance at normal incidence, solved for the refractive index.
-            "eta": (1 + root) / (1 - root),
-        },
-    }
-
-
-def _roughness(material: Material) -> float:
-    """Return GGX roughness (its square is α) widened by the slopes of the grooves."""
+    # GGX roughness, whose square is α, widened by the grooves. A sine of largest slope s has the
+    # slope variance s²/2 across the grooves and none along them: s²/4 on average. GGX's α² stands
+    # for twice the variance.
     variance = material.roughness**4
     if material.grooves is not None:
-        # A sine of largest slope s has the slope variance s²/2 across the grooves and none along
-        # them: s²/4 on average. GGX's α² stands for twice the variance.
         variance += material.grooves.slope**2 / 2
-    return float(min(variance**0.25, 1.0))
+    root = math.sqrt(min(max(material.specular, 1e-4), 0.9))
+    bsdf = {
+        "type": "principled",
+        "base_color": _colour(mi, item, K),
+        "roughness": float(min(variance**0.25, 1.0)),
+        "metallic": float(material.metallic),
+        # Fresnel's reflectance at normal incidence, solved for the refractive index.
+        "eta": (1 + root) / (1 - root),
+    }
+    return {"type": "twosided", "bsdf": bsdf}
 
 
 def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
@@ -160,7 +148,7 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
     material, texture = item.material, item.surface.texture
     colour = np.asarray(material.colour, np.float32)
     if texture is not None:
-        codes = texture.image(_texture_level(item.surface, texture, item.T_cam_obj, K))
+        codes = texture.image(_texture_level(item, K))
         return _bitmap(mi, SRGB_TO_LINEAR[codes] * colour, np.eye(4))
     if len(item.surface.colours):
         return {"type": "mesh_attribute", "name": _VERTEX_COLOUR}
@@ -177,28 +165,24 @@ def _colour(mi: Any, item: SceneObject, K: CameraMatrix) -> dict[str, Any]:
 def _bitmap(
     mi: Any, texels: Float32[np.ndarray, "rows columns 3"], to_uv: np.ndarray
 ) -> dict[str, Any]:
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.clip(texels, 0.0, _MAX_ALBEDO)),
-        "raw": True,
-        "to_uv": mi.ScalarTransform4f(to_uv),
-    }
+    bitmap = mi.Bitmap(np.clip(texels, 0.0, _MAX_ALBEDO))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "to_uv": mi.ScalarTransform4f(to_uv)}
 
 
-def _texture_level(
-    surface: Surface, texture: Texture, T_cam_obj: Transform, K: CameraMatrix
-) -> int:
+def _texture_level(item: SceneObject, K: CameraMatrix) -> int:
     """Return the texture level whose texels are about half as large as the object's pixels."""
-    depth = float(T_cam_obj[2, 3])
+    surface, depth = item.surface, float(item.T_cam_obj[2, 3])
+    assert surface.texture is not None
+    levels = surface.texture.levels
     a, b, c = surface.uv[surface.faces].transpose(1, 2, 0)
     along, across = b - a, c - a
     used = float(np.abs(along[0] * across[1] - along[1] * across[0]).sum() / 2)
     if used == 0.0 or depth <= 0.0:
         return 0
-    texels = used * texture.levels[0, 1] * texture.levels[0, 2]
+    texels = used * levels[0, 1] * levels[0, 2]
     pixels = face_areas(surface.vertices, surface.faces).sum() * K[0, 0] * K[1, 1] / depth**2
     level = math.floor(0.5 * math.log2(max(texels / pixels, 1.0))) - 1
-    return min(max(level, 0), len(texture.levels) - 1)
+    return min(max(level, 0), len(levels) - 1)
 
 
 def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
@@ -210,3 +194,116 @@ def _sky(mi: Any, ambient: Ambient) -> dict[str, Any]:
     place = np.eye(4)
     place[:3, :3] = np.stack([right, up, -across], axis=1)  # Mitsuba's zenith is +y
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": mi.ScalarTransform4f(place)}
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A film with square pixels, which Mitsuba demands, over a window of the image.
+
+    Its pixels are at least as fine as the image's. Where the camera's pixels are not square, the
+    picture is resampled.
+
+    Attributes:
+        size: (width, height) of the film, pixels.
+        centre_px: Its principal point; pixel (0, 0) is the centre of the film's first pixel.
+        film_from_window: Affine map, 2×3, from the window's pixels to the film's.
+    """
+
+    window: Box
+    size: Size
+    focal_px: float
+    centre_px: tuple[float, float]
+    film_from_window: Float[np.ndarray, "2 3"]
+
+    def sensor(self, mi: Any, samples: int) -> dict[str, Any]:
+        """Return the camera, at the origin of the camera frame, for Mitsuba."""
+        width, height = self.size
+        return {
+            "type": "perspective",
+            "fov": math.degrees(2 * math.atan(width / 2 / self.focal_px)),
+            "fov_axis": "x",
+            # Fractions of the film, from the principal point to the middle at (width − 1)/2.
+            "principal_point_offset_x": 0.5 - (self.centre_px[0] + 0.5) / width,
+            "principal_point_offset_y": 0.5 - (self.centre_px[1] + 0.5) / height,
+            "near_clip": NEAR,
+            "far_clip": 1e4,
+            # Mitsuba's camera frame has x to the left and y up.
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+            "sampler": {"type": "multijitter", "sample_count": samples},
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "pixel_format": "rgba",
+                "component_format": "float32",
+                # Pixels that share no samples, so that the denoiser sees independent noise.
+                "rfilter": {"type": "box"},
+            },
+        }
+
+    def resampled(
+        self, picture: Float32[np.ndarray, "film_height film_width 4"]
+    ) -> Float32[np.ndarray, "height width 4"]:
+        """Return the film's picture in the window's pixels."""
+        left, top, right, bottom = self.window
+        if np.array_equal(self.film_from_window, np.eye(2, 3)):
+            return picture
+        resampled = cv2.warpAffine(
+            picture, self.film_from_window, (right - left, bottom - top),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return np.asarray(np.maximum(resampled, np.float32(0)))
+
+
+def make_film(K: CameraMatrix, window: Box) -> Film:
+    """Return the film over a window of the image."""
+    left, top, right, bottom = window
+    focal = float(max(K[0, 0], K[1, 1]))
+    K_window = crop_camera(K, left, top)
+    width, height = right - left, bottom - top
+    if K[0, 0] == K[1, 1] and K[0, 1] == 0.0:
+        centre = (float(K_window[0, 2]), float(K_window[1, 2]))
+        return Film(window, (width, height), focal, centre, np.eye(2, 3))
+    # The film's pixels are focal · ray − origin.
+    rays = np.linalg.inv(K_window)[:2] * focal
+    corners = np.array([(x, y, 1.0) for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
+    low, high = (corners @ rays.T).min(axis=0), (corners @ rays.T).max(axis=0)
+    size = (math.ceil(high[0] - low[0]), math.ceil(high[1] - low[1]))
+    rays[:, 2] -= low + 0.5
+    return Film(window, size, focal, (-float(low[0]) - 0.5, -float(low[1]) - 0.5), rays)
+
+
+def pixel_rays(K: CameraMatrix, window: Box) -> Float[np.ndarray, "height width 3"]:
+    """Return the points at depth 1 m that the window's pixel centres see."""
+    left, top, right, bottom = window
+    y, x = np.mgrid[top:bottom, left:right]
+    return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(K).T)
+
+
+def cast(
+    mi: Any, world: Any, shapes: list[Any], rays: Float[np.ndarray, "height width 3"]
+) -> tuple[Float32[np.ndarray, "height width"], Int16[np.ndarray, "height width"]]:
+    """Return depth (0 where nothing is hit) and the number of the shape that each ray hits.
+
+    ``rays`` are points at depth 1 m; shapes nearer than :data:`~dopepp.virtual.scene.NEAR` are
+    transparent.
+    """
+    flat = rays.reshape(-1, 3).astype(np.float32)
+    if mi.variant().startswith("scalar"):
+        distance, numbers = np.zeros(len(flat)), np.full(len(flat), -1)
+        for index, (x, y, z) in enumerate(flat.tolist()):
+            ray = mi.Ray3f(mi.Point3f(NEAR * x, NEAR * y, NEAR * z), mi.Vector3f(x, y, z))
+            hit = world.ray_intersect_preliminary(ray, coherent=True)
+            if hit.is_valid():
+                distance[index] = hit.t
+                numbers[index] = next(k for k, shape in enumerate(shapes) if shape == hit.shape)
+    else:
+        # Directions of unit depth make distances depths.
+        origins, directions = mi.Point3f(flat.T * np.float32(NEAR)), mi.Vector3f(flat.T)
+        hit = world.ray_intersect_preliminary(mi.Ray3f(origins, directions), coherent=True)
+        owners = mi.Int32(-1)
+        for number, shape in enumerate(shapes):
+            owners[hit.is_valid() & (hit.shape == mi.ShapePtr(shape))] = number
+        distance, numbers = np.array(hit.t), np.array(owners)
+    depth = np.where(numbers >= 0, distance + NEAR, 0.0).astype(np.float32)
+    return depth.reshape(rays.shape[:2]), numbers.astype(np.int16).reshape(rays.shape[:2])
