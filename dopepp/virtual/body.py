@@ -200,13 +200,12 @@ class Distractors(Checked):
     """Random objects around the targets.
 
     Attributes:
-        number: Smallest and largest number per image; one that would hide a target too much or
-            finds no place is left out.
-        image_share: Smallest and largest diameter of a primitive's image over the image's width.
-        depth: Smallest and largest depth in units of the first target's depth; of no use on a
-            plane, which gives the depth.
-        lookalike_share: Chance that a distractor is a negative: another weakly textured part,
-            where there is one.
+        number: Per image; an object that would hide a target too much or finds no place is left
+            out.
+        image_share: Diameter of a primitive's image.
+        depth: Of no use on a plane, which gives the depth.
+        lookalike_share: Chance that a distractor is a negative, where there is one: another weakly
+            textured part.
         lookalike_scale: Size of a negative over its real size.
     """
 

@@ -32,8 +32,7 @@ CENTRE_SAMPLE: Final = np.zeros((1, 2))
 EdgeFunctions = tuple[float, float, float, float, float, float, float, float, float]
 """Of a triangle's three edges, the coefficients of x, y and 1 each."""
 
-# Plain literals would turn the arithmetic into float64.
-_ZERO, _ONE = np.float32(0), np.float32(1)
+_ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic into float64
 
 _pool = threading.local()
 
@@ -98,11 +97,11 @@ def rasterise(
 ) -> None:
     """Draw triangles into a sample buffer of inverse depth (1/m, 0 = empty) and triangle ids.
 
-    ``hom`` are the vertices' homogeneous pixels, shape (V, 3), ``faces`` their indices, shape (F,
-    3); ``cull`` drops back faces (watertight meshes only). Samples nearer than ``near`` metres are
-    dropped. ``origin`` is the pixel (x, y) of the buffer's first element; ``samples`` are a pixel's
-    offsets from its centre, shape (S, 2), up to 1/4. Updated in place, both of shape (height,
-    width, S), are ``inverse_depth``, float32, and ``ids``, int32, which count from ``first_id``.
+    ``hom`` are the vertices' homogeneous pixels, shape (V, 3); ``cull`` drops back faces
+    (watertight meshes only). Samples nearer than ``near`` metres are dropped. ``origin`` is the
+    pixel (x, y) of the buffer's first element; ``samples`` are a pixel's offsets from its centre,
+    shape (S, 2), up to 1/4. The buffers have the shape (height, width, S); ``ids`` count from
+    ``first_id``.
     """
     height, width, num_samples = inverse_depth.shape
     x0, y0 = origin

@@ -46,25 +46,21 @@ class Preset(Checked):
     """A distribution of scenes.
 
     Attributes:
-        horizontal_fov_deg: Horizontal field of view, degrees, of a camera with square pixels that
-            looks through the image's middle; ignored where ``intrinsics_px`` is given.
+        horizontal_fov_deg: Horizontal field of view of a camera with square pixels that looks
+            through the image's middle; ignored where ``intrinsics_px`` is given.
         intrinsics_px: fx, fy, cx, cy of an explicit camera, pixels of this image size.
-        turning: Distribution of the targets' orientation; of no use on a table.
+        turning: Distribution of the targets' orientation; like the placement, unused on a table.
         table: The plane that everything lies on; None for objects in mid-air.
-        targets_per_image: Smallest and largest number of targets, each a random part; one after
-            the first that finds no place is left out. Images without any are for learning and
-            testing silence.
+        targets_per_image: Number of targets, each a random part; a further target that finds no
+            place is left out. Images without any are for learning and testing silence.
         min_visible_fraction: Smallest visible fraction of every target; scenes are drawn again,
             a bounded number of times, to keep it.
-        centroid_inside: Whether the image of every target's cuboid centre must lie inside the
-            frame.
-        materials: Distribution of what targets and distractors are made of.
-        window: Width and height of the part of the picture that is rendered, around a random point
-            of it, pixels; None renders all of it.
-        depths: Smallest and largest depth of the targets' cuboids' centres, metres; None for any.
-        clutter: Smallest and largest number of flat pieces of other pictures that the background
-            is littered with.
-        background_contrast: Smallest and largest factor on the background's contrast.
+        centroid_inside: Whether every target's cuboid centre must be seen inside the frame.
+        window: (width, height) of the part of the picture that is rendered, around a random point
+            of it; None renders all of it.
+        depths: Smallest and largest depth of the targets' cuboids' centres; None for any.
+        clutter: Number of flat pieces of other pictures that the background is littered with.
+        background_contrast: Factor on the background's contrast.
     """
 
     name: str
@@ -103,8 +99,8 @@ class Preset(Checked):
     def draw_camera(self, rng: Generator) -> tuple[CameraMatrix, Size]:
         """Return K and (width, height) of what is rendered: all of the picture, or a window of it.
 
-        A window lies around a point that is uniform over the picture, moved into it; where it is
-        larger than the picture, it is in its middle. Its principal point may be outside of it.
+        A window lies around a point that is uniform over the picture, moved into it; one larger
+        than the picture has it in its middle.
         """
         K, size = self.K, (self.width, self.height)
         if self.window is None:
@@ -115,11 +111,7 @@ class Preset(Checked):
         return crop_camera(K, *corner), self.window
 
     def resized(self, width: int, height: int) -> Preset:
-        """Return the same scenes in another image size: the camera follows the resize rule.
-
-        A changed aspect ratio stretches the image, so fx and fy differ, as they do when a picture
-        is resized.
-        """
+        """Return the same scenes in another size; another aspect ratio stretches the image."""
         K = resize_camera(self.K, width / self.width, height / self.height)
         return self._seen_by(K, width, height, width / self.width)
 
@@ -127,7 +119,7 @@ class Preset(Checked):
         """Return the same scenes in a picture of another size and shape, with pixels as square.
 
         The field of view along the shorter side stays; along the longer one the picture is cut or
-        shows more, alike at both ends. Of the same shape, it is :meth:`resized`.
+        shows more, alike at both ends.
         """
         side, new_side = min(self.width, self.height), min(width, height)
         scale = new_side / side

@@ -24,8 +24,7 @@ Pitch = Annotated[Pair, Span(1e-6, 0.1, "metres")]
 Slope = Annotated[Pair, Span(0.0, 2.0, "tangent")]
 Intensity = Annotated[Pair, Span(0.0, 10.0, "1 = white")]
 
-_GREY_CAST: Final = 0.05
-"""Largest relative deviation of a grey's channels: real greys are not quite grey."""
+_GREY_CAST: Final = 0.05  # largest relative deviation of a channel: real greys are not quite grey
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Materials(Checked):
     Attributes:
         albedo: Linear albedo of the brightest channel, the same range for greys and colours.
         coloured_share: Share of untextured surfaces that have a colour; the others are grey.
-        roughness: GGX roughness of dielectrics.
+        roughness: Of dielectrics.
         specular: Their reflectance at normal incidence.
         texture_gain: Factor on the colours of surfaces that have some.
         texture_tint: Largest relative deviation of one colour channel from that factor: a scan's
@@ -44,13 +43,12 @@ class Materials(Checked):
             thing has shades, stains and openings that its model lacks.
         noise: Relative amplitude of the albedo's variation over an untextured surface.
         noise_pitch: Size of either variation over the object's radius.
-        metal_albedo: Their reflectance at normal incidence.
-        brushed_share: Share of metals that are brushed.
-        brush_pitch: Mean distance of brush marks, metres.
+        metal_albedo: Reflectance of metals at normal incidence.
+        brush_pitch: Mean distance of the marks on brushed metals.
         brush_slope: Largest slope of their flanks, the tangent of the normal's tilt.
         print_share: Share of untextured dielectrics that are 3D prints with layer lines.
-        layer_pitch: Height of a print's layers, metres.
-        layer_slope: Largest slope of the layers' flanks, the tangent of the normal's tilt.
+        layer_pitch: Height of a print's layers.
+        layer_slope: Largest slope of the layers' flanks, as ``brush_slope``.
         alike_share: Chance that all instances of a part in an image are made of the same.
     """
 
@@ -111,11 +109,20 @@ class Materials(Checked):
         """Draw a plastic; a printed one has layers along the axis it was built up."""
         brightness = rng.uniform(*self.albedo)
         coloured = rng.random() < self.coloured_share
-        colour = self._colour(rng, brightness) if coloured else _grey(rng, brightness)
+        if coloured:
+            srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
+            # The usual power for sRGB, exact enough for a random colour.
+            colour = triple(brightness * channel**2.2 for channel in srgb)
+        else:
+            colour = _grey(rng, brightness)
         grooves = None
         if rng.random() < self.print_share:
+            # Two times of three, the axis it was built up along is the thinnest, as slicers lay.
+            thinnest = rng.random() < 2 / 3
+            extents: Vector = np.ptp(surface.hull, axis=0)
+            number = int(extents.argmin()) if thinnest else int(rng.integers(3))
             grooves = Grooves(
-                axis=_build_axis(rng, surface),
+                axis=_unit_axis(number),
                 pitch=rng.uniform(*self.layer_pitch),
                 slope=rng.uniform(*self.layer_slope),
             )
@@ -124,31 +131,16 @@ class Materials(Checked):
             colour, roughness, specular, noise=noise, noise_pitch=pitch, grooves=grooves
         )
 
-    def _colour(self, rng: Generator, brightness: float) -> Triple:
-        """Draw the linear albedo of a random hue whose brightest channel is given."""
-        srgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*self.saturation), 1.0)
-        # The usual power for sRGB, exact enough for a random colour.
-        return triple(brightness * channel**2.2 for channel in srgb)
-
 
 def _grey(rng: Generator, brightness: float) -> Triple:
     return triple(np.clip(brightness * (1 + rng.uniform(-_GREY_CAST, _GREY_CAST, 3)), 0.0, 1.0))
-
-
-def _build_axis(rng: Generator, surface: Surface) -> Triple:
-    """Draw the axis a print was built up along: two times of three the thinnest, as slicers lay."""
-    extents: Vector = np.ptp(surface.hull, axis=0)
-    thinnest = rng.random() < 2 / 3
-    return _unit_axis(int(extents.argmin()) if thinnest else int(rng.integers(3)))
 
 
 def _unit_axis(number: int) -> Triple:
     return triple(number == axis for axis in range(3))
 
 
-_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
-"""Luminance of linear sRGB (BT.709)."""
-
+_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB (BT.709)
 _RGB_FROM_XYZ: Final = np.array(
     [
         [3.2404542, -1.5371385, -0.4985314],
@@ -164,14 +156,11 @@ class Lighting(Checked):
     """Ranges of light; intensities are what a white surface facing the light reflects, 1 clips.
 
     Attributes:
-        num_lights: Smallest and largest number of point lights; the first casts shadows.
-        ambient_intensity: Of the light from everywhere.
-        max_angle_deg: Largest angle between a light's direction and the camera's, as seen from
-            the scene; 0 is a flash light on the camera, 90 a light from the side. Over a plane,
-            the angle is taken from the plane's normal.
-        distance: Of a light from the scene, in units of the camera's distance.
-        temperature_k: Colour temperature of a lamp as a camera balanced for 6500 K sees it,
-            kelvin; low ones are warm.
+        num_lights: Number of point lights; the first, the key light, casts the sharpest shadows.
+        max_angle_deg: Largest angle between a light's direction and the camera's (over a plane:
+            the plane's normal), as seen from the scene; 0 is a flash light on the camera.
+        distance: Of a light from the scene.
+        temperature_k: Colour temperature as a camera balanced for 6500 K sees it; low is warm.
         tint: Largest relative deviation of a colour channel from that colour.
         ground_share: Light from below over the light from above.
     """
@@ -190,10 +179,9 @@ class Lighting(Checked):
     def draw(
         self, rng: Generator, centre: Vector, normal: Vector | None = None
     ) -> tuple[tuple[Light, ...], Ambient]:
-        """Draw point lights around a point of the scene, and the ambient light.
+        """Draw the ambient light and point lights around ``centre``, camera frame, metres.
 
-        They stand around ``centre``; ``normal`` is the supporting plane's, None where there is
-        none; both in the camera frame, metres.
+        ``normal`` is the supporting plane's, if there is a plane.
         """
         towards = np.array([0.0, 0.0, -1.0]) if normal is None else normal
         far = float(np.linalg.norm(centre))

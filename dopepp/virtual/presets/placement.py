@@ -7,7 +7,7 @@ To add a choice, write a frozen dataclass with a ``draw`` method and a ``kind``,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.random import Generator
@@ -33,8 +33,6 @@ ImageShare = Annotated[float, Range(1e-3, 1.0, "share of the image")]
 FACING: Final = np.diag([1.0, -1.0, -1.0])
 """Rotation that turns an object's +z face towards the camera, +x staying on the right."""
 
-_AXES: Final = ("x", "y", "z")
-
 
 @dataclass(frozen=True)
 class FreeTurning(Checked):
@@ -52,10 +50,10 @@ class FacingTurning(Checked):
     """The part's +z face looks at the camera, tilted a little, then turned in the image plane.
 
     ``R = R_z(in-plane) · R_(axis in the image plane)(tilt) · diag(1, −1, −1)``; the tilted axis is
-    uniform over the spherical cap, the in-plane angle uniform over its range.
+    uniform over the spherical cap, the in-plane angle uniform over its range to either side.
 
     Attributes:
-        in_plane_deg: Largest rotation about the optical axis to either side, degrees.
+        in_plane_deg: Largest rotation about the optical axis to either side.
         tilt_deg: Largest angle between the part's +z and the direction against the optical axis.
     """
 
@@ -81,9 +79,9 @@ class UprightTurning(Checked):
     azimuth are uniform.
 
     Attributes:
-        up: The axis of the part's file that points upwards: x, y or z.
-        elevation_deg: Smallest and largest angle of the line of sight with the horizontal.
-        roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
+        up: The axis of the part's file that points upwards.
+        elevation_deg: Angle of the line of sight with the horizontal.
+        roll_deg: Largest rotation of the camera about its line of sight to either side.
     """
 
     up: Literal["x", "y", "z"] = "z"
@@ -99,8 +97,8 @@ class UprightTurning(Checked):
         rolled, turned = (
             rotation_vector_to_matrix(np.array([0.0, 0.0, angle])) for angle in (roll, azimuth)
         )
-        # Axes in a circle: a rotation that brings the one which points upwards to z.
-        standing = np.roll(np.eye(3), 2 - _AXES.index(self.up), axis=0)
+        # Axes in a circle: a rotation that brings the axis which points upwards to z.
+        standing = np.roll(np.eye(3), 2 - "xyz".index(self.up), axis=0)
         return np.asarray(rolled @ looking_down(elevation) @ turned @ standing)
 
 
@@ -120,11 +118,23 @@ def looking_down(elevation: float) -> RotationMatrix:
 class _Placement(Checked):
     """Base of the placements."""
 
-    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
-        """Return what to try after a place at which the object is not well in the frame.
+    _ends: ClassVar[tuple[str, str] | None] = None  # two fields, the first at most the second
 
-        What a placement keeps of such a place has the distribution it was drawn from, however often
-        the camera does not see the object there. None draws the orientation anew, too.
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self._ends is None:
+            return
+        low, high = (getattr(self, end) for end in self._ends)
+        if low > high:
+            first, last = self._ends
+            got = f"{first}={low} and {last}={high} of {type(self).__name__}"
+            raise UserError(got, f"{first} <= {last}", "change the placement's range")
+
+    def redraw(self, rng: Generator, place: Vector) -> Vector | None:
+        """Return another place to try where the object is not well in the frame, or None.
+
+        What a placement keeps of the former place has the distribution it was drawn from, however
+        often the camera does not see the object there. None draws the orientation anew, too.
         """
         return None
 
@@ -134,12 +144,12 @@ class OffsetPlacement(_Placement):
     """A box of positions around a point on the optical axis (the paper's scene, section 2.1).
 
     Where the camera does not see all of the box, a place is moved along the optical axis until it
-    does: offsets across the axis and orientations keep their uniform distributions, and the depth
-    is uniform over those at which the object is seen there.
+    does: offsets across the axis and orientations keep their uniform distributions.
 
     Attributes:
-        axial: Largest offset along the optical axis to either side, metres.
-        lateral: Largest offset along image x and along image y to either side, metres.
+        distance: Depth of the box's middle.
+        axial: Largest offset along the optical axis to either side.
+        lateral: Largest offset along image x and along image y to either side.
     """
 
     distance: Metres = 0.20
@@ -171,21 +181,17 @@ class OffsetPlacement(_Placement):
 
 @dataclass(frozen=True)
 class DistancePlacement(_Placement):
-    """Uniform in depth and, laterally, over the image.
+    """Uniform in the depth of the object's origin and, laterally, over the image.
 
-    Attributes:
-        nearest: Smallest depth of the object's origin, metres.
-        margin: Share of the image's width and height that the origin keeps from the border.
+    ``margin`` is the share of width and height that the origin keeps from the border.
     """
+
+    _ends = ("nearest", "farthest")
 
     nearest: Depth = 0.5
     farthest: Depth = 1.2
     margin: Annotated[float, Range(0.0, 0.49, "share")] = 0.1
     kind: Literal["distance"] = "distance"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "nearest", "farthest", "in metres")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -202,13 +208,11 @@ class FillPlacement(_Placement):
     image height. The distance follows from it by iteration.
     """
 
+    _ends = ("smallest", "largest")
+
     smallest: ImageShare = 0.60
     largest: ImageShare = 0.95
     kind: Literal["fill"] = "fill"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "smallest", "largest", "shares of the image")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -237,18 +241,13 @@ class WorkingPlacement(_Placement):
 
     The middle is that of the turned part's extent along each axis, wherever its file has the
     origin. A part that is larger than the picture is in its middle.
-
-    Attributes:
-        nearest: Smallest depth of the middle, metres.
     """
+
+    _ends = ("nearest", "farthest")
 
     nearest: Depth
     farthest: Depth
     kind: Literal["working"] = "working"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "nearest", "farthest", "in metres")
 
     def draw(self, rng: Generator, K: CameraMatrix, size: Size, rotated_hull: Points) -> Vector:
         """Return the object's origin in the camera frame, metres."""
@@ -277,17 +276,6 @@ Placement = Annotated[
     OffsetPlacement | DistancePlacement | FillPlacement | WorkingPlacement, Discriminator("kind")
 ]
 """Draws a target's position."""
-
-
-def _check_order(of: object, first: str, last: str, units: str) -> None:
-    """Refuse a range whose two ends are in the wrong order."""
-    low, high = getattr(of, first), getattr(of, last)
-    if low > high:
-        raise UserError(
-            f"{first}={low} and {last}={high} of {type(of).__name__}",
-            f"{first} <= {last}, {units}",
-            "change the placement's range",
-        )
 
 
 def _depth_that_fills(

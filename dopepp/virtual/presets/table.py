@@ -25,16 +25,14 @@ class Table(Checked):
     """A supporting plane before a robot's camera.
 
     Attributes:
-        distance: Of the camera from the point of the plane that it looks at, metres.
-        elevation_deg: Angle between the plane and the camera's line of sight; 90 looks straight
-            down.
-        roll_deg: Largest rotation of the camera about its line of sight to either side, degrees.
-        heaped: Whether objects are dropped onto a heap; otherwise each lies on the plane beside
-            the others.
-        heap_radius: Radius within which a heap's objects are dropped, in units of the largest
-            diameter of a target.
-        picture_width: Width of the plane that the background's picture covers, in camera
-            distances; beyond it the picture is mirrored.
+        distance: Of the camera from the point of the plane that it looks at.
+        elevation_deg: Angle between the plane and the line of sight; 90 looks straight down.
+        roll_deg: Largest rotation of the camera about its line of sight to either side.
+        tilted_share: Share of objects that lean by ``tilt_deg`` instead of resting on a face.
+        heaped: Whether objects are dropped onto a heap; otherwise each lies beside the others.
+        heap_radius: Radius within which a heap's objects are dropped.
+        picture_width: Width of the plane that the background's picture covers; beyond it the
+            picture is mirrored.
     """
 
     distance: Annotated[Pair, Span(0.02, 100.0, "metres")] = (0.25, 0.60)
@@ -43,7 +41,7 @@ class Table(Checked):
     tilted_share: Share = 0.2
     tilt_deg: Annotated[Pair, Span(0.0, 90.0, "degrees")] = (5.0, 30.0)
     heaped: bool = False
-    heap_radius: Annotated[Pair, Span(0.0, 10.0, "diameters")] = (0.3, 0.8)
+    heap_radius: Annotated[Pair, Span(0.0, 10.0, "diameters of the largest target")] = (0.3, 0.8)
     picture_width: Annotated[Pair, Span(0.1, 20.0, "camera distances")] = (1.2, 2.4)
 
     def draw_view(self, rng: Generator) -> Transform:
@@ -58,8 +56,9 @@ class Table(Checked):
     def draw_turning(self, rng: Generator, hull: Hull) -> tuple[Float[np.ndarray, "3 3"], float]:
         """Draw how an object lies: on one of its stable faces, any way round, or leaning.
 
-        The rotation is from the object to the table frame; with it comes the height of the object's
-        lowest point relative to its origin, metres.
+        Returns:
+            Rotation from the object to the table frame, and the height of the object's lowest point
+            relative to its origin, metres.
         """
         normals, shares = hull.rests
         down = normals[int(np.searchsorted(np.cumsum(shares)[:-1], rng.random(), side="right"))]
@@ -97,13 +96,12 @@ class Table(Checked):
 
 @dataclass(frozen=True, eq=False)
 class TablePicture:
-    """What is to be seen on the plane, and beyond its end.
+    """The picture that lies on the plane, and one for beyond the plane's end.
 
     Attributes:
-        picture: Lies on the plane; beyond its borders it is mirrored.
         picture_table: Homography from a point (x, y) of the table's frame, metres, to its pixels.
         end: Depth from which on there is no plane, metres.
-        surroundings: What is there instead, an image of the camera; None where the plane goes on.
+        surroundings: Image of the camera beyond the end; None where that is out of view.
     """
 
     picture: Picture

@@ -27,7 +27,7 @@ from dopepp.virtual.renderers.raster.visibility import (
     project_object,
     shadow_maps,
 )
-from dopepp.virtual.scene import NEAR, Plane, Rendered, Scene, SceneObject
+from dopepp.virtual.scene import NEAR, Rendered, Scene, SceneObject
 from dopepp.virtual.triangles import (
     CENTRE_SAMPLE,
     NUM_COLOUR_SAMPLES,
@@ -36,8 +36,7 @@ from dopepp.virtual.triangles import (
     scratch,
 )
 
-_MOST_PX: Final = 1_000_000
-"""A full silhouette whose box is larger than this is counted at a reduced scale."""
+_MOST_PX: Final = 1_000_000  # a whole silhouette in a larger box is counted at a reduced scale
 
 
 def render(scene: Scene) -> Rendered:
@@ -67,8 +66,7 @@ class Silhouette:
     Attributes:
         mask: Its pixels within the image.
         num_px: Its pixels on a canvas without borders; infinite around the camera.
-        box: (left, top, right, bottom) of those pixels' bounds, pixels, right and bottom excluded;
-            it may reach beyond the image. None behind the camera.
+        box: Bounds of those pixels, perhaps beyond the image; None behind the camera.
     """
 
     mask: Mask
@@ -103,17 +101,13 @@ def _fractions(
     """Divide every object's visible pixels by those of its whole silhouette."""
     visible = np.bincount(instances.reshape(-1) + 1, minlength=len(projected) + 1)[1:]
     fractions = np.zeros(len(projected))
-    for index, (item, seen) in enumerate(zip(scene.objects, projected, strict=True)):
-        if not visible[index]:
-            continue
+    for index in np.flatnonzero(visible).tolist():
+        item, seen = scene.objects[index], projected[index]
         if seen.inside(scene.size):
             # Only where something else may be before it can a pixel of it be missing.
-            box = _rivals(scene, projected, index)
-            hidden = 0
-            if box is not None:
-                left, top, right, bottom = box
-                covered = draw_alone(item, seen.hom, box)[0] > 0
-                hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
+            left, top, right, bottom = _rivals(scene, projected, index) or (0, 0, 0, 0)
+            covered = draw_alone(item, seen.hom, (left, top, right, bottom))[0] > 0
+            hidden = int((covered & (instances[top:bottom, left:right] != index)).sum())
             fractions[index] = visible[index] / (visible[index] + hidden)
         else:
             whole = _whole_px(item, seen, scene.K)
@@ -123,24 +117,24 @@ def _fractions(
 
 def _rivals(scene: Scene, projected: Sequence[Projected], index: int) -> Box | None:
     """Return the part of an object's box in which other objects or the plane may hide it."""
-    own = projected[index].box(scene.size)
+    item, own = scene.objects[index], projected[index].box(scene.size)
     if own is None:
         return None
-    if scene.plane is not None and _reaches_below(scene.plane, scene.objects[index]):
-        return own
+    if scene.plane is not None:
+        normal = np.array(scene.plane.normal) @ item.T_cam_obj[:3, :3]
+        offset = scene.plane.offset - float(np.dot(scene.plane.normal, item.T_cam_obj[:3, 3]))
+        if (item.surface.hull @ normal).min() < offset:  # some of it lies below the plane
+            return own
     # Nothing that begins behind its end can hide it.
-    farthest = _depths(scene.objects[index])[1]
-    boxes = [
-        seen.box(scene.size)
-        for number, seen in enumerate(projected)
-        if number != index and _depths(scene.objects[number])[0] < farthest
-    ]
-    shared = [
-        (max(own[0], box[0]), max(own[1], box[1]), min(own[2], box[2]), min(own[3], box[3]))
-        for box in boxes
-        if box is not None
-    ]
-    return box_around(box for box in shared if box[0] < box[2] and box[1] < box[3])
+    depths = [_depths(other) for other in scene.objects]
+    boxes = []
+    for number, seen in enumerate(projected):
+        box = seen.box(scene.size) if depths[number][0] < depths[index][1] else None
+        if number != index and box is not None:
+            left, top = max(own[0], box[0]), max(own[1], box[1])
+            right, bottom = min(own[2], box[2]), min(own[3], box[3])
+            boxes.append((left, top, right, bottom) if left < right and top < bottom else None)
+    return box_around(boxes)
 
 
 def _depths(item: SceneObject) -> tuple[float, float]:
@@ -150,13 +144,6 @@ def _depths(item: SceneObject) -> tuple[float, float]:
     # The hull's extreme points miss a little of a round object.
     slack = 0.02 * (most - least)
     return least - slack, most + slack
-
-
-def _reaches_below(plane: Plane, item: SceneObject) -> bool:
-    """Tell whether some of an object lies on or below the plane."""
-    normal = np.array(plane.normal) @ item.T_cam_obj[:3, :3]
-    offset = plane.offset - float(np.dot(plane.normal, item.T_cam_obj[:3, 3]))
-    return bool((item.surface.hull @ normal).min() < offset)
 
 
 def _whole_px(item: SceneObject, seen: Projected, K: Array) -> float:
@@ -180,11 +167,8 @@ def _composite(
 ) -> None:  # fmt: skip
     """Put a window of samples over the background and read its centre samples as labels.
 
-    ``origin`` is the image pixel (x, y) of the window's first element; ``ids`` and
-    ``inverse_depth`` (1/m) are per sample, the last of which is the pixel's centre; ``colour`` sums
-    the covered samples' sRGB values; ``first_ids`` ascend by object. Updated in place: ``image``
-    (uint8, the background on entry) and, at pixel centres, ``depth`` (metres, float32) and
-    ``instances`` (object index, int16).
+    ``colour`` sums the covered samples' sRGB values; ``first_ids`` ascend by object. Updated in
+    place: ``image``, the background on entry, and, at pixel centres, ``depth`` and ``instances``.
     """
     height, width, num_samples = ids.shape
     centre = num_samples - 1

@@ -18,11 +18,8 @@ from dopepp.virtual.renderers.raster.visibility import Projected, Samples
 from dopepp.virtual.scene import Scene, SceneObject
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, PIXEL_SAMPLES, edge_functions, scratch
 
-_DEPTH_GAP: Final = 0.01
-"""Samples of a patch whose depths differ by a larger share are parts that hide one another."""
-
-_ALL_BUT_FIRST: Final = 0b1110
-"""Bits of the samples that need not be looked at when all of a pixel are alike."""
+_DEPTH_GAP: Final = 0.01  # samples of a patch that differ by a larger share hide one another
+_ALL_BUT_FIRST: Final = 0b1110  # bits of the samples to skip when all of a pixel are alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +29,8 @@ class Fragments:
     Attributes:
         pixel: Index of the pixel in the window, row by row, shape (n,).
         weight: Number of the pixel's samples that it covers, shape (n,).
-        face: Index of its triangle; of one seen from behind, its bitwise complement, shape (n,).
+        face: Index of its triangle; its bitwise complement for a back face, shape (n,).
+        x: Column of its mean in the image, shape (n,); ``y`` is the row.
         share: Weights of the triangle's corners, shape (3, n).
         position: Camera frame, metres, shape (3, n).
         normal: Unit normal towards the camera, camera frame, shape (3, n).
@@ -56,7 +54,7 @@ def gather_fragments(
 ) -> Fragments | None:
     """Collect an object's fragments, valid until the next object's are collected; None without any.
 
-    ``first_id`` is the number of the object's first triangle in ``samples``.
+    ``first_id`` is the number of the object's first triangle.
     """
     box = seen.box(scene.size)
     if box is None:
@@ -65,9 +63,10 @@ def gather_fragments(
     window = (box[0] - origin[0], box[1] - origin[1], box[2] - origin[0], box[3] - origin[1])
     # The most there can be; memory that is never touched costs nothing.
     most = NUM_COLOUR_SAMPLES * (box[2] - box[0]) * (box[3] - box[1])
-    pixel, face = scratch("pixel", (most,), np.int32), scratch("face", (most,), np.int32)
-    weight, inverse = (scratch(name, (most,), np.float32) for name in ("weight", "inverse"))
-    x, y = scratch("x", (most,), np.float32), scratch("y", (most,), np.float32)
+    pixel, face = (scratch(name, (most,), np.int32) for name in ("pixel", "face"))
+    weight, x, y, inverse = (
+        scratch(name, (most,), np.float32) for name in ("weight", "x", "y", "inverse")
+    )
     count = _group(
         window, origin, samples.ids, samples.inverse_depth, first_id, surface.patches,
         PIXEL_SAMPLES, pixel, weight, face, x, y, inverse,

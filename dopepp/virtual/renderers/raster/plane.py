@@ -3,6 +3,11 @@
 The background shows the plane in full light. Where objects keep light from it, the background is
 multiplied by the share of light that is left, of the sky and of every lamp. A plane's points map
 to a shadow map, and to the grid of its sky, by homographies; so both are warped into the image.
+
+For the sky, points spread over the objects stand for them: in each of 32 directions, spread with
+the cosine, every point hides the sky from one spot of the plane. One bit per direction and cell
+says so; the share of bits is the share of the sky. That is the soft darkening around an object that
+touches a table.
 """
 
 from __future__ import annotations
@@ -30,11 +35,9 @@ from dopepp.virtual.scene import NEAR, Plane, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import NUM_COLOUR_SAMPLES, scratch
 
-_VISIBLE: Final = np.float32(0.005)
-"""Share of hidden light from which on a picture of 256 levels changes."""
+_VISIBLE: Final = np.float32(0.005)  # share of hidden light that changes a picture of 256 levels
 
-_SKY_DIRECTIONS: Final = 32
-"""Directions in which the sky is looked at, one bit each."""
+_SKY_DIRECTIONS: Final = 32  # in which the sky is sampled, one bit each
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -47,7 +50,7 @@ def darken_plane(
     ``samples`` are what the pixels with objects see, those full of objects left out; ``image`` is
     the uint8 background, updated in place.
     """
-    # Camera-frame points to (x, y) on the plane and the height above it, metres.
+    # To (x, y) on the plane and the height above it, metres.
     rotation = rotation_to_z(np.array(plane.normal, np.float64))
     frame = np.column_stack([rotation, [0.0, 0.0, -plane.offset]])
     sky = hidden_sky(frame, scene.objects)
@@ -175,7 +178,12 @@ def hidden_sky(
     cell = float((high - low).max()) / 80
     columns, rows = (math.ceil(side) + 1 for side in (high - low) / cell)
     bits, own = np.zeros((rows, columns), np.uint32), np.empty((rows, columns), np.uint32)
-    grid, slopes = np.array([low[0], low[1], cell]), _sky_slopes()
+    grid = np.array([low[0], low[1], cell])
+    # Directions into the sky as (x, y)/z, spread with the cosine (Malley's method).
+    k = np.arange(_SKY_DIRECTIONS) + 0.5
+    radius, angle = np.sqrt(k / _SKY_DIRECTIONS), k * np.pi * (1 + np.sqrt(5))
+    slopes = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    slopes = slopes / np.sqrt(1 - radius**2)[:, None]
     for item, points in zip(objects, places, strict=True):
         own[:] = 0
         # Half a spot's side, so wide that spots leave no gaps.
@@ -195,15 +203,6 @@ def hidden_sky(
     )
     hidden *= np.minimum(np.minimum.outer(*edges), 1.0).astype(np.float32)
     return grid, np.asarray(hidden)
-
-
-def _sky_slopes() -> Float[np.ndarray, "directions 2"]:
-    """Return directions into the sky as (x, y)/z, spread with the cosine (Malley's method)."""
-    k = np.arange(_SKY_DIRECTIONS) + 0.5
-    radius, angle = np.sqrt(k / _SKY_DIRECTIONS), k * np.pi * (1 + np.sqrt(5))
-    height = np.sqrt(1 - radius**2)
-    slopes = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    return np.asarray(slopes / height[:, None])
 
 
 @compiled()
@@ -232,12 +231,10 @@ def _darken(
 ) -> None:  # fmt: skip
     """Multiply the picture by the share of the plane's light that is left.
 
-    Pixels (x, y) of the first elements are ``corner`` of ``shades`` (the share that is hidden of
-    the sky and of every light, shape (1 + lights, h, w)) and ``origin`` of ``ids`` (triangles per
-    sample). ``to_point`` maps a pixel to its point and 1/z, shape (4, 3). ``sky`` is linear RGB,
-    ``lights`` have position and linear RGB at one metre, shape (lights, 6), ``P`` projects into
-    their shadow maps, shape (lights, 3, 4). ``decode`` turns codes into linear light, ``encode``,
-    in ``steps`` per unit, back. ``image`` is uint8, updated in place.
+    ``shades``, of shape (1 + lights, h, w), are the shares that are hidden of the sky and of every
+    light; their first pixel is ``corner``, that of ``ids`` ``origin``. ``to_point`` maps a pixel to
+    its point and 1/z, shape (4, 3); ``lights`` and ``P`` are those of the shadow maps. ``decode``
+    turns codes into linear light, ``encode``, in ``steps`` per unit, back.
     """
     width = shades.shape[2]
     total, lost = np.empty((3, width), np.float32), np.empty((3, width), np.float32)

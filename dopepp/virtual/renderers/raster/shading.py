@@ -31,9 +31,8 @@ from dopepp.virtual.renderers.raster.visibility import (
     Samples,
     ShadowMap,
     ambient_row,
-    lit_shares,
 )
-from dopepp.virtual.scene import NOISE_LIMITS, Grooves, Scene, SceneObject
+from dopepp.virtual.scene import NOISE_LIMITS, Scene, SceneObject
 from dopepp.virtual.sensor import CODE_STEPS, SRGB_TO_LINEAR, TONE_CURVE, TONE_LIMIT
 from dopepp.virtual.surface.occlusion import look_up_sky
 from dopepp.virtual.surface.texture import sample_texture
@@ -41,12 +40,10 @@ from dopepp.virtual.triangles import scratch
 
 # Plain literals would turn the arithmetic into float64.
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
-_GRAZING = np.float32(1e-3)
-_TINY = np.float32(1e-6)
+_GRAZING, _TINY = np.float32(1e-3), np.float32(1e-6)
 
 _SIDE: Final = 32
 _MASK: Final = _SIDE - 1
-
 # 32³ values of one byte stay in the processor's first cache; the seed only fixes the pattern.
 _NOISE: Final = np.random.default_rng(0).integers(-127, 128, (_SIDE, _SIDE, _SIDE)).astype(np.int8)
 """Random values on a lattice that repeats every 32 steps, in units of 1/127."""
@@ -74,9 +71,13 @@ def shade_object(
     alpha = scratch("alpha", (count,), np.float32)
     # A highlight under a point light may be narrower than any pixel.
     alpha.fill(max(material.roughness**2, 0.002))
-    if material.grooves is not None:
-        _cut_grooves(item, material.grooves, scene, fragments, alpha)
-    lit, opened = (scratch(name, (count,), np.float32) for name in ("lit", "sky"))
+    if (grooves := material.grooves) is not None:
+        axis = item.T_cam_obj[:3, :3] @ np.array(grooves.axis, np.float64)
+        _tilt_normals(
+            _NOISE, position, axis, float(axis @ item.T_cam_obj[:3, 3]), scene.K.diagonal()[:2],
+            grooves.pitch, grooves.slope, grooves.irregularity, normal, alpha,
+        )  # fmt: skip
+    opened = scratch("sky", (count,), np.float32)
     radiance = scratch("radiance", (3, count), np.float32)
     look_up_sky(fragments.face, fragments.share, sky.steps, sky.firsts, sky.values, opened)
     reflect_ambient(
@@ -84,11 +85,7 @@ def shade_object(
         radiance,
     )  # fmt: skip
     for shadow in lights:
-        # Lifted by √2 texels, a plane does not shadow itself; the rest is for rounding.
-        lit_shares(
-            position, normal, fragments.bulge, shadow.light, shadow.inverse_depth, shadow.P,
-            1.5 * shadow.texel, lit,
-        )  # fmt: skip
+        lit = shadow.lit_shares(position, normal, fragments.bulge)
         reflect_light(
             position, normal, albedo, alpha, lit, shadow.light, material.specular,
             material.metallic, radiance,
@@ -103,36 +100,22 @@ def _albedo(item: SceneObject, seen: Projected, scene: Scene, fragments: Fragmen
     """Return the fragments' albedo: the surface's times the material's colour, and its noise."""
     surface, material = item.surface, item.material
     albedo = scratch("albedo", (3, len(fragments.pixel)), np.float32)
-    colour = np.array(material.colour, np.float32)[:, None]
-    if surface.texture is None and not len(surface.colours):
-        albedo[:] = colour
-    elif surface.texture is None:
-        _blend_colours(fragments.face, fragments.share, surface.faces, surface.colours, albedo)
-        albedo *= colour
-    else:
+    if surface.texture is not None:
         sample_texture(
             fragments.face, fragments.share, fragments.x, fragments.y, seen.hom, surface.faces,
             surface.uv, surface.texture.texels, surface.texture.levels, SRGB_TO_LINEAR, albedo,
         )  # fmt: skip
-        albedo *= colour
+    elif len(surface.colours):
+        _blend_colours(fragments.face, fragments.share, surface.faces, surface.colours, albedo)
+    else:
+        albedo.fill(1.0)
+    albedo *= np.array(material.colour, np.float32)[:, None]
     if material.noise > 0.0:
         _tint_albedo(
             _NOISE, fragments.position, item.T_cam_obj, float(scene.K[0, 0]), material.noise,
             material.noise_pitch, albedo, *NOISE_LIMITS,
         )  # fmt: skip
     return albedo
-
-
-def _cut_grooves(
-    item: SceneObject, grooves: Grooves, scene: Scene, fragments: Fragments, alpha: Array
-) -> None:
-    """Tilt the fragments' normals along the material's grooves, or widen their highlights."""
-    axis = item.T_cam_obj[:3, :3] @ np.array(grooves.axis, np.float64)
-    _tilt_normals(
-        _NOISE, fragments.position, axis, float(axis @ item.T_cam_obj[:3, 3]),
-        np.array([scene.K[0, 0], scene.K[1, 1]]), grooves.pitch, grooves.slope,
-        grooves.irregularity, fragments.normal, alpha,
-    )  # fmt: skip
 
 
 @compiled(fastmath=True)
@@ -154,11 +137,9 @@ def _tint_albedo(
     noise: Array, position: Array, T_cam_obj: Array, focal: float, amplitude: float, pitch: float,
     albedo: Array, least: float, greatest: float,
 ) -> None:  # fmt: skip
-    """Vary the albedo over an object's surface; variation finer than a pixel fades.
+    """Vary the albedo, in place, over an object's surface; variation finer than a pixel fades.
 
-    ``position`` is in the camera frame, metres, shape (3, n); ``focal`` in pixels; ``pitch`` that
-    of the lattice, metres; ``albedo`` linear RGB, shape (3, n), updated in place, by factors from
-    ``least`` to ``greatest``.
+    ``pitch`` is the lattice's, metres; the factors lie between ``least`` and ``greatest``.
     """
     for p in range(position.shape[1]):
         # Two lattice steps are the shortest wave; it needs two pixels.
@@ -184,13 +165,10 @@ def _tilt_normals(
     noise: Array, position: Array, axis: Array, phase_origin: float, focal: Array, pitch: float,
     slope: float, irregularity: float, normal: Array, alpha: Array,
 ) -> None:  # fmt: skip
-    """Tilt the normals of grooved points, or widen their highlight where grooves are fine.
+    """Tilt the normals of grooved points, or widen their alpha where grooves are fine, in place.
 
-    In the camera frame are ``position`` (metres, shape (3, n)) and ``axis``, a unit vector across
-    the grooves; ``phase_origin`` is ``axis · origin`` of the object's frame, metres; ``focal`` is
-    (fx, fy), pixels; ``pitch`` metres from groove to groove; ``irregularity`` 0 for sines, 1 for
-    noise. Updated in place: unit normals towards the camera, shape (3, n), and ``alpha``, the GGX
-    width (the square of the roughness), shape (n,).
+    ``axis`` is a unit vector across the grooves, camera frame; ``phase_origin`` is ``axis ·
+    origin`` of the object's frame, metres; ``focal`` is (fx, fy), pixels.
     """
     ax, ay, az = axis
     for p in range(position.shape[1]):
@@ -263,9 +241,8 @@ def reflect_ambient(
 
     A dielectric scatters the hemisphere around its normal; the little gloss on top is left out. A
     metal mirrors the hemisphere's colour in the reflected direction, the sharper the smoother it
-    is, and tints it with its albedo. ``opened``, of shape (n,), is the share of the ambient light
-    that reaches each point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for
-    metals; ``radiance``, linear RGB of shape (3, n), is overwritten.
+    is, and tints it with its albedo. ``opened`` is the share of the ambient light that reaches each
+    point, ``ambient`` comes from :func:`ambient_row`, ``metallic`` is 1 for metals.
     """
     ux, uy, uz = ambient[0], ambient[1], ambient[2]
     for p in range(position.shape[1]):
@@ -295,10 +272,9 @@ def reflect_light(
 ) -> None:  # fmt: skip
     """Add one point light: Lambert, and GGX with Smith's visibility and Schlick's Fresnel factor.
 
-    ``lit``, of shape (n,), is the share of the light that reaches each point, ``light`` comes from
-    :func:`~.visibility.light_row`, ``specular`` is the reflectance of
-    the dielectric part at normal incidence, ``metallic`` 1 for a metal, whose reflectance is its
-    albedo; ``radiance``, linear RGB of shape (3, n), is updated in place.
+    ``lit`` is the share of the light that reaches each point, ``light`` a :class:`ShadowMap`'s,
+    ``specular`` the reflectance of the dielectric part at normal incidence, ``metallic`` 1 for a
+    metal, whose reflectance is its albedo. ``radiance`` is updated in place.
     """
     base, metal = np.float32(specular), np.float32(metallic)
     matt = _ONE - metal
@@ -339,10 +315,8 @@ def _add_colour(
 ) -> None:  # fmt: skip
     """Add fragments to the sums of their pixels' sRGB values.
 
-    Light is encoded before samples are averaged, so a highlight's edge stays smooth. A fragment
-    stands for ``weight`` samples of its ``pixel``, both of shape (n,), with linear RGB
-    ``radiance``, shape (3, n). ``curve`` gives sRGB in ``steps`` per unit of radiance up to
-    ``limit``. ``colour`` are the sums, float32, shape (pixels, 3), updated in place.
+    Light is encoded before samples are averaged, so a highlight's edge stays smooth. ``curve``
+    gives sRGB in ``steps`` per unit of radiance up to ``limit``.
     """
     for p in range(pixel.shape[0]):
         for c in range(3):

@@ -1,4 +1,7 @@
-"""Visibility: what every sample of the image sees, of a scene or of one object alone."""
+"""Visibility: what every sample of the image sees, of a scene or of one object alone; shadow maps.
+
+A shadow map is the scene's depth as a light sees it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from jaxtyping import Float32, Int16
 
 from dopepp.core.compiled import Array, Scalar, compiled
 from dopepp.drawing.pictures import Picture, Size
-from dopepp.geometry.camera import Transform, make_transform, transform
+from dopepp.geometry.camera import make_transform, transform
 from dopepp.geometry.rotation import Vector, rotation_to_z
 from dopepp.virtual.scene import NEAR, Ambient, Light, Plane, Scene, SceneObject
 from dopepp.virtual.triangles import (
@@ -28,13 +31,12 @@ from dopepp.virtual.triangles import (
 Box = tuple[int, int, int, int]
 """(left, top, right, bottom) in pixels, right and bottom excluded."""
 
+Extent = tuple[float, float, float, float]
+"""Smallest and largest pixel coordinates (left, top, right, bottom)."""
+
 _REACH: Final = float(np.abs(PIXEL_SAMPLES).max())
-
-_LARGEST_TANGENT: Final = 3.0
-"""A light among the objects looks no farther than this to the sides; beyond, all is lit."""
-
-# Plain literals would turn the arithmetic into float64.
-_ZERO, _ONE = np.float32(0), np.float32(1)
+_LARGEST_TANGENT: Final = 3.0  # to the side of a light among the objects; beyond, all is lit
+_ZERO, _ONE = np.float32(0), np.float32(1)  # literals would turn the arithmetic into float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,25 +46,22 @@ class Projected:
     Attributes:
         cam: Camera frame, metres, shape (V, 3).
         hom: Homogeneous pixels ``K x_cam``, shape (V, 3).
-        extent: Smallest and largest pixel coordinates (left, top, right, bottom) of its image;
-            infinite if it crosses the camera plane, left > right if it lies behind.
+        extent: Of its image; infinite if it crosses the camera plane, left > right if it lies
+            behind.
     """
 
     cam: Array
     hom: Array
-    extent: tuple[float, float, float, float]
+    extent: Extent
 
     def box(self, size: Size) -> Box | None:
         """Return the pixels of an image of a size that it may touch; None if there are none."""
         left, top, right, bottom = self.extent
         if left > right:
             return None
-        box = (
-            math.ceil(max(left - _REACH, 0.0)),
-            math.ceil(max(top - _REACH, 0.0)),
-            math.floor(min(right + _REACH, size[0] - 1)) + 1,
-            math.floor(min(bottom + _REACH, size[1] - 1)) + 1,
-        )
+        left, top = max(left - _REACH, 0.0), max(top - _REACH, 0.0)
+        right, bottom = min(right + _REACH, size[0] - 1), min(bottom + _REACH, size[1] - 1)
+        box = centres_within((left, top, right, bottom))
         return box if box[0] < box[2] and box[1] < box[3] else None
 
     def inside(self, size: Size) -> bool:
@@ -78,7 +77,7 @@ def project_object(item: SceneObject, K: Array) -> Projected:
     return Projected(cam, hom, bounds(hom, NEAR))
 
 
-def centres_within(extent: tuple[float, float, float, float]) -> Box:
+def centres_within(extent: Extent) -> Box:
     """Return the box of the pixel centres within finite bounds, on a canvas without borders."""
     left, top, right, bottom = extent
     return math.ceil(left), math.ceil(top), math.floor(right) + 1, math.floor(bottom) + 1
@@ -174,7 +173,7 @@ class ShadowMap:
     """What one light sees.
 
     Attributes:
-        light: As of :func:`light_row`.
+        light: Position and linear RGB at one metre, for compiled code.
         inverse_depth: 1/m, 0 where nothing is, shape (height, width, 1).
         P: Camera frame to homogeneous pixels of the map, of which the third is the depth from the
             light, shape (3, 4), float32.
@@ -186,17 +185,31 @@ class ShadowMap:
     P: Array
     texel: float
 
+    def lit_shares(self, position: Array, normal: Array, bulge: Array) -> Array:
+        """Return the share of the light that reaches each point; 0 where it faces away.
+
+        Before a point is looked up it is lifted along its normal: by 1.5 texels (from √2 on, the
+        four texels around it lie behind it on its own plane, whatever the slope), and by its
+        ``bulge``, metres: a smooth ball of few flat triangles would shadow itself where its normals
+        still face the light.
+        """
+        u, v, inverse = scratch("places", position.shape, np.float32)
+        lit = scratch("lit", u.shape, np.float32)
+        lift = np.float32(1.5 * self.texel)
+        _place(position, normal, bulge, self.light, self.P, lift, u, v, inverse)
+        _compare(u, v, inverse, self.inverse_depth, lit)
+        return lit
+
 
 def shadow_maps(scene: Scene, projected: Sequence[Projected]) -> list[ShadowMap]:
     """Return the shadow map of every light of a scene with objects."""
     boxes = [box for seen in projected if (box := seen.box(scene.size)) is not None]
     extent = max((max(box[2] - box[0], box[3] - box[1]) for box in boxes), default=0)
-    lights = []
-    for number, light in enumerate(scene.lights):
-        # One per pixel of the objects' image; for all lights but the first, half as many.
-        texels = extent * (0.5 if number else 1.0)
-        lights.append(shadow_map(light, scene.objects, projected, texels))
-    return lights
+    # A texel per pixel of the objects' image; for all lights but the first, half as many.
+    return [
+        shadow_map(light, scene.objects, projected, extent * (0.5 if number else 1.0))
+        for number, light in enumerate(scene.lights)
+    ]
 
 
 def shadow_map(
@@ -208,15 +221,17 @@ def shadow_map(
     ``texels``.
     """
     points = np.concatenate([transform(item.T_cam_obj, item.surface.hull) for item in objects])
-    T_light_cam = _look_at(light, (points.min(axis=0) + points.max(axis=0)) / 2)
+    position = np.array(light.position, np.float64)
+    forward = (points.min(axis=0) + points.max(axis=0)) / 2 - position
+    distance = float(np.linalg.norm(forward))
+    # From their middle itself, the light looks anywhere.
+    rotation = rotation_to_z(forward / distance if distance > 0 else np.array([0.0, 0.0, 1.0]))
+    T_light_cam = make_transform(rotation, -rotation @ position)
     points = transform(T_light_cam, points)
-    depth = np.maximum(points[:, 2], NEAR)
-    tangents = points[:, :2] / depth[:, None]
-    if (points[:, 2] <= NEAR).any():
-        low, high = np.full(2, -_LARGEST_TANGENT), np.full(2, _LARGEST_TANGENT)
-    else:
-        low = np.maximum(tangents.min(axis=0), -_LARGEST_TANGENT)
-        high = np.minimum(tangents.max(axis=0), _LARGEST_TANGENT)
+    low, high = np.full(2, -_LARGEST_TANGENT), np.full(2, _LARGEST_TANGENT)
+    if (points[:, 2] > NEAR).all():
+        tangents = points[:, :2] / points[:, 2:]
+        low, high = np.maximum(tangents.min(axis=0), low), np.minimum(tangents.max(axis=0), high)
     span = np.maximum(high - low, 1e-6)
     focal = float(np.clip(texels, 64, 768) / span.max())
     # Two texels of margin, so that the interpolation at the outline stays inside.
@@ -232,41 +247,14 @@ def shadow_map(
             hom, surface.faces, surface.closed, NEAR, (0, 0), CENTRE_SAMPLE, inverse_depth, ids, 0
         )
     P = (K @ T_light_cam[:3]).astype(np.float32)
-    return ShadowMap(light_row(light), inverse_depth, P, 1 / focal)
-
-
-def light_row(light: Light) -> Array:
-    """Return a light's position and its linear RGB at one metre, for compiled code."""
-    return np.array([*light.position, *(light.reach**2 * np.array(light.intensity))], np.float32)
+    rgb = light.reach**2 * np.array(light.intensity)
+    row = np.array([*light.position, *rgb], np.float32)
+    return ShadowMap(row, inverse_depth, P, 1 / focal)
 
 
 def ambient_row(ambient: Ambient) -> Array:
     """Return the up direction and the light from above and below, for compiled code."""
     return np.array([*ambient.up, *ambient.above, *ambient.below], np.float32)
-
-
-def lit_shares(
-    position: Array,
-    normal: Array,
-    bulge: Array,
-    light: Array,
-    inverse_depth: Array,
-    P: Array,
-    lift: float,
-    lit: Array,
-) -> None:
-    """Write the share of a light's light that reaches each point; 0 where it faces away.
-
-    ``light`` comes from :func:`light_row`; ``inverse_depth`` and ``P`` are its shadow map's. Before
-    a point is looked up it is lifted along its normal, by ``lift`` metres per metre of distance
-    from the light (from √2 texels on, the four texels around it lie behind it on its own plane,
-    whatever the slope), and by its ``bulge``, metres, shape (n,): a smooth ball of few flat
-    triangles would shadow itself where its normals still face the light. ``lit`` has the shape
-    (n,).
-    """
-    u, v, inverse = scratch("places", position.shape, np.float32)
-    _place(position, normal, bulge, light, P, np.float32(lift), u, v, inverse)
-    _compare(u, v, inverse, inverse_depth, lit)
 
 
 @compiled(fastmath=True)
@@ -296,16 +284,6 @@ def _compare(u: Array, v: Array, inverse: Array, inverse_depth: Array, lit: Arra
     """Compare projected points with the map."""
     for p in range(lit.shape[0]):
         lit[p] = open_share(u[p], v[p], inverse[p], inverse_depth) if inverse[p] > _ZERO else _ZERO
-
-
-def _look_at(light: Light, centre: Vector) -> Transform:
-    """Return the transform from the camera frame to a frame at the light that looks at a point."""
-    position = np.array(light.position, np.float64)
-    forward = centre - position
-    distance = float(np.linalg.norm(forward))
-    # From the point itself it looks anywhere.
-    rotation = rotation_to_z(forward / distance if distance > 0 else np.array([0.0, 0.0, 1.0]))
-    return make_transform(rotation, -rotation @ position)
 
 
 @compiled()
