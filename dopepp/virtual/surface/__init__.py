@@ -20,34 +20,27 @@ from dopepp.virtual.sensor import SRGB_TO_LINEAR
 from dopepp.virtual.surface.occlusion import OpenSky, bake_open_sky, spread_directions
 from dopepp.virtual.surface.texture import Texture, make_texture
 
-CREASE_ANGLE_DEG: Final = 35.0
+_CREASE_ANGLE_DEG: Final = 35.0
 """Faces that meet at a larger angle keep a sharp edge; a CAD cylinder has facets of 5° to 30°."""
 
-_HULL_DIRECTIONS: Final = 400
-"""Extreme points along so many directions stand for a mesh when its image size is measured."""
-
-_NUM_POINTS: Final = 400
-"""Points that stand for a mesh where a plane is darkened beside it."""
-
-_MOST_CORNERS: Final = 1024
-"""Normals around a vertex of more corners are not averaged: that takes the square of the number."""
+_HULL_DIRECTIONS: Final = 400  # whose extreme points stand for a mesh when its image is measured
+_NUM_POINTS: Final = 400  # that stand for a mesh where a plane is darkened beside it
+_MOST_CORNERS: Final = 1024  # of a vertex; averaging more normals takes the square of the number
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles as the rasteriser takes them.
+    """Triangles as the rasteriser takes them; positions in the object frame, metres.
 
     Attributes:
-        vertices: Object frame, metres, float64.
-        faces: Vertex indices, int32.
+        vertices: float64; ``faces`` are their indices, int32.
         normals: Unit normal of every face's corner, object frame, float32.
         patches: Number of every face's smooth patch, int32: faces that connect without a crease.
         uv: Texture coordinates per vertex, v up; shape (0, 2) without a texture.
         colours: Linear albedo per vertex; shape (0, 3) without colours or with a texture.
         closed: Watertight with outward winding, so back faces can be dropped.
-        hull: Extreme vertices that bound the mesh's image, object frame, metres.
-        points: Points spread evenly over the surface, object frame, metres.
-        spacing: About the distance between neighbours among them, metres.
+        hull: Extreme vertices that bound the mesh's image.
+        points: Points spread evenly over the surface, about ``spacing`` apart.
     """
 
     vertices: Vertices
@@ -91,71 +84,53 @@ class Surface:
         )
 
 
-def make_surface(mesh: Mesh, crease_angle_deg: float = CREASE_ANGLE_DEG) -> Surface:
+def make_surface(mesh: Mesh) -> Surface:
     """Prepare a mesh for rendering (a quarter of a second; do it once per part).
 
-    A UserError: the mesh has no faces, a vertex or a texture coordinate that is not finite, or a
-    face with a vertex that does not exist.
+    Raises:
+        UserError: The mesh has no faces, a value that is not finite, or a face with a vertex that
+            does not exist.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
+    fix = "repair the mesh or export it again"
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        raise UserError(
-            f"a mesh of {len(vertices)} vertices and {len(faces)} faces to render",
-            "at least one face and finite vertices",
-            "repair the mesh or export it again",
-        )
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        # Compiled code does not check indices.
-        raise UserError(
-            f"a mesh with a face of vertices {faces.min()} to {faces.max()}",
-            f"vertices 0 to {len(vertices) - 1}",
-            "repair the mesh or export it again",
-        )
+        got = f"a mesh of {len(vertices)} vertices and {len(faces)} faces to render"
+        raise UserError(got, "at least one face and finite vertices", fix)
+    if faces.min() < 0 or faces.max() >= len(vertices):  # compiled code does not check indices
+        got = f"a mesh with a face of vertices {faces.min()} to {faces.max()}"
+        raise UserError(got, f"vertices 0 to {len(vertices) - 1}", fix)
     merged = _merge_vertices(vertices)[faces]
     edges = vertices[faces[:, [1, 2, 0]]] - vertices[faces]
     doubled = np.cross(edges[:, 0], edges[:, 1])
     length = np.linalg.norm(doubled, axis=1)
-    normals = _corner_normals(merged, doubled, length, edges, crease_angle_deg)
+    normals = _corner_normals(merged, doubled, length, edges)
     if mesh.normals is not None:
-        _take_given(normals, mesh.normals[faces], doubled, length, crease_angle_deg)
+        _take_given(normals, mesh.normals[faces], doubled, length)
     closed = _is_closed(merged, vertices[faces])
     uv, texture = np.zeros((0, 2), np.float32), None
+    colours = np.zeros((0, 3), np.float32)
     if mesh.uv is not None and mesh.texture is not None:
         uv = np.ascontiguousarray(mesh.uv, np.float32)
         if len(uv) != len(vertices) or not np.isfinite(uv).all():
-            raise UserError(
-                f"{len(uv)} texture coordinates of a mesh of {len(vertices)} vertices",
-                "one finite texture coordinate per vertex",
-                "export the mesh again",
-            )
+            got = f"{len(uv)} texture coordinates of a mesh of {len(vertices)} vertices"
+            raise UserError(got, "one finite texture coordinate per vertex", fix)
         texture = make_texture(mesh.texture, uv, faces)
+    elif mesh.colours is not None:
+        colours = SRGB_TO_LINEAR[mesh.colours]
+    # Texture coordinates may differ where positions do not.
+    patches = _smooth_patches(merged if texture is None else faces, normals, length > 0)
+    sky = bake_open_sky(vertices, faces, normals, closed)
+    hull = vertices[np.unique(faces)]
+    if len(hull) > _HULL_DIRECTIONS:
+        # One direction after the other: all at once would take gigabytes for a large mesh.
+        extreme = [int((hull @ along).argmax()) for along in spread_directions(_HULL_DIRECTIONS)]
+        hull = hull[np.unique(extreme)]
+    spacing = float(np.sqrt(length.sum() / 2 / _NUM_POINTS))
+    points = _spread_points(vertices[faces], length)
     return Surface(
-        vertices=vertices,
-        faces=faces,
-        normals=normals,
-        # Texture coordinates may differ where positions do not.
-        patches=_smooth_patches(merged if texture is None else faces, normals, length > 0),
-        uv=uv,
-        colours=np.zeros((0, 3), np.float32)
-        if mesh.colours is None or texture is not None
-        else SRGB_TO_LINEAR[mesh.colours],
-        texture=texture,
-        sky=bake_open_sky(vertices, faces, normals, closed),
-        closed=closed,
-        hull=_extremes(vertices[np.unique(faces)]),
-        points=_spread_points(vertices[faces], length),
-        spacing=float(np.sqrt(length.sum() / 2 / _NUM_POINTS)),
+        vertices, faces, normals, patches, uv, colours, texture, sky, closed, hull, points, spacing
     )
-
-
-def _extremes(vertices: Vertices) -> Float[np.ndarray, "hull 3"]:
-    """Return the vertices that are extreme along directions spread over the sphere."""
-    if len(vertices) <= _HULL_DIRECTIONS:
-        return vertices
-    # One direction after the other: all at once would take gigabytes for a large mesh.
-    extreme = [int((vertices @ along).argmax()) for along in spread_directions(_HULL_DIRECTIONS)]
-    return np.asarray(vertices[np.unique(extreme)])
 
 
 def _spread_points(
@@ -202,13 +177,11 @@ def _corner_normals(
     doubled: Float[np.ndarray, "faces 3"],
     length: Float[np.ndarray, "faces"],
     edges: Float[np.ndarray, "faces 3 3"],
-    crease_angle_deg: float,
 ) -> Float[np.ndarray, "faces 3 3"]:
     """Return angle-weighted corner normals (Thürmer and Wüthrich 1998) with creases.
 
     ``merged`` is the merged vertex of every corner; ``doubled`` the cross product of two ``edges``
-    of every face (its normal, twice its area long), ``length`` its length. Faces that meet at more
-    than ``crease_angle_deg`` keep a sharp edge.
+    of every face (its normal, twice its area long), ``length`` its length.
     """
     face_normals = doubled / np.maximum(length, 1e-300)[:, None]
     unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
@@ -218,7 +191,7 @@ def _corner_normals(
     counts = np.bincount(merged.reshape(-1), minlength=int(merged.max()) + 1)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     normals = np.empty((len(merged), 3, 3), np.float32)
-    cosine = float(np.cos(np.radians(crease_angle_deg)))
+    cosine = float(np.cos(np.radians(_CREASE_ANGLE_DEG)))
     _average_normals(face_normals, weights, offsets, corners, cosine, normals)
     return normals
 
@@ -228,7 +201,6 @@ def _take_given(
     given: Float[np.ndarray, "faces 3 3"],
     doubled: Float[np.ndarray, "faces 3"],
     length: Float[np.ndarray, "faces"],
-    crease_angle_deg: float,
 ) -> None:
     """Put a file's normals at the corners where they can be the smooth surface's.
 
@@ -238,7 +210,7 @@ def _take_given(
     with np.errstate(all="ignore"):  # of what is zero, or not finite
         unit = given / np.linalg.norm(given, axis=2, keepdims=True)
         facing = np.einsum("fki,fi->fk", unit, doubled / np.maximum(length, 1e-300)[:, None])
-        near = facing >= math.cos(math.radians(crease_angle_deg / 2))
+        near = facing >= math.cos(math.radians(_CREASE_ANGLE_DEG / 2))
     normals[near] = unit[near]
 
 
@@ -248,10 +220,9 @@ def _average_normals(
 ) -> None:
     """Average, at every corner, the normals of the faces around its vertex within an angle.
 
-    Faces have unit normals, zero for degenerate ones, and corners ``weights`` (their angles), both
-    of shape (F, 3). ``corners`` are the numbers 3·face + k sorted by vertex, shape (3F,), of which
-    each vertex's start at ``offsets``, shape (V + 1,). Faces that differ by more than ``cosine``
-    are not averaged. ``out`` are normals, shape (F, 3, 3), float32.
+    Degenerate faces have the normal zero; ``weights`` are the corners' angles, shape (F, 3).
+    ``corners`` are the numbers 3·face + k sorted by vertex, of which each vertex's start at
+    ``offsets``. Faces that differ by more than ``cosine`` are not averaged.
     """
     for vertex in range(offsets.shape[0] - 1):
         for p in range(offsets[vertex], offsets[vertex + 1]):
@@ -282,8 +253,7 @@ def _smooth_patches(
     """Number faces so that those connected by edges without a crease share a number.
 
     ``corners`` are vertices; where attributes differ, vertices must too. An edge is smooth where
-    the normals of both its faces agree. ``usable`` is False for faces without an area, which
-    connect nothing.
+    the normals of both its faces agree. Faces that are not ``usable`` connect nothing.
     """
     count = int(corners.max()) + 1
     start, end = corners, corners[:, [1, 2, 0]]

@@ -20,8 +20,7 @@ from dopepp.core.compiled import Array, compiled
 from dopepp.parts.mesh import Faces, Vertices
 from dopepp.virtual.triangles import CENTRE_SAMPLE, lit_share, project_vertices, rasterise
 
-_FINEST: Final = 1 / 96
-"""Spacing of the points over the mesh's size, and the most steps along a triangle's edge."""
+_FINEST: Final = 1 / 96  # spacing of the points over the mesh's size; 96 steps an edge at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +47,8 @@ def bake_open_sky(
 ) -> OpenSky:
     """Measure the open sky over a mesh; the time grows with the number of triangles.
 
-    The last ones are kept, because a run prepares its parts anew for every set of its data.
-
-    ``normals`` are of every corner; ``closed`` tells that nobody sees the back sides.
+    The last skies are kept, because a run prepares its parts anew for every set of its data.
+    ``normals`` are of every corner; of a ``closed`` mesh, nobody sees the back sides.
     """
     digest = hashlib.sha256(str((vertices.shape, closed)).encode())
     for array in (vertices, faces, normals):
@@ -157,11 +155,10 @@ def _bake(
 ) -> None:  # fmt: skip
     """Sum the open and all of the cosine over directions, for front and back sides.
 
-    The mesh lies within ``radius`` around ``centre``; ``closed`` drops back faces. Depth maps along
-    ``directions`` (units, shape (D, 3)) have ``side`` texels across, sampled at their centres.
-    ``points`` with normals ``upright``, both of shape (n, 3), are measured at; ``ground`` is the
-    face of each, shape (n,), ``flat`` every face's normal. ``sums`` are open front, all front, open
-    back and all back, shape (4, n), updated in place.
+    The mesh lies within ``radius`` around ``centre``. Depth maps along ``directions`` have ``side``
+    texels across, sampled at their centres. ``points`` with normals ``upright`` lie on the faces
+    ``ground``; ``flat`` are the faces' normals. ``sums`` are open front, all front, open back and
+    all back.
     """
     distance = 20.0 * radius  # as good as parallel
     focal = 0.5 * (side - 4) * distance / radius
@@ -222,9 +219,8 @@ def look_up_sky(
 ) -> None:
     """Interpolate the open sky at an object's fragments.
 
-    ``face`` is each one's triangle, complemented for back sides, shape (n,); ``share`` weighs its
-    corners, shape (3, n); ``steps``, ``firsts`` and ``values`` are those of an :class:`OpenSky`;
-    ``out`` is the result, shape (n,).
+    ``face`` and ``share`` are the fragments'; ``steps``, ``firsts`` and ``values`` those of an
+    :class:`OpenSky`.
     """
     for p in range(face.shape[0]):
         f, side = (face[p], 0) if face[p] >= 0 else (~face[p], 1)

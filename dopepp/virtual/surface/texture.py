@@ -23,11 +23,8 @@ from dopepp.parts.mesh import Faces
 from dopepp.virtual.sensor import CODE_STEPS, LINEAR_TO_SRGB, SRGB_TO_LINEAR
 from dopepp.virtual.triangles import CENTRE_SAMPLE, edge_functions, rasterise
 
-_MOST_PROBES: Final = 16
-"""Along a footprint's longer axis; beyond this stretch a texture blurs."""
-
-_SHARPNESS: Final = 0.75
-"""Width of a probe over that of the footprint; interpolation between texels widens it again."""
+_MOST_PROBES: Final = 16  # along a footprint's longer axis; beyond this stretch a texture blurs
+_SHARPNESS: Final = 0.75  # a probe's width over the footprint's; interpolation widens it again
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +147,9 @@ def sample_texture(
 ) -> None:  # fmt: skip
     """Look up the texture at an object's fragments, filtered over a pixel.
 
-    ``face`` is each one's triangle, complemented for back faces, shape (n,); ``share`` weighs its
-    corners, shape (3, n); ``x`` and ``y`` are image column and row, pixels, shape (n,). ``hom`` are
-    the vertices' homogeneous pixels, shape (V, 3), with ``faces``, shape (F, 3), and ``uv``, shape
-    (V, 2); ``texels`` and ``levels`` are those of a :class:`Texture`; ``decode`` is the linear
-    light of every code. ``out`` is linear RGB, shape (3, n), overwritten.
+    ``face``, ``share``, ``x`` and ``y`` are the fragments'; ``hom`` are the vertices' homogeneous
+    pixels; ``texels`` and ``levels`` belong to a :class:`Texture`; ``decode`` is the linear light
+    of every code. ``out`` is linear RGB, shape (3, n).
     """
     last = levels.shape[0] - 1
     rows, columns = float(levels[0, 1]), float(levels[0, 2])
@@ -168,18 +163,12 @@ def sample_texture(
         v = share[0, p] * uv[a, 1] + share[1, p] * uv[b, 1] + share[2, p] * uv[c, 1]
         # u = (Σ e_k u_k)/(Σ e_k), both linear in the image; the derivatives are in texels.
         scale = 1.0 / total if total != 0.0 else 0.0
-        ux = (
-            columns
-            * scale
-            * (e[0] * (uv[a, 0] - u) + e[3] * (uv[b, 0] - u) + e[6] * (uv[c, 0] - u))
-        )
-        uy = (
-            columns
-            * scale
-            * (e[1] * (uv[a, 0] - u) + e[4] * (uv[b, 0] - u) + e[7] * (uv[c, 0] - u))
-        )
-        vx = rows * scale * (e[0] * (uv[a, 1] - v) + e[3] * (uv[b, 1] - v) + e[6] * (uv[c, 1] - v))
-        vy = rows * scale * (e[1] * (uv[a, 1] - v) + e[4] * (uv[b, 1] - v) + e[7] * (uv[c, 1] - v))
+        au, bu, cu = uv[a, 0] - u, uv[b, 0] - u, uv[c, 0] - u
+        av, bv, cv = uv[a, 1] - v, uv[b, 1] - v, uv[c, 1] - v
+        ux = columns * scale * (e[0] * au + e[3] * bu + e[6] * cu)
+        uy = columns * scale * (e[1] * au + e[4] * bu + e[7] * cu)
+        vx = rows * scale * (e[0] * av + e[3] * bv + e[6] * cv)
+        vy = rows * scale * (e[1] * av + e[4] * bv + e[7] * cv)
         # Axes of the ellipse that a pixel's disc maps to: eigenvectors of J Jᵀ.
         uu, vv, cross = ux * ux + uy * uy, vx * vx + vy * vy, ux * vx + uy * vy
         middle, half = 0.5 * (uu + vv), math.sqrt(0.25 * (uu - vv) ** 2 + cross * cross)
