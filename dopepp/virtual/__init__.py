@@ -2,7 +2,7 @@
 
 from dopepp.virtual.backgrounds import Backgrounds, PhotoBackgrounds, ProceduralBackgrounds
 from dopepp.virtual.body import Distractors
-from dopepp.virtual.factory import Factory, random_scene
+from dopepp.virtual.factory import Factory
 from dopepp.virtual.presets import PRESETS, Preset, preset_of
 from dopepp.virtual.presets.looks import Lighting, Materials
 from dopepp.virtual.presets.placement import (
@@ -63,7 +63,6 @@ __all__ = [
     "capture",
     "make_surface",
     "preset_of",
-    "random_scene",
     "render",
     "silhouette",
     "visible_fractions",

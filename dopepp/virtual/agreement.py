@@ -9,7 +9,6 @@ each profile by its own sum makes strong and weak contrasts count alike.
 
 from __future__ import annotations
 
-import logging
 from typing import Final
 
 import cv2
@@ -22,13 +21,8 @@ from dopepp.virtual.renderers.raster.visibility import draw_alone, project_objec
 from dopepp.virtual.scene import NEAR, SceneObject
 from dopepp.virtual.surface import Surface
 
-_log = logging.getLogger(__name__)
-
-MOST_POINTS: Final = 1500
-"""Contour pixels that are read."""
-
-FLOOR: Final = 2.0
-"""Gradient, grey levels a pixel, that noise has: a profile of nothing else agrees with nothing."""
+MOST_POINTS: Final = 1500  # contour pixels that are read
+FLOOR: Final = 2.0  # gradient of noise, grey levels a pixel: a profile of noise agrees with nothing
 
 
 def agreement(image: Picture, K: CameraMatrix, T_cam_obj: Transform, surface: Surface) -> float:

@@ -11,7 +11,7 @@ from itertools import islice
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from numpy.random import Generator
 
 from dopepp.drawing.pictures import Size
@@ -28,7 +28,6 @@ from dopepp.geometry.rotation import random_rotation
 from dopepp.virtual.body import Body
 from dopepp.virtual.presets import Preset
 from dopepp.virtual.renderers.raster.visibility import (
-    Box,
     centres_within,
     draw_alone,
     project_object,
@@ -100,59 +99,52 @@ class Composition:
 
 
 class Preview:
-    """The objects accepted so far, seen coarsely."""
+    """The objects accepted so far, drawn coarsely."""
 
     def __init__(self, K: CameraMatrix, size: Size, min_visible: float) -> None:
-        scale = min(160 / size[0], 1.0)  # smaller images are looked at as they are
-        self._width, self._height = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
-        self._K = resize_camera(K, self._width / size[0], self._height / size[1])
+        scale = min(160 / size[0], 1.0)  # smaller images keep their size
+        self._size = width, height = tuple(max(round(side * scale), 1) for side in size)
+        self._K = resize_camera(K, width / size[0], height / size[1])
         self._least = min_visible + 0.03  # because coarse pixels are counted
-        self._nearest = np.zeros((self._height, self._width), np.float32)
-        self._owners = np.full((self._height, self._width), -1, np.int64)
+        self._nearest = np.zeros((height, width), np.float32)
+        self._owners = np.full((height, width), -1, np.int64)
         self._visible: list[int] = []
         self._needed: list[float] = []
 
     def add(self, item: SceneObject) -> bool:
-        """Add an object if every target, itself included, stays visible enough."""
-        layer = self._draw(item)
-        if layer is None:
+        """Add an object if every target, itself included, stays visible enough.
+
+        An object that reaches the camera or is far larger than the frame is refused.
+        """
+        seen, (width, height) = project_object(item, self._K), self._size
+        left, top, right, bottom = seen.extent
+        if not max(right - left, bottom - top) <= 4 * max(width, height):
             return False
-        box, inverse_depth = layer
+        box = centres_within(seen.extent)
+        inverse_depth = draw_alone(item, seen.hom, box)[0]
         whole = int(np.count_nonzero(inverse_depth))
         if item.is_target and whole == 0:
             return False
-        frame, canvas = self._overlap(box)
+        # The pixels of the box within the frame, as slices of the frame and of the box.
+        left, top = max(box[0], 0), max(box[1], 0)
+        right, bottom = max(min(box[2], width), left), max(min(box[3], height), top)
+        frame = slice(top, bottom), slice(left, right)
+        canvas = slice(top - box[1], bottom - box[1]), slice(left - box[0], right - box[0])
         drawn, nearest = inverse_depth[canvas], self._nearest[frame]
         # At equal depth the first stays, as in the renderer.
         in_front = drawn > nearest
         hidden = self._owners[frame][in_front]
         losses = np.bincount(hidden[hidden >= 0], minlength=len(self._visible))
-        left = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
+        left_px = [have - int(loss) for have, loss in zip(self._visible, losses, strict=True)]
         own = int(np.count_nonzero(in_front))
         needed = self._least * whole if item.is_target else 0.0
-        if own < needed or any(px < least for px, least in zip(left, self._needed, strict=True)):
+        if (np.array([*left_px, own]) < [*self._needed, needed]).any():
             return False
         nearest[in_front] = drawn[in_front]
-        self._owners[frame][in_front] = len(left)
-        self._visible = [*left, own]
+        self._owners[frame][in_front] = len(left_px)
+        self._visible = [*left_px, own]
         self._needed.append(needed)
         return True
-
-    def _draw(self, item: SceneObject) -> tuple[Box, Float32[np.ndarray, "rows columns"]] | None:
-        """Draw an object alone; None if it reaches the camera or is far larger than the frame."""
-        seen = project_object(item, self._K)
-        left, top, right, bottom = seen.extent
-        if not max(right - left, bottom - top) <= 4 * max(self._width, self._height):
-            return None
-        box = centres_within(seen.extent)
-        return box, draw_alone(item, seen.hom, box)[0]
-
-    def _overlap(self, box: Box) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Return the pixels of a box within the frame, as slices of the frame and of the box."""
-        left, top = max(box[0], 0), max(box[1], 0)
-        right, bottom = max(min(box[2], self._width), left), max(min(box[3], self._height), top)
-        canvas = slice(top - box[1], bottom - box[1]), slice(left - box[0], right - box[0])
-        return (slice(top, bottom), slice(left, right)), canvas
 
 
 def arrange_floating(composition: Composition, targets: Sequence[Body], usual: Body) -> float:
@@ -162,7 +154,12 @@ def arrange_floating(composition: Composition, targets: Sequence[Body], usual: B
     where there is no target.
     """
     for body in targets:
-        if not _place_target(composition, body) and not composition.objects:
+        material = composition.draw_material(body)
+        # Of the preset ``paper``, four of five first poses are accepted.
+        for pose in islice(_poses(composition, body), 200):
+            if _is_clear(composition, body, pose) and composition.add(body, pose, material):
+                break
+        if not composition.objects:
             break
     depths = [float(item.T_cam_obj[2, 3]) for item in composition.objects]
     if not depths:
@@ -191,16 +188,6 @@ def _poses(composition: Composition, body: Body) -> Iterator[Transform]:
             if place is None:
                 break
             pose = make_transform(pose[:3, :3], place)
-
-
-def _place_target(composition: Composition, body: Body) -> bool:
-    """Draw a pose until the part is well in the frame; tell whether that happened."""
-    material = composition.draw_material(body)
-    # Of the preset ``paper``, four of five first poses are accepted.
-    for pose in islice(_poses(composition, body), 200):
-        if _is_clear(composition, body, pose) and composition.add(body, pose, material):
-            return True
-    return False
 
 
 def _place_distractor(composition: Composition, reference: float) -> None:

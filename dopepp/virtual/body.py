@@ -31,9 +31,8 @@ class Body:
     """A surface that can be posed.
 
     Attributes:
-        part: The part it is; None for what no network is to find.
-        source: The body it was stretched from.
-        stretch: By how much, along x, y and z.
+        part: None for what no network is to find.
+        source: The body it was stretched from, by ``stretch`` along x, y and z.
     """
 
     surface: Surface
@@ -55,13 +54,11 @@ class Body:
 
 
 def make_body(part: Part, *, is_target: bool) -> Body:
-    """Prepare a part's mesh; without one that can be rendered, it is a UserError."""
+    """Prepare a part's mesh; a part without a mesh is a UserError."""
     if part.mesh is None:
-        raise UserError(
-            f"part {part.name} without a mesh",
-            "parts that were read from a mesh file or built in",
-            "give the part's mesh file; a checkpoint's objects table holds no mesh",
-        )
+        allowed = "parts that were read from a mesh file or built in"
+        fix = "give the part's mesh file; a checkpoint's objects table holds no mesh"
+        raise UserError(f"part {part.name} without a mesh", allowed, fix)
     return Body(make_surface(part.mesh), part if is_target else None)
 
 
@@ -81,10 +78,8 @@ class Hull:
     centre: Vector
 
     def scaled(self, scale: Vector) -> Hull:
-        """Return the hull stretched along its axes by positive factors.
-
-        A linear map takes the hull to the hull, flat faces to flat faces, the centre to the centre.
-        """
+        """Return the hull stretched along its axes by positive factors."""
+        # A linear map takes hull to hull, flat faces to flat faces and centre to centre.
         return replace(self, vertices=self.vertices * scale, centre=self.centre * scale)
 
     @cached_property
@@ -92,9 +87,8 @@ class Hull:
         """Outward normals of the faces on which the body rests, and how often it does.
 
         A face is stable if the centre of mass stands above it. Its frequency is taken as the
-        solid angle under which the centre sees it (the share of directions in which a body that
-        falls without bouncing lands on it); a body that would roll over an unstable face is left
-        out of the count.
+        solid angle under which the centre sees it: the share of directions in which a body that
+        falls without bouncing lands on it.
         """
         corners = self.vertices[self.triangles] - self.centre
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -126,7 +120,11 @@ def make_hull(surface: Surface) -> Hull:
     except QhullError:
         # A flat or straight mesh has no volume; joggled by a rounding error, it has.
         hull = ConvexHull(used, qhull_options="QJ")
-    triangles = _outward(hull)
+    # Wound so that their normals point outwards.
+    a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles = hull.simplices.copy()
+    triangles[inward] = triangles[inward][:, ::-1]
     closed = surface.vertices[surface.faces] if surface.closed else hull.points[triangles]
     kept, index = np.unique(triangles, return_inverse=True)
     return Hull(
@@ -135,15 +133,6 @@ def make_hull(surface: Surface) -> Hull:
         facets=_facets(hull),
         centre=_centre_of_mass(closed),
     )
-
-
-def _outward(hull: ConvexHull) -> Int[np.ndarray, "triangles 3"]:
-    """Return the hull's triangles, wound so that their normals point outwards."""
-    a, b, c = hull.points[hull.simplices].swapaxes(0, 1)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    triangles = hull.simplices.copy()
-    triangles[inward] = triangles[inward][:, ::-1]
-    return np.asarray(triangles)
 
 
 def _facets(hull: ConvexHull) -> Int[np.ndarray, "triangles"]:

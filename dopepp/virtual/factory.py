@@ -1,4 +1,11 @@
-"""The factory: image ``(epoch, index)`` of an endless, reproducible supply."""
+"""The factory: image ``(epoch, index)`` of an endless, reproducible supply.
+
+A scale shows the same scene from nearer or farther: the camera moves, the world stays (paper Fig.
+11). The camera goes along the ray to the middle of the targets and keeps its orientation and its
+lens, so a single part stays at its place in the image and grows about as a picture of it would.
+Objects, lamps and the plane keep their places in the world; light from everywhere, and the picture
+behind objects in mid-air, are infinitely far away and do not change.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +17,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.random import Generator
 
 from dopepp.core.errors import UserError
 from dopepp.geometry.camera import Transform, make_transform, transform
@@ -30,17 +36,23 @@ from dopepp.virtual.sensor import capture
 from dopepp.virtual.tabletop import arrange_on_table
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_FOLDERS: Final = ("virtual", "parts", "geometry")
-"""The packages that decide a render's pixels and labels."""
+_FOLDERS: Final = ("virtual", "parts", "geometry")  # which decide a render's pixels and labels
 
 
 class Factory:
     """Renders labelled images of parts; image (epoch, index) depends on nothing but the seed.
 
     A factory can be pickled and forked: it holds no generator, so any process renders the same
-    bytes for the same (seed, epoch, index), in any order. Backgrounds are procedural if not given.
-    ``negatives`` are parts that are shown among the distractors, so that a network learns not to
-    find them; the built-in parts that are no targets are always among them.
+    bytes for the same (seed, epoch, index), in any order.
+
+    Args:
+        parts: Targets, each with a name of its own.
+        preset: Distribution of the scenes.
+        seed: At least 0.
+        backgrounds: Procedural by default.
+        renderer: Name of a renderer.
+        negatives: Parts that are shown among the distractors, so that a network learns not to find
+            them; the built-in parts that are no targets are always among them.
 
     Raises:
         UserError: There is no part, a part has no mesh, two share a name, a negative is a target
@@ -58,10 +70,8 @@ class Factory:
     ) -> None:
         names = [part.name for part in parts]
         if not parts or len(set(names)) != len(names):
-            raise UserError(
-                f"parts {names} to render", "at least one part, each with a name of its own",
-                "name the parts differently",
-            )  # fmt: skip
+            allowed = "at least one part, each with a name of its own"
+            raise UserError(f"parts {names} to render", allowed, "name the parts differently")
         if seed < 0:
             raise UserError(f"seed {seed}", "an integer >= 0", "choose another seed")
         self.parts, self.preset, self.seed = tuple(parts), preset, seed
@@ -71,20 +81,92 @@ class Factory:
         self._targets = [make_body(part, is_target=True) for part in parts]
         self._others = [make_body(part, is_target=False) for part in self.negatives]
 
-    def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
-        """Return the scene of an image without rendering it; see :func:`random_scene`."""
-        rng = np.random.default_rng([self.seed, epoch, index])
-        return random_scene(self.preset, self._targets, self._others, rng, self.backgrounds, scale)
-
     def render(self, epoch: int, index: int, scale: float = 1.0) -> Rendered:
         """Render an image with its ground truth, as the scene's sensor takes it.
 
-        ``scale`` is how many times as large its parts appear: the camera of the same scene, moved
-        (see :mod:`dopepp.virtual.factory`). A UserError, where the preset cannot show
-        the part, or the camera cannot stand there.
+        ``scale`` is how many times as large the targets appear as the preset has it.
+
+        Raises:
+            UserError: The preset cannot show the part, or the camera cannot stand there.
         """
         rendered = self._render(self.scene(epoch, index, scale))
         return replace(rendered, image=capture(rendered.image, rendered.scene.sensor))
+
+    def scene(self, epoch: int, index: int, scale: float = 1.0) -> Scene:
+        """Return the scene of an image without rendering it."""
+        preset, backgrounds = self.preset, self.backgrounds
+        rng = np.random.default_rng([self.seed, epoch, index])
+        if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):
+            contrast = preset.background_contrast
+            backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter, contrast)
+        order = rng.permutation(len(self._targets))
+        low, high = preset.targets_per_image
+        count = int(rng.integers(low, high + 1))
+        targets = [self._targets[order[number % len(order)]] for number in range(count)]
+        composition = Composition(preset, rng, self._others)
+        K, size, plane = composition.K, composition.size, None
+        if preset.table is None:
+            # An image without targets has its distractors where a target's would be.
+            depth = arrange_floating(composition, targets, self._targets[order[0]])
+            shift = approach(composition.objects, scale)
+            lights, ambient = preset.lighting.draw(rng, np.array([0.0, 0.0, depth]))
+            background = backgrounds.draw(rng, *size)
+        else:
+            T_cam_table = arrange_on_table(composition, preset.table, targets)
+            shift = approach(composition.objects, scale)
+            lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
+            picture = preset.table.draw_picture(rng, backgrounds, K, size, T_cam_table)
+            T_cam_table = _moved(T_cam_table, shift)
+            plane = plane_of(T_cam_table)
+            if plane.offset >= 0:
+                got = f"scale {scale:g} of a scene whose parts reach higher than the camera"
+                allowed = "a scale at which the camera is above the table"
+                raise UserError(got, allowed, "choose a larger scale")
+            background = picture.seen(K, size, T_cam_table)
+        if targets and not any(item.is_target for item in composition.objects):
+            raise _unplaced(targets[0], preset)
+        objects = [
+            replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects
+        ]
+        # The camera may have reached or passed some of them.
+        hulls = (transform(item.T_cam_obj, item.surface.hull) for item in objects)
+        seen = [item for item, hull in zip(objects, hulls, strict=True) if hull[:, 2].min() > NEAR]
+        # How strongly a lamp lights the scene stays the same.
+        lights = tuple(
+            replace(light, position=triple(np.array(light.position) + shift)) for light in lights
+        )
+        sensor = preset.sensors.draw(rng)
+        return Scene(K, background, tuple(seen), lights, ambient, plane, sensor)
+
+
+def _unplaced(body: Body, preset: Preset) -> UserError:
+    assert body.part is not None
+    return UserError(
+        f"part {body.part.name} of diameter {body.part.diameter:.3g} m, which found no place in "
+        f"any draw of preset {preset.name}",
+        "a part that the preset's distances and field of view can show",
+        "check the mesh's unit, or replace the preset's distances or field of view",
+    )
+
+
+def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
+    """Return by how much the world moves in the camera frame, metres.
+
+    The distance from the camera to the mean of the targets' cuboids' centres is divided by the
+    positive ``scale``: as many times as large they appear. Without a target the camera stays.
+    """
+    centres = [
+        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
+        for item in objects
+        if item.part is not None
+    ]
+    if not centres or scale == 1:
+        return np.zeros(3)
+    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
+
+
+def _moved(T_cam: Transform, shift: Vector) -> Transform:
+    return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)
 
 
 @cache
@@ -110,94 +192,8 @@ def _all_negatives(parts: Sequence[Part], given: Sequence[Part]) -> tuple[Part, 
                 "parts of other names and other meshes than the targets'",
                 "take it out of the negatives",
             )
-    known = names | {part.name for part in given}
+    names |= {part.name for part in given}
     hashes |= {part.mesh_hash for part in given}
     built_in = (make() for make in BUILTIN.values())
-    others = [p for p in built_in if p.name not in known and p.mesh_hash not in hashes]
-    return (*given, *others)
-
-
-def random_scene(
-    preset: Preset,
-    targets: Sequence[Body],
-    negatives: Sequence[Body],
-    rng: Generator,
-    backgrounds: Backgrounds,
-    scale: float = 1.0,
-) -> Scene:
-    """Draw a scene.
-
-    The scene is a pure function of the state of ``rng``. A distractor may be one of ``negatives``
-    instead of a primitive. ``scale`` is how many times as large the targets appear as the preset
-    has it: it decides from where the scene is seen, nothing else. A UserError: the part is too
-    large or too small for the preset to show it, or the scale takes the camera below the table.
-    """
-    if any(preset.clutter) or preset.background_contrast != (1.0, 1.0):
-        backgrounds = ClutteredBackgrounds(backgrounds, preset.clutter, preset.background_contrast)
-    order = rng.permutation(len(targets))
-    low, high = preset.targets_per_image
-    count = int(rng.integers(low, high + 1))
-    chosen = [targets[int(order[number % len(targets)])] for number in range(count)]
-    composition = Composition(preset, rng, negatives)
-    if preset.table is None:
-        # An image without targets has its distractors where a target's would be.
-        depth = arrange_floating(composition, chosen, targets[int(order[0])])
-        shift = approach(composition.objects, scale)
-        lights, ambient = preset.lighting.draw(rng, np.array([0.0, 0.0, depth]))
-        background, plane = backgrounds.draw(rng, *composition.size), None
-    else:
-        T_cam_table = arrange_on_table(composition, preset.table, chosen)
-        shift = approach(composition.objects, scale)
-        lights, ambient = preset.lighting.draw(rng, T_cam_table[:3, 3], T_cam_table[:3, 2])
-        picture = preset.table.draw_picture(
-            rng, backgrounds, composition.K, composition.size, T_cam_table
-        )
-        T_cam_table = _moved(T_cam_table, shift)
-        plane = plane_of(T_cam_table)
-        if plane.offset >= 0:
-            raise UserError(
-                f"scale {scale:g} of a scene whose parts reach higher than the camera",
-                "a scale at which the camera is above the table",
-                "choose a larger scale",
-            )
-        background = picture.seen(composition.K, composition.size, T_cam_table)
-    if chosen and not any(item.is_target for item in composition.objects):
-        part = chosen[0].part
-        assert part is not None
-        raise UserError(
-            f"part {part.name} of diameter {part.diameter:.3g} m, which found no place in any draw "
-            f"of preset {preset.name}",
-            "a part that the preset's distances and field of view can show",
-            "check the mesh's unit, or replace the preset's distances or field of view",
-        )
-    there = (replace(item, T_cam_obj=_moved(item.T_cam_obj, shift)) for item in composition.objects)
-    # The camera may have reached or passed some of them.
-    objects = tuple(
-        item for item in there if transform(item.T_cam_obj, item.surface.hull)[:, 2].min() > NEAR
-    )
-    # How strongly a lamp lights the scene stays the same.
-    lights = tuple(
-        replace(light, position=triple(np.array(light.position) + shift)) for light in lights
-    )
-    sensor = preset.sensors.draw(rng)
-    return Scene(composition.K, background, objects, lights, ambient, plane, sensor)
-
-
-def approach(objects: Sequence[SceneObject], scale: float) -> Vector:
-    """Return by how much the world moves in the camera frame, metres.
-
-    The distance from the camera to the mean of the targets' cuboids' centres is divided by the
-    positive ``scale``: as many times as large they appear. Without a target the camera stays.
-    """
-    centres = [
-        transform(item.T_cam_obj, item.part.cuboid[CENTROID])
-        for item in objects
-        if item.part is not None
-    ]
-    if not centres or scale == 1:
-        return np.zeros(3)
-    return np.asarray((1 / scale - 1) * np.mean(centres, axis=0))
-
-
-def _moved(T_cam: Transform, shift: Vector) -> Transform:
-    return make_transform(T_cam[:3, :3], T_cam[:3, 3] + shift)
+    others = (part for part in built_in if part.name not in names)
+    return (*given, *(part for part in others if part.mesh_hash not in hashes))

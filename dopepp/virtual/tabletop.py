@@ -28,10 +28,7 @@ from dopepp.virtual.triangles import CENTRE_SAMPLE, rasterise
 
 
 def arrange_on_table(composition: Composition, table: Table, targets: Sequence[Body]) -> Transform:
-    """Choose a view, place targets and distractors, and return T_cam_table (plane z = 0, z up).
-
-    They are added to an empty ``composition``; no target if none finds a place.
-    """
+    """Choose a view, add targets and distractors, and return T_cam_table (plane z = 0, z up)."""
     rng = composition.rng
     # Another view is drawn where no target finds room in the image.
     for _ in range(8):
@@ -50,7 +47,7 @@ def arrange_on_table(composition: Composition, table: Table, targets: Sequence[B
 
 @dataclass(frozen=True, eq=False)
 class _Lying:
-    """One way to lie; ``height``, of the lowest point, and ``centre``, of mass, above the plane."""
+    """One way to lie, with the heights of lowest point and centre of mass above the plane."""
 
     T_table_obj: Transform
     footprint: Footprint

@@ -11,7 +11,7 @@ import importlib.util
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -43,11 +43,8 @@ _LEAST_REDUCTION: Final = 2.0
 """A crop is cut out of the smallest halving of a photo that it still reduces so many times, as a
 small piece of a large photo would cost as much as all of that photo."""
 
-_SMALLEST_PX: Final = 30
-"""Shorter side of the smallest halving, at least."""
-
-_KEPT_BYTES: Final = 200_000_000
-"""Decoded photos and their halvings a process keeps: about 260 of VOC2007."""
+_SMALLEST_PX: Final = 30  # shorter side of the smallest halving, at least
+_KEPT_BYTES: Final = 200_000_000  # decoded photos a process keeps: about 260 of VOC2007
 
 
 class Backgrounds(Protocol):
@@ -63,9 +60,12 @@ class Backgrounds(Protocol):
 def find_backgrounds(choice: str | Path | None) -> Backgrounds:
     """Return the backgrounds that a user names.
 
-    ``choice`` is None or ``procedural``, the same on every machine; ``skimage`` for the photos in
-    an installed scikit-image; or a folder of photos (``./skimage`` for one of that name). A
-    UserError: the folder is missing or holds no photo, or scikit-image is not installed.
+    Args:
+        choice: None or ``procedural``, the same on every machine; ``skimage`` for the photos in an
+            installed scikit-image; or a folder of photos (``./skimage`` for one of that name).
+
+    Raises:
+        UserError: The folder is missing or holds no photo, or scikit-image is not installed.
     """
     if choice is None or choice == "procedural":
         return ProceduralBackgrounds()
@@ -91,11 +91,9 @@ class PhotoBackgrounds:
         found = _photo_names(self.folder) if names is None else names
         self.paths = [self.folder / name for name in sorted(found)]
         if not self.paths:
-            raise UserError(
-                f"no photo in the background folder {folder}",
-                f"a folder with {', '.join(PHOTO_SUFFIXES)} files",
-                "correct the path, or leave it out to use procedural backgrounds",
-            )
+            allowed = f"a folder with {', '.join(PHOTO_SUFFIXES)} files"
+            fix = "correct the path, or leave it out to use procedural backgrounds"
+            raise UserError(f"no photo in the background folder {folder}", allowed, fix)
         self.bad: dict[Path, str] = {}
         self._photos: OrderedDict[Path, list[Picture]] = OrderedDict()
         self._kept_bytes = 0
@@ -150,9 +148,10 @@ class PhotoBackgrounds:
             return None
         sizes = _halvings(photo)
         self._photos[path] = sizes
-        self._kept_bytes += _bytes(sizes)
+        self._kept_bytes += sum(size.nbytes for size in sizes)
         while self._kept_bytes > _KEPT_BYTES and len(self._photos) > 1:
-            self._kept_bytes -= _bytes(self._photos.popitem(last=False)[1])
+            oldest = self._photos.popitem(last=False)[1]
+            self._kept_bytes -= sum(size.nbytes for size in oldest)
         return sizes
 
     def _quarantine(self, path: Path, damage: str) -> None:
@@ -179,11 +178,9 @@ def bundled_photos() -> PhotoBackgrounds:
     folder = Path(package.origin).parent / "data" if package and package.origin else None
     names = [name for name in BUNDLED if folder and (folder / name).is_file()]
     if folder is None or not names:
-        raise UserError(
-            "backgrounds=skimage without scikit-image and its photos",
-            "an installed scikit-image",
-            "pip install scikit-image, or give a folder of photos",
-        )
+        got = "backgrounds=skimage without scikit-image and its photos"
+        fix = "pip install scikit-image, or give a folder of photos"
+        raise UserError(got, "an installed scikit-image", fix)
     return PhotoBackgrounds(folder, names)
 
 
@@ -196,10 +193,6 @@ def _halvings(photo: Picture) -> list[Picture]:
     return sizes
 
 
-def _bytes(pictures: Iterable[Picture]) -> int:
-    return sum(picture.nbytes for picture in pictures)
-
-
 def _photo_names(folder: Path) -> Iterator[str]:
     """Yield the relative paths of a folder's photos."""
     if not folder.is_dir():
@@ -209,7 +202,7 @@ def _photo_names(folder: Path) -> Iterator[str]:
         prefix = pending.pop()
         with os.scandir(folder / prefix) as entries:
             for entry in entries:
-                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg, which is none
+                if entry.name.startswith("."):  # such as a Mac's ._photo.jpg, which is no photo
                     continue
                 if entry.is_dir(follow_symlinks=False):
                     pending.append(f"{prefix}{entry.name}/")

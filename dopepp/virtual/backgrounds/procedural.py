@@ -1,4 +1,8 @@
-"""Procedural backgrounds: textures made from noise, gradients, tiles, bricks, wood and shapes.
+"""Drawn backgrounds: procedural textures with shapes on them, and clutter.
+
+Photos of landscapes and people have few sharp outlines of the size of a part. A network that has
+seen its part before such photos alone takes much of a real desk for the part; so clutter lays
+pieces of other pictures on backgrounds.
 
 To add a pattern, write a function like ``_checker`` and name it in ``_PATTERNS``.
 """
@@ -21,8 +25,7 @@ if TYPE_CHECKING:
 
 Field = Float32[np.ndarray, "height width"]
 
-_SHARP_WIDTH_PX: Final = 256
-"""Textures up to this width are drawn at full resolution."""
+_SHARP_WIDTH_PX: Final = 256  # textures up to this width are drawn at full resolution
 
 
 class ProceduralBackgrounds:
@@ -196,18 +199,13 @@ def _scatter(rng: Generator, image: Picture, count: int) -> None:
             cv2.circle(image, centre, radius, colour, thickness, cv2.LINE_AA)
 
 
+# Shares of the pieces: of one colour, lighter towards one side, as weakly textured things; printed
+# with cells of a dark and a light colour, as markers and keyboards. The others are cut out of
+# backgrounds.
 _PLAIN_SHARE: Final = 0.4
-"""Share of the pieces that have one colour, lighter towards one side, as weakly textured things."""
-
 _PRINTED_SHARE: Final = 0.2
-"""Share of those that have cells of a dark and a light colour, as markers and keyboards; the others
-are cut out of backgrounds."""
-
-_WIDTHS: Final = (0.04, 0.4)
-"""Of a piece, over the picture's width; logarithmically uniform: most things are small."""
-
-_FINE_BITS: Final = 4
-"""Outlines are drawn in sixteenths of a pixel."""
+_WIDTHS: Final = (0.04, 0.4)  # over the picture's; logarithmically uniform: most things are small
+_FINE_BITS: Final = 4  # outlines are drawn in sixteenths of a pixel
 
 
 class ClutteredBackgrounds:
