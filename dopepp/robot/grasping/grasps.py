@@ -172,14 +172,19 @@ def write_grasps(path: Path, part: Part, grasps: Sequence[Grasp]) -> None:
     """Write a file of grasps, a line each."""
     check_target(path, (".yaml", ".yml"))
     lines = [f"part: {part.name}", "grasps:"]
-    for one in grasps:
+    for grasp in grasps:
         vectors = ", ".join(
-            # Adding 0 makes −0 of rounding a 0.
-            f"{name}: [{', '.join(f'{round(value, 5) + 0.0:g}' for value in getattr(one, name))}]"
+            f"{name}: [{', '.join(map(_written, getattr(grasp, name)))}]"
             for name in ("point", "closing", "approach")
         )
-        lines.append(f"- {{{vectors}, width: {round(one.width, 5):g}}}")
+        lines.append(f"- {{{vectors}, width: {_written(grasp.width)}}}")
     write_whole(path, ("\n".join(lines) + "\n").encode())
+
+
+def _written(value: float) -> str:
+    """Return a number with five decimals at most; YAML takes one with an exponent for text."""
+    number = round(value, 5) + 0.0  # makes −0 of rounding a 0
+    return f"{number:.5f}".rstrip("0").rstrip(".")
 
 
 def propose_grasps(part: Part, count: int, seed: int = 0) -> tuple[Grasp, ...]:

@@ -18,7 +18,7 @@ def test_built_in_parts_have_grasps_from_the_front(name):
 
 def test_what_is_written_is_read(part, tmp_path):
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    grasp = Grasp(np.array([0.01, -0.002, 0.001]), turn[0], turn[1], 0.0333)
+    grasp = Grasp(np.array([0.01, -0.002, -3e-5]), turn[0], turn[1], 0.0333)
     write_grasps(tmp_path / "g.yaml", part, [grasp])
     (read,) = read_grasps(tmp_path / "g.yaml", part)
     for name in ("point", "closing", "approach", "width"):
