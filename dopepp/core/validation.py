@@ -1,13 +1,12 @@
 """Typed objects from untrusted plain values, checked by pydantic in its strict JSON mode.
 
 :func:`parse` turns a plain value, as a YAML or JSON file gives it, into a type: a frozen dataclass
-whose numbers have a :class:`Range`. The first mistake raises a
-:class:`~dopepp.core.errors.UserError`. :func:`mistakes` returns all of them instead, for readers
-that collect problems.
+whose numbers have a :class:`Range`. :func:`check` validates an argument, :class:`Checked` the
+fields of a dataclass. The first mistake raises a :class:`~dopepp.core.errors.UserError`.
 
 Values are never coerced: ``"1"`` is no number and ``true`` is no integer. As in JSON, a list stands
 for a tuple and text for a path. A dataclass that refuses unknown fields has the line
-``__pydantic_config__ = STRICT``. :func:`check` and :func:`check_fields` validate arguments.
+``__pydantic_config__ = STRICT``.
 """
 
 from __future__ import annotations
@@ -114,15 +113,8 @@ Pair = tuple[float, float]
 Share = Annotated[float, Range(0.0, 1.0, "share")]
 
 
-class Mistake(NamedTuple):
-    """A value that its type does not allow.
-
-    Attributes:
-        location: Keys and indices that lead to the value.
-        got: The value, shortened for a message; empty where it is missing.
-        allowed: The allowed values in words.
-        is_unknown: Whether the location is no field at all.
-    """
+class _Mistake(NamedTuple):
+    """A value that its type does not allow; ``got`` is empty where the value is missing."""
 
     location: tuple[str | int, ...]
     got: str
@@ -163,15 +155,6 @@ def parse(kind: type[T], value: object, name: str = "", fix: str = "") -> T:
     return typed
 
 
-def mistakes(kind: type[Any], value: object) -> list[Mistake]:
-    """Return everything that ``kind`` refuses about a plain value, in the order of its fields."""
-    try:
-        _validated(kind, value, "")
-    except ValidationError as error:
-        return list(_mistakes(kind, value, error))
-    return []
-
-
 def check(
     name: str, value: object, kind: type[T], limits: Range | None = None, of: object = None
 ) -> T:
@@ -204,29 +187,18 @@ def check(
     return typed
 
 
-def check_fields(instance: object) -> None:
-    """Validate those fields of a dataclass that are annotated with a :class:`Range`.
-
-    A ``__post_init__`` that calls this function checks what Python code passes, too.
-
-    Raises:
-        UserError: A field is of another type or out of range.
-    """
-    owner: Any = type(instance)
-    for name, kind in _ranged_fields(owner).items():
-        check(name, getattr(instance, name), kind, of=instance)
-
-
 class Checked:
-    """Base of a frozen dataclass whose ranges hold however it is made, from plain values or code.
+    """Base of a frozen dataclass that refuses unknown fields and values out of their ranges.
 
-    It refuses unknown fields.
+    Ranges also hold for a dataclass that Python code makes.
     """
 
     __pydantic_config__ = STRICT
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        kind: Any = type(self)
+        for name, annotated in _ranged_fields(kind).items():
+            check(name, getattr(self, name), annotated, of=self)
 
 
 @cache
@@ -265,7 +237,7 @@ def _json(value: object, name: str) -> str:
         raise UserError(got, allowed, "write plain values") from None
 
 
-def _user_error(mistake: Mistake, root: str, fix: str) -> UserError:
+def _user_error(mistake: _Mistake, root: str, fix: str) -> UserError:
     name = mistake.name(root)
     if mistake.is_unknown:
         return UserError(f"{name}={mistake.got}", mistake.allowed, fix or "check the name")
@@ -274,7 +246,7 @@ def _user_error(mistake: Mistake, root: str, fix: str) -> UserError:
     return UserError(f"{name}={mistake.got}", mistake.allowed, fix or f"change {name}")
 
 
-def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[Mistake]:
+def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterator[_Mistake]:
     """Translate pydantic's errors; those of a union's alternatives become one mistake."""
     located = [(_location(value, detail), detail) for detail in error.errors()]
     for location, group in groupby(located, key=lambda pair: pair[0]):
@@ -282,12 +254,12 @@ def _mistakes(kind: type[Any], value: object, error: ValidationError) -> Iterato
         first = details[0]
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             fields = ", ".join(_fields(kind, location[:-1], value)) or "no field"
-            yield Mistake(location, shown(first["input"]), fields, is_unknown=True)
+            yield _Mistake(location, shown(first["input"]), fields, is_unknown=True)
         elif first["type"] in ("missing", "missing_argument"):
-            yield Mistake(location, "", "a value")
+            yield _Mistake(location, "", "a value")
         else:
             allowed = " or ".join(dict.fromkeys(map(_allowed, details)))
-            yield Mistake(location, shown(first["input"]), allowed)
+            yield _Mistake(location, shown(first["input"]), allowed)
 
 
 def _location(value: object, detail: ErrorDetails) -> tuple[str | int, ...]:

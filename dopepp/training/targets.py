@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dopepp.core.errors import UserError
-from dopepp.core.validation import Range, check_fields
+from dopepp.core.validation import Checked, Range
 from dopepp.data.batch import PADDING, Batch
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import rotation_vector_to_matrix
@@ -40,7 +40,7 @@ UP: Final = np.array([0.0, -1.0, 0.0])
 
 
 @dataclass(frozen=True)
-class SymmetryOptions:
+class SymmetryOptions(Checked):
     """How symmetric parts are learnt.
 
     Attributes:
@@ -53,7 +53,7 @@ class SymmetryOptions:
     border_deg: Annotated[float, Range(0, 360, "degrees")] = 30.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
         if self.border_deg > 0 and not self.canonical:
             raise UserError(
                 f"symmetry.border_deg={self.border_deg} with symmetry.canonical=false",

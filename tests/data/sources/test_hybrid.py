@@ -78,7 +78,7 @@ def test_pure_function_of_seed_epoch_and_index():
     assert all(backward[e, i] == forward[e][i] for e in range(4) for i in range(20))
     assert forward[0] != forward[1]
     assert items(build(4), 0) != forward[0]
-    # RenderRequest is mixed, not real frames first.
+    # The order is mixed, not real frames first.
     names = [name for name, _ in forward[0]]
     assert names != sorted(names)
 
