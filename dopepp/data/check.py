@@ -1,14 +1,12 @@
-"""Find a folder's layout and check it.
+"""Find a folder's layout and check it: its reader collects problems, then come its invariants.
 
-A check lets the layout's own readers report to a
-:class:`~dopepp.data.formats.problems.CheckReport`, and then holds records against each other and
-against the images. To add a layout, write ``check_NAME(report)`` in ``check.py`` of its folder in
+To add a layout, write ``check_NAME(report)`` in ``invariants.py`` of its folder in
 :mod:`dopepp.data.formats`, and a line in ``LAYOUTS``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -33,11 +31,15 @@ LAYOUTS: Final[dict[str, tuple[Callable[[Path], bool], Callable[[CheckReport], N
         check_ndds,
     ),
 }
-"""How each layout is told, in this order, and checked."""
+"""How each layout is recognised, in this order, and checked."""
 
 
 def check_dataset(root: Path) -> CheckReport:
-    """Check a data set; a UserError tells only that the folder is missing or of no known layout."""
+    """Check a data set.
+
+    Raises:
+        UserError: The folder is missing, of no known layout, or holds several data sets.
+    """
     root = Path(root)
     known = (
         "a YCB-Video folder (data/, image_sets/), a BOP data set, split or scene (scene_gt.json), "
@@ -62,21 +64,19 @@ def _layout_of(root: Path) -> str | None:
 def _refuse_parent(root: Path, layout: str | None) -> None:
     """Refuse a folder that holds data sets and is none itself.
 
-    FAT's folders of scenes are one data set; those that render jobs wrote are one each.
+    FAT's folders of scenes are one data set; those of render jobs are one each.
     """
     if (root / RECORD_FILE).is_file() or any(root.glob("*.json")):
         return
-    found = {path.name: name for path in _visible(root) if (name := _layout_of(path)) is not None}
-    own = [name for name in found if found[name] != "NDDS" or (root / name / RECORD_FILE).is_file()]
-    if not own and (layout is not None or not found):
+    folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    layouts = {path.name: name for path in sorted(folders) if (name := _layout_of(path))}
+    is_set = {
+        name: layouts[name] != "NDDS" or (root / name / RECORD_FILE).is_file() for name in layouts
+    }
+    if not any(is_set.values()) and (layout is not None or not layouts):
         return
-    listed = [f"{name} ({found[name]})" for name in sorted(found)]
+    listed = [f"{name} ({found})" for name, found in layouts.items()]
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    raise UserError(
-        f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}",
-        "one data set", f"check one of them, e.g. dopepp check {root / sorted(found)[0]}",
-    )  # fmt: skip
-
-
-def _visible(root: Path) -> Iterator[Path]:
-    return (path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+    got = f"{root}, a folder of {len(listed)} data sets: {', '.join(listed[:_LISTED])}{more}"
+    fix = f"check one of them, e.g. dopepp check {root / next(iter(layouts))}"
+    raise UserError(got, "one data set", fix)

@@ -49,10 +49,8 @@ def picture(
 ) -> Image.Image | None:
     """Decode a BOP image; return None where it is missing, damaged, too large or of another kind.
 
-    Args:
-        place: The image's file, or its name where ``content`` is given.
-        content: Bytes of an image that is no file of its own.
-        modes: Allowed pixel types, by Pillow's names; none allows any.
+    ``content`` are the bytes of an image in a tar file; ``modes`` are the allowed pixel types by
+    Pillow's names, none for any.
     """
     if content is None:
         content = place["image"].attempt(lambda: read_content(Path(place.path)))
@@ -82,10 +80,7 @@ def picture_shape(
 
 
 def stated_shape(file: Path | io.BytesIO) -> Shape | None:
-    """Return the (height, width) that a damaged image states, or None.
-
-    So other images can be compared with a truncated one.
-    """
+    """Return the (height, width) that a truncated image still states, or None."""
     try:
         with Image.open(file, formats=FORMATS) as image:
             width, height = image.size
@@ -136,10 +131,7 @@ def decode_mask(content: bytes, where: str, shape: Shape) -> Mask:
 def one_channel_of(
     place: Place, shape: Shape | None, content: bytes | None = None, modes: tuple[str, ...] = ()
 ) -> NDArray[Any] | None:
-    """Decode a BOP depth image or mask like :func:`picture`; return None where it is reported.
-
-    ``modes`` are allowed pixel types; none allows any with one channel.
-    """
+    """Decode a BOP depth image or mask like :func:`picture`; return None where it is reported."""
     image = picture(place, content)
     if image is None:
         return None

@@ -27,11 +27,10 @@ _log = logging.getLogger(__name__)
 MAX_KEPT: Final = 10_000
 """Defects kept in full; the rest is only counted, so that memory stays bounded."""
 
-_LOG_EVERY: Final = 1000
-"""Images between two lines of the log."""
-
 FARTHEST: Final = 1e9
 """Largest number of a label in any unit; squares of such numbers stay exact enough."""
+
+_IMAGES_A_LINE: Final = 1000  # of the log
 
 T = TypeVar("T")
 
@@ -52,36 +51,19 @@ class Problems:
 STRICT: Final = Problems()
 
 
-@dataclass(frozen=True)
-class Defect:
-    """One problem of a data set.
-
-    Attributes:
-        path: File below the data set's folder; a member of a tar file as ``TAR/MEMBER``.
-        field: Field in the file, e.g. ``3[0].cam_R_m2c`` or ``size``.
-    """
-
-    path: str
-    field: str
-    message: str
-
-    def __str__(self) -> str:
-        return " ".join(f"{self.path}: {self.field}: {self.message}".split())
-
-
 @dataclass
 class CheckReport(Problems):
     """Collects all problems as defects.
 
     Attributes:
-        defects: The first ``MAX_KEPT`` defects, in the order in which they were found.
+        defects: The first ``MAX_KEPT`` defects as ``FILE: FIELD: MESSAGE``, in order.
         counts: Numbers of defects by the last part of their field.
     """
 
     root: Path
     layout: str
     num_images: int = 0
-    defects: list[Defect] = field(default_factory=list)
+    defects: list[str] = field(default_factory=list)
     num_defects: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
@@ -101,7 +83,7 @@ class CheckReport(Problems):
             path = Path(path)
             is_inside = self.root in path.parents
             shown = path.relative_to(self.root).as_posix() if is_inside else str(path)
-            self.defects.append(Defect(shown, where, message))
+            self.defects.append(" ".join(f"{shown}: {where}: {message}".split()))
 
     def take(self, path: Path | str, where: str, error: UserError) -> None:
         """Keep an error as a defect, without the file's name in its message."""
@@ -116,12 +98,12 @@ class CheckReport(Problems):
     def count_image(self) -> None:
         """Count an image, and log the progress now and then."""
         self.num_images += 1
-        if self.num_images % _LOG_EVERY == 0:
+        if self.num_images % _IMAGES_A_LINE == 0:
             _log.info("%s images checked, %s defects", self.num_images, self.num_defects)
 
     def lines(self, most: int = 100) -> list[str]:
         """Return the notes, at most ``most`` defects, and a summary, a line each."""
-        shown = [str(defect) for defect in self.defects[:most]]
+        shown = self.defects[:most]
         if self.num_defects > len(shown):
             shown.append(f"… and {self.num_defects - len(shown):,} more")
         kinds = ", ".join(f"{kind} {number:,}" for kind, number in self.counts.most_common())

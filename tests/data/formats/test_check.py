@@ -376,7 +376,7 @@ def test_a_good_set_is_clean_from_any_level(good_sets, layout, below):
 def assert_found(root: Path, *expected: str) -> None:
     """Each damage is among the defects, with its file and field."""
     report = check_dataset(root)
-    lines = [str(defect) for defect in report.defects]
+    lines = report.defects
     for text in expected:
         assert any(text in line for line in lines), (text, lines)
     assert not report.ok

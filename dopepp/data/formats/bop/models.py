@@ -107,21 +107,11 @@ def parts_by_id(root: Path, parts: Sequence[Part]) -> dict[int, Part]:
 
 
 def part_of(info: ModelInfo) -> Part:
-    """Read an object's mesh.
-
-    Raises:
-        UserError: The mesh is missing, damaged or not in millimetres.
-    """
+    """Read an object's mesh; a UserError where it is missing, damaged or not in millimetres."""
+    symmetries: dict[str, Any] = {name: getattr(info, name) for name in SYMMETRY_FIELDS}
     mesh = read_mesh(info.path, unit="mm")
-    symmetries = info.symmetries_discrete, info.symmetries_continuous
     try:
-        part = make_part(
-            info.name,
-            mesh,
-            symmetries_discrete=symmetries[0],
-            symmetries_continuous=symmetries[1],
-            unit="mm",
-        )
+        part = make_part(info.name, mesh, unit="mm", **symmetries)
     except UserError as error:  # of its size or its triangles; BOP's files have one unit
         allowed = f"{error.allowed}, from a file in millimetres as all of BOP's"
         fix = "correct the model, or convert its file to millimetres"
@@ -286,8 +276,8 @@ def model_info(part: Part) -> dict[str, object]:
     for axis, first, extent in zip("xyz", lower.tolist(), size.tolist(), strict=True):
         record |= {f"min_{axis}": first, f"size_{axis}": extent}
     if part.symmetries_discrete is not None and len(part.symmetries_discrete):
-        scaled = part.symmetries_discrete * np.array([1, 1, 1, MM])[None, None]
-        scaled[:, 3, 3] = 1
+        scaled = part.symmetries_discrete.copy()
+        scaled[:, :3, 3] *= MM
         record["symmetries_discrete"] = scaled.reshape(-1, 16).tolist()
     if part.symmetries_continuous:
         record["symmetries_continuous"] = [

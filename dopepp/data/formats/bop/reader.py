@@ -125,10 +125,9 @@ class BopReader:
         present = [(number, row) for number, row in listed if self._scenes[number].files[row]]
         num_wanted = len(listed) if self._targets is None else len(self._targets)
         if not present:
-            raise UserError(
-                f"no image under {self.root / self.split} ({num_wanted:,} listed)",
-                "at least one listed image in rgb/ or gray/", "unpack the data set fully",
-            )  # fmt: skip
+            got = f"no image under {self.root / self.split} ({num_wanted:,} listed)"
+            allowed = "at least one listed image in rgb/ or gray/"
+            raise UserError(got, allowed, "unpack the data set fully")
         if len(present) < num_wanted:
             absent = f"{num_wanted - len(present):,} of {num_wanted:,}"
             _log.warning("%s: %s listed images are absent", self.name, absent)
@@ -182,25 +181,16 @@ class BopReader:
         where = f"{scene.folder / 'scene_camera.json'}: image {scene.image_ids[row]}"
         K = check_camera(scene.K[row], (shape[1], shape[0]), where)
         objects = scene.objects(row)
-        instances = [
-            self._instance(scene, k, path.stem, K, shape)
-            for k in range(objects.start, objects.stop)
-        ]
-        if self._targets is not None:
-            self._mark_wanted(instances, self._target_counts(scene, row))
+        numbers = range(objects.start, objects.stop)
+        instances = [self._instance(scene, k, path.stem, K, shape) for k in numbers]
+        if self._targets is not None and (counts := self._target_counts(scene, row)) is not None:
+            left = Counter({self._parts[n].name: counts[n] for n in self._parts})
+            for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
+                instance.wanted = left[instance.label] > 0
+                left[instance.label] -= 1
         depth = self._depth(scene, row, shape) if self._read_depth else None
         key = f"{scene.folder.name}/{scene.image_ids[row]:06d}"
         return Sample(image, K, instances, depth, self.name, key)
-
-    def _mark_wanted(self, instances: list[Instance], counts: Counter[int] | None) -> None:
-        """Mark the targets among an image's instances: of each object the most visible ones."""
-        if counts is None:
-            return
-        numbers = {part.name: number for number, part in self._parts.items()}
-        left = Counter(counts)
-        for instance in sorted(instances, key=lambda instance: -instance.visible_fraction):
-            instance.wanted = left[numbers[instance.label]] > 0
-            left[numbers[instance.label]] -= 1
 
     def _instance(self, scene: Scene, k: int, stem: str, K: CameraMatrix, shape: Shape) -> Instance:
         path = scene.folder / "mask_visib" / f"{stem}_{scene.gt_ids[k]:06d}.png"
@@ -275,8 +265,6 @@ def _scene_folders(root: Path, split: str) -> list[Path]:
         )
     folders = [p for p in (root / split).iterdir() if bop.is_number(p.name) and p.is_dir()]
     if not folders:
-        raise UserError(
-            f"{root / split}, which has no scene", "folders 000000, 000001, …",
-            "unpack the data set's images into it",
-        )  # fmt: skip
+        got, allowed = f"{root / split}, which has no scene", "folders 000000, 000001, …"
+        raise UserError(got, allowed, "unpack the data set's images into it")
     return sorted(folders, key=lambda path: (int(path.name), path.name))

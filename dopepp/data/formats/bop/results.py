@@ -30,20 +30,16 @@ UNKNOWN_TIME: Final = -1.0
 MAX_ROWS: Final = 500_000
 """Several times the largest submission; read, a row takes 0.8 kB."""
 
-_MAX_LINE_BYTES: Final = 4096
-"""Fourteen numbers of 25 digits take 400."""
-
-_FARTHEST: Final = 1e9
-"""Millimetres; squares of such distances stay finite."""
+_MAX_LINE_BYTES: Final = 4096  # fourteen numbers of 25 digits take 400
+_FARTHEST: Final = 1e9  # mm; squares of such distances stay finite
 
 _PLAUSIBLE_MM: Final = (10.0, 100_000.0)
-"""The median distance of objects from the camera: outside, t is hardly in millimetres."""
+"""Median distance of objects from the camera if t is in millimetres."""
 
 _COUNTS: Final = {"score": 1, "R": 9, "t": 3, "time": 1}
 _COLUMNS: Final = 18
 """A line's number and its 17 numbers."""
 
-Row = Float[np.ndarray, "18"]
 Table = Float[np.ndarray, "rows 18"]
 
 _ID: Final = re.compile(r"\d{1,9}", re.ASCII)
@@ -104,14 +100,12 @@ def read_results(path: Path, objects: Collection[int]) -> list[PoseResult]:
     table = np.array(values, np.float64).reshape(-1, _COLUMNS)
     _check_repeats(path, table)
     _check_unit(path, table)
-    return [_result(row) for row in table]
-
-
-def _result(row: Row) -> PoseResult:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = row[5:14].reshape(3, 3), row[14:17] / MM
-    scene_id, im_id, obj_id = map(int, row[1:4])
-    return PoseResult(scene_id, im_id, obj_id, float(row[4]), T, float(row[17]))
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = table[:, 5:14].reshape(-1, 3, 3), table[:, 14:17] / MM
+    return [
+        PoseResult(int(row[1]), int(row[2]), int(row[3]), float(row[4]), T, float(row[17]))
+        for row, T in zip(table, poses, strict=True)
+    ]
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

@@ -45,10 +45,8 @@ def read_records(folder: Path, problems: Problems = STRICT) -> SceneRecords:
     camera, gt, gt_info = (
         Place(problems, folder / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
     )
-    cameras, truths, infos = (
-        _by_image(place) if place is camera or Path(place.path).exists() else {}
-        for place in (camera, gt, gt_info)
-    )
+    cameras = _by_image(camera)
+    truths, infos = (_by_image(p) if Path(p.path).exists() else {} for p in (gt, gt_info))
     objects = {image: gt[f"{image}"].entries(rows) for image, rows in truths.items()}
     paired: dict[int, list[bop.Record | None]] = {image: [] for image in infos.keys() - objects}
     for image, records in objects.items():
@@ -115,9 +113,9 @@ class Scene:
     without_model: Counter[int]
     num_behind: int
 
-    def objects(self, image: int) -> slice:
+    def objects(self, row: int) -> slice:
         """Return the slice of the objects on an image."""
-        return slice(int(self.first[image]), int(self.first[image + 1]))
+        return slice(int(self.first[row]), int(self.first[row + 1]))
 
 
 def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int] = ()) -> Scene:
@@ -129,10 +127,8 @@ def read_scene(folder: Path, wanted: Collection[int], with_model: Collection[int
     cameras, truths, infos = read_records(folder)
     images = sorted(cameras)
     if without := truths.keys() - cameras.keys():
-        _log.warning(
-            "%s: %d images have ground truth and no camera, and are left out; first: %d",
-            folder, len(without), min(without),
-        )  # fmt: skip
+        got = f"{len(without)} images have ground truth and no camera, and are left out"
+        _log.warning("%s: %s; first: %d", folder, got, min(without))
     owners = [(row, n) for row, i in enumerate(images) for n in range(len(truths.get(i, ())))]
 
     def places(what: str, number: int) -> Place:

@@ -218,15 +218,12 @@ def _bop_box(box: Box | None) -> list[int]:
 
 
 def _beyond_the_border(inside: Box | None, whole: Silhouette) -> Box | None:
-    """Return the outermost pixels of a silhouette, those beyond the image included."""
+    """Return the outermost pixels of a silhouette, also beyond the image's border."""
     # Its box bounds the vertices; where no vertex lies beyond the border, the pixels are exact.
     if inside is None or whole.box is None:
         return inside
     height, width = whole.mask.shape
     left, top, right, bottom = whole.box[0], whole.box[1], whole.box[2] - 1, whole.box[3] - 1
-    return Box(
-        left if left < 0 else inside.left,
-        top if top < 0 else inside.top,
-        right if right >= width else inside.right,
-        bottom if bottom >= height else inside.bottom,
-    )
+    low = left if left < 0 else inside.left, top if top < 0 else inside.top
+    high = right if right >= width else inside.right, bottom if bottom >= height else inside.bottom
+    return Box(*low, *high)

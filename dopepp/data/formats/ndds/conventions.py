@@ -143,12 +143,10 @@ def _turned_corners(part: Part, rotation: RotationMatrix) -> Float[np.ndarray, "
 
 
 MAX_ERROR_PX: Final = 5.0
-"""Largest error of three quarters of the instances under the right convention; annotations of
-photos are no better."""
+"""Largest error of most instances under the right convention: annotations of photos need it."""
 
 _MAX_SHARE: Final = 0.05
-"""Allowed error of an instance as a share of its projected cuboid's longer side, where that is more
-than ``MAX_ERROR_PX``: annotations of photos are worse for near objects."""
+"""Allowed error of one instance as a share of its projected cuboid's longer side, if larger."""
 
 _MOST: Final = 0.75
 """Share of the instances that must fit: a few damaged ones decide nothing."""
@@ -156,11 +154,8 @@ _MOST: Final = 0.75
 _RATIO: Final = 3.0
 """Any convention with other poses must fit this many times worse."""
 
-_ROUNDING_PX: Final = 0.05
-"""Between two fits that count as equally good: files round to a few digits."""
-
-_SAME_POSE: Final = 0.05
-"""Distance of corners, in diameters, below which two conventions give the same poses."""
+_ROUNDING_PX: Final = 0.05  # between equally good fits: files round to a few digits
+_SAME_POSE: Final = 0.05  # distance of corners, in diameters, of conventions with the same poses
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,10 @@ NORM_TOLERANCE: Final = 0.01
 """Of ``pose_transform`` from a rotation, of a quaternion's norm from 1: FAT has four digits."""
 
 EDGE_SHARE: Final = 0.02
-"""Of the longest edge: by how much edges may be unequal, slanted, or thin to have no direction."""
+"""Of the longest edge: allowed inequality and slant of edges, and size of one without direction."""
 
 SIZE_SHARE: Final = 0.05
-"""By how much edges may differ from the class's ``cuboid_dimensions``."""
+"""Allowed difference of edges from the class's ``cuboid_dimensions``."""
 
 _EDGES: Final = np.array(
     [

@@ -33,7 +33,7 @@ from dopepp.data.formats.images import encode_png
 from dopepp.data.formats.invariants import Box
 from dopepp.data.formats.ndds import CAMERA_SETTINGS, DEPTH_UNIT, OBJECT_SETTINGS
 from dopepp.data.sample import Instance, Sample
-from dopepp.drawing.pictures import Mask, Shape
+from dopepp.drawing.pictures import Shape
 from dopepp.geometry.camera import CameraMatrix, transform
 from dopepp.geometry.cuboid import CENTROID
 from dopepp.geometry.rotation import matrix_to_quaternion
@@ -82,17 +82,17 @@ class NddsWriter:
         settings = _encode(object_settings(list(self._parts.values())))
         present = sorted(self._root.glob("[!._]*")) if self._root.is_dir() else []
         foreign = [path for path in present if path.is_dir() or path.suffix in _DATA_SUFFIXES]
-        got = ""
         if path.is_file():
-            got = "" if path.read_bytes() == settings else f"{path} of other parts"
+            if path.read_bytes() == settings:
+                return
+            got = f"{path} of other parts"
         elif foreign:
             got = f"{foreign[0].name} in {self._root}, which no NDDS writer prepared"
         else:
             write_whole(path, settings)
-        if got:
-            raise UserError(
-                got, "an empty folder, or one begun with the same parts", "name another"
-            )
+            return
+        allowed = "an empty folder, or one begun with the same parts"
+        raise UserError(got, allowed, "name another")
 
     def write(self, index: int, sample: Sample) -> None:
         """Write an item's images and then its annotation, which marks it as complete."""
@@ -167,16 +167,14 @@ def camera_settings(camera: dict[str, Any]) -> dict[str, Any]:
 
 def camera_data(sample: Sample) -> dict[str, Any]:
     """Return an annotation's ``camera_data``."""
-    K = np.asarray(sample.K, np.float64)
+    (fx, _, cx), (_, fy, cy), _ = np.asarray(sample.K, np.float64).tolist()
     return {
         "width": sample.size[0],
         "height": sample.size[1],
         # The camera frame is the world frame: a sample knows no other.
         "location_worldframe": [0.0, 0.0, 0.0],
         "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
-        "intrinsics": dict(
-            zip(("fx", "fy", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
-        ),
+        "intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy},
     }
 
 
@@ -192,7 +190,14 @@ def object_record(
     w, x, y, z = matrix_to_quaternion(rotation).tolist()
     pose = np.eye(4)
     pose[:3, :3], pose[3, :3] = UNREAL_AXES @ rotation.T, location
-    projected = _projected(cuboid, K)
+    # Through the camera's centre: a corner behind it has a finite projection too.
+    pixels = cuboid @ K.T
+    depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
+    with np.errstate(over="ignore"):
+        projected = np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX)
+    seen = None if instance.mask is None else Box.of_mask(instance.mask)
+    box = seen or Box.of_points(projected[:CENTROID])
+    assert box is not None  # all corners have finite projections
     segmented = {} if instance.mask is None else {"segmentation_id": number}
     return {
         "class": instance.label,
@@ -205,27 +210,10 @@ def object_record(
         "pose_transform": pose.tolist(),
         "cuboid_centroid": (CM * cuboid[CENTROID]).tolist(),
         "projected_cuboid_centroid": projected[CENTROID].tolist(),
-        "bounding_box": _bounding_box(instance.mask, projected[:CENTROID]),
+        "bounding_box": {"top_left": [box.top, box.left], "bottom_right": [box.bottom, box.right]},
         "cuboid": (CM * cuboid[:CENTROID]).tolist(),
         "projected_cuboid": projected[:CENTROID].tolist(),
     }
-
-
-def _projected(points_cam: Float[np.ndarray, "9 3"], K: CameraMatrix) -> Float[np.ndarray, "9 2"]:
-    """Project through the camera's centre: a point behind it has a finite place too."""
-    pixels = points_cam @ K.T
-    depth = np.where(pixels[:, 2:] == 0, np.finfo(np.float64).tiny, pixels[:, 2:])
-    with np.errstate(over="ignore"):
-        return np.asarray(np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX))
-
-
-def _bounding_box(
-    mask: Mask | None, corners_px: Float[np.ndarray, "8 2"]
-) -> dict[str, list[float]]:
-    seen = None if mask is None else Box.of_mask(mask)
-    box = seen or Box.of_points(corners_px)
-    assert box is not None  # all corners have finite places
-    return {"top_left": [box.top, box.left], "bottom_right": [box.bottom, box.right]}
 
 
 def segmentation_map(

@@ -33,11 +33,9 @@ def read_classes(root: Path) -> list[str]:
         (path.is_file(), "has no image_sets/classes.txt"),
     ):
         if not is_there:
-            raise UserError(
-                f"data.root={root}, which {lack}",
-                "a YCB-Video folder with data/, image_sets/classes.txt and models/",
-                "set data.root to the unpacked YCB-Video data set",
-            )
+            allowed = "a YCB-Video folder with data/, image_sets/classes.txt and models/"
+            fix = "set data.root to the unpacked YCB-Video data set"
+            raise UserError(f"data.root={root}, which {lack}", allowed, fix)
     return path.read_text().split()
 
 
@@ -51,9 +49,8 @@ def read_image_set(root: Path, image_set: str, subset: Subset) -> list[str]:
     for line in path.read_text().split():
         scene, _, number = line.partition("/")
         if not number.isdigit() or not (scene.isdigit() or scene == "data_syn"):
-            raise UserError(
-                f"{path}: line {line!r}", "SSSS/NNNNNN or data_syn/NNNNNN", "correct it"
-            )
+            allowed = "SSSS/NNNNNN or data_syn/NNNNNN"
+            raise UserError(f"{path}: line {line!r}", allowed, "correct it")
         if (scene == "data_syn") == (subset == "synthetic"):
             frames.append(number if subset == "synthetic" else line)
     return frames
@@ -209,9 +206,6 @@ def read_frame(
 def _read_colour(path: Path, alpha: bool) -> UInt8[np.ndarray, "height width channels"]:
     image = read_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 + alpha:
-        raise UserError(
-            f"image {path} of shape {image.shape}, {image.dtype}",
-            f"8 bits and {3 + alpha} channels",
-            "copy or download the file again",
-        )
+        got, allowed = f"shape {image.shape}, {image.dtype}", f"8 bits and {3 + alpha} channels"
+        raise UserError(f"image {path} of {got}", allowed, "copy or download the file again")
     return image

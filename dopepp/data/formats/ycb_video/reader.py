@@ -27,7 +27,7 @@ from dopepp.data.formats.ycb_video import (
 )
 from dopepp.data.sample import Purpose, Sample, SourceInfo, item_rng
 from dopepp.drawing.pictures import Picture
-from dopepp.geometry.camera import CameraMatrix, camera_matrix, check_camera
+from dopepp.geometry.camera import camera_matrix, check_camera
 from dopepp.parts.part import Part
 from dopepp.virtual.backgrounds import Backgrounds
 
@@ -82,15 +82,13 @@ class YcbVideoReader:
         classes = read_classes(self.root)
         unknown = [part.name for part in parts if part.name not in classes]
         if unknown:
-            raise UserError(
-                f"objects {unknown}", f"those of classes.txt: {classes}", "correct them"
-            )
+            allowed = f"those of classes.txt: {classes}"
+            raise UserError(f"objects {unknown}", allowed, "correct them")
         self._parts = {classes.index(part.name) + 1: part for part in parts}
         if image_set is not None:
             frames = read_image_set(self.root, image_set, subset)
-        self.frames = self._present(
-            list(frames or ()), f"{image_set}.txt" if image_set else "frames"
-        )
+        where = f"{image_set}.txt" if image_set else "frames"
+        self.frames = self._present(list(frames or ()), where)
         self._backgrounds, self._seed, self._read_depth = backgrounds, seed, read_depth
 
     def _present(self, listed: list[str], where: str) -> list[str]:
@@ -98,11 +96,9 @@ class YcbVideoReader:
         is_there = {frame: Path(f"{self._start(frame)}-color.png").is_file() for frame in listed}
         absent = [frame for frame in listed if not is_there[frame]]
         if len(absent) == len(listed):
-            raise UserError(
-                f"no frame of {where} under {folder} ({len(absent):,} listed)",
-                "at least one listed frame on disk",
-                "unpack the data set fully, or choose another image set",
-            )
+            got = f"no frame of {where} under {folder} ({len(absent):,} listed)"
+            fix = "unpack the data set fully, or choose another image set"
+            raise UserError(got, "at least one listed frame on disk", fix)
         if absent:
             counts = f"{len(absent):,} of {len(listed):,}"
             message = "%s: %s frames listed in %s are absent; first: %s"
@@ -120,7 +116,8 @@ class YcbVideoReader:
         shape, meta, depth = frame.image.shape[:2], frame.meta, frame.depth
         if depth is not None:
             depth = depth / np.float32(meta.factor_depth)
-        K = self._camera(name) if meta.K is None else meta.K
+        scene = int(name.partition("/")[0]) if is_real else 0
+        K = _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA] if meta.K is None else meta.K
         K = check_camera(K, (shape[1], shape[0]), f"{self._start(name)}-meta.mat")
         instances = []
         for class_index, part in self._parts.items():
@@ -133,11 +130,6 @@ class YcbVideoReader:
 
     def _start(self, frame: str) -> str:
         return str(self.root / FOLDERS[self.subset] / frame)
-
-    def _camera(self, frame: str) -> CameraMatrix:
-        """Return K of a frame whose ``meta.mat`` does not state it."""
-        scene = 0 if self.subset == "synthetic" else int(frame.partition("/")[0])
-        return _CAMERAS[scene >= _FIRST_SCENE_OF_SECOND_CAMERA]
 
     def _meta(self, frame: str) -> FrameMeta:
         return read_meta(Path(f"{self._start(frame)}-meta.mat"))
@@ -161,21 +153,17 @@ class YcbVideoReader:
 
     def describe(self) -> list[SourceInfo]:
         """Return the frame list's hash and the objects; instances of a small list are counted."""
-        digest = hashlib.sha256("\n".join(self.frames).encode()).hexdigest()
         identity: dict[str, object] = {
-            "frames": digest,
+            "frames": hashlib.sha256("\n".join(self.frames).encode()).hexdigest(),
             "objects": {part.name: part.mesh_hash for part in self._parts.values()},
         }
         if self._backgrounds is not None and self.subset == "synthetic":
             identity["background_seed"] = self._seed
             identity["backgrounds"] = self._backgrounds.identity()
-        return [SourceInfo(self.name, len(self.frames), identity, self._count_instances())]
-
-    def _count_instances(self) -> dict[str, int]:
-        if len(self.frames) > _MAX_COUNTED_FRAMES:
-            return {}
-        metas = [self._meta(frame) for frame in self.frames]
-        return {
+        is_counted = len(self.frames) <= _MAX_COUNTED_FRAMES
+        metas = [self._meta(frame) for frame in self.frames] if is_counted else []
+        instances = {
             part.name: sum(class_index in meta.poses for meta in metas)
             for class_index, part in self._parts.items()
         }
+        return [SourceInfo(self.name, len(self.frames), identity, instances if is_counted else {})]

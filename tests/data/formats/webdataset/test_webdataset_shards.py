@@ -238,7 +238,7 @@ def test_shards_are_downloaded_once_and_within_bounds(
     source = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert [source.sample(i).key for i in (0, 1)] == ["000000_000000", "000001_000000"]
     assert contents(folder) == contents(tmp_path / "served")
-    monkeypatch.setattr("dopepp.data.formats.webdataset.locations.MAX_SHARD_BYTES", 1000)
+    monkeypatch.setattr("dopepp.data.formats.webdataset.reader.MAX_SHARD_BYTES", 1000)
     again = WebdatasetReader(tmp_path, [block(2)], url, download_dir=folder)
     assert again.describe() == [source.describe()[0]]
     with pytest.raises(UserError, match="of over 0 GB"):
