@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dopepp.geometry.camera import camera_matrix
 from dopepp.geometry.cuboid import cuboid_keypoints
-from dopepp.recovery import Detection, explain, recover
+from dopepp.recovery import Detection, explain, recover, recover_batch
 
 QUICK: Final = 40
 THOROUGH: Final = 6000
@@ -135,20 +135,30 @@ def test_many_maps(case):
 
 
 WRONG: Final = {
-    "nine channels too few": ((9, 4, 4), (32, 4, 4), 2),
-    "maps of two sizes": ((9, 4, 4), (16, 4, 5), 1),
-    "no batch": ((4, 4), (16, 4, 4), 1),
-    "no maps": ((9, 0, 4), (16, 0, 4), 1),
-    "one dimension too many": ((1, 9, 4, 4), (1, 16, 4, 4), 1),
-    "no objects but channels": ((9, 4, 4), (16, 4, 4), 0),
+    "nine channels too few": ((9, 4, 4), (32, 4, 4), 2, r"2 objects need \(18, 32\)"),
+    "nine channels too many": ((18, 4, 4), (32, 4, 4), 1, r"1 objects need \(9, 16\)"),
+    "maps of two sizes": ((9, 4, 4), (16, 4, 5), 1, r"1 objects need \(9, 16\)"),
+    "no batch": ((4, 4), (16, 4, 4), 1, "maps are"),
+    "no maps": ((9, 0, 4), (16, 0, 4), 1, "maps are"),
+    "one dimension too many": ((1, 9, 4, 4), (1, 16, 4, 4), 1, "maps are"),
+    "no objects but channels": ((9, 4, 4), (16, 4, 4), 0, "0 objects need"),
 }
 
 
 @pytest.mark.parametrize("name", WRONG)
 def test_maps_of_other_shapes(name):
-    belief, field, objects = WRONG[name]
+    belief, field, objects, message = WRONG[name]
     box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)
     K = camera_matrix(60, 60, 50, 50)
     cuboids = np.stack([box] * objects) if objects else np.zeros((0, 9, 3))
-    with pytest.raises(ValueError, match=r"channels|maps"):
+    with pytest.raises(ValueError, match=message):
         recover(torch.zeros(belief), torch.zeros(field), cuboids, K)
+
+
+def test_names_and_cameras_must_be_as_many_as_objects_and_images():
+    box = cuboid_keypoints(-np.ones(3) / 20, np.ones(3) / 20)[None]
+    K, maps = camera_matrix(60, 60, 50, 50), (torch.zeros(2, 9, 8, 8), torch.zeros(2, 16, 8, 8))
+    with pytest.raises(ValueError, match="1 objects need as many names"):
+        recover(maps[0][0], maps[1][0], box, K, names=["a", "b"])
+    with pytest.raises(ValueError, match="2 images need as many camera matrices"):
+        recover_batch(*maps, box, K)

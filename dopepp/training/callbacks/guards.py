@@ -4,7 +4,7 @@ Whether a step is taken must be known before it is taken, so :class:`FiniteSteps
 device once per optimiser step: three numbers, as often as torch's own gradient scaler does.
 A network whose maps are empty gives no pose, and every pose metric is zero whatever the reason;
 :class:`EmptyMaps` names the likely reasons. To add a reason, write a method like
-:meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._causes`.
+:meth:`EmptyMaps._rate` and a line in :meth:`EmptyMaps._warn`.
 """
 
 from __future__ import annotations
@@ -163,16 +163,14 @@ class FiniteSteps(Callback):
         Gradients are summed over the processes, so where they alone are wrong, all have one.
         """
         folder = Path(trainer.default_root_dir) / FOLDER
-        bad = [
-            one_pass
-            for one_pass in passes
-            if (one_pass.bad[0] if "loss" in names else one_pass.bad.any())
-        ]
-        if bad:
-            facts: dict[str, Any] = {"step": trainer.global_step, "epoch": trainer.current_epoch}
-            facts |= {"not_finite": names, "loss": float(bad[0].loss)}
-            name = f"step_{trainer.global_step}_rank_{trainer.global_rank}"
-            _dump_batch(folder / name, bad[0].batch, facts)
+        for one_pass in passes:
+            if one_pass.bad[0] if "loss" in names else one_pass.bad.any():
+                step, epoch = trainer.global_step, trainer.current_epoch
+                facts = {"step": step, "epoch": epoch, "not_finite": names}
+                facts["loss"] = float(one_pass.loss)
+                path = folder / f"step_{step}_rank_{trainer.global_rank}"
+                _dump_batch(path, one_pass.batch, facts)
+                break
         return folder
 
 
@@ -269,35 +267,37 @@ class EmptyMaps(Callback):
             f"(recovery.peak_threshold={options.peak_threshold:g}), of a centroid {centroid:.2g} "
             f"(recovery.centroid_threshold={options.centroid_threshold:g}). The usual causes:"
         ]
-        causes = sorted(self._causes(trainer, system), key=lambda cause: not cause[0])
-        for number, (likely, name, text) in enumerate(causes, start=1):
+        rate, labels = self._rate(trainer), self._labels()
+        early = not rate[0] and not labels[0], self._early(trainer, system)
+        causes = {
+            "too little training so far": early,
+            "a learning rate that is too high or too low": rate,
+            "labels or units that do not fit the images": labels,
+        }
+        likely_first = sorted(causes.items(), key=lambda item: not item[1][0])
+        for number, (name, (likely, text)) in enumerate(likely_first, start=1):
             lines.append(f"  {number}. {name}{' (likely here)' if likely else ''}: {text}")
         _log.warning("\n".join(lines))
 
-    def _causes(self, trainer: Trainer, system: PoseSystem) -> list[tuple[bool, str, str]]:
-        """Return of each cause whether it is likely, its name, and what to look at and try."""
-        rate, labels = self._rate(trainer), self._labels()
-        early = (
-            f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
-            "train longer (trainer.max_epochs)"
-        )
+    def _early(self, trainer: Trainer, system: PoseSystem) -> str:
+        """Say how far the training is, and which loss learns sooner."""
+        text = f"step {trainer.global_step:,} of {trainer.estimated_stepping_batches:,}; wait, or "
+        text += "train longer (trainer.max_epochs)"
         if isinstance(system.loss, MapMSE):
-            early += (
+            text += (
                 "; to the squared error of model/loss=mse, whose peaks are a few cells of a map, "
                 "empty maps are a good answer for long: model/loss=spatial_ce learns from the "
                 "first step on"
             )
-        return [
-            (not rate[0] and not labels[0], "too little training so far", early),
-            (rate[0], "a learning rate that is too high or too low", rate[1]),
-            (labels[0], "labels or units that do not fit the images", labels[1]),
-        ]
+        return text
 
     def _rate(self, trainer: Trainer) -> tuple[bool, str]:
         """Judge the learning rate by the validation loss."""
         first, last = self._first_loss, self._loss
         flat = self._num_empty > 1 and not last < _FALL * first
-        rates = [group["lr"] for one in trainer.optimizers for group in one.param_groups]
+        rates = [
+            group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups
+        ]
         present = f"{max(rates):.2g}" if rates else "unknown"
         return flat, (
             f"the validation loss went from {first:.4g} to {last:.4g}, the rate is {present} now; "

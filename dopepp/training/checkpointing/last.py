@@ -65,7 +65,7 @@ class LastCheckpoint(Checkpoint):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the random generators' states; in a validation, those at its beginning."""
-        return {"random": self._random or capture()}
+        return {"random": self._random or _capture()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Keep the states until training starts."""
@@ -80,23 +80,23 @@ class LastCheckpoint(Checkpoint):
         if self._cut is not None:
             self._cut(fit_loop)
         elif epochs["processed"] == epochs["ready"]:  # the best one, at the end of an epoch
-            between_epochs(fit_loop)
+            _between_epochs(fit_loop)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take up the random states and the signals; tidy up after the run that was cut off."""
         if self._random is not None:
-            restore(self._random)
+            _restore(self._random)
             self._random = None
         _find_place(trainer)
         if trainer.is_global_zero:
-            files.sweep(Path(trainer.default_root_dir))
+            run_dir, resumed = Path(trainer.default_root_dir), trainer.ckpt_path
+            files.sweep(run_dir)
             # A damaged file must not take the place of the whole one that is resumed from.
-            last = Path(trainer.default_root_dir) / files.FOLDER / files.LAST
-            resumed = trainer.ckpt_path
+            last = run_dir / files.FOLDER / files.LAST
             if resumed is not None and Path(resumed).name != files.LAST and last.exists():
                 last.replace(last.with_name(f"{files.LAST}.damaged"))
         _forget_later_best(trainer)
-        self._saved, self._saved_at = _state(trainer), time.monotonic()
+        self._saved, self._saved_at = _progress(trainer), time.monotonic()
         self._stop = StopRequest()
         self._stop.listen()
 
@@ -106,17 +106,17 @@ class LastCheckpoint(Checkpoint):
         """Save the state after the batches before this one, if it is time."""
         # Gradients that are being accumulated are in no checkpoint.
         if batch_idx % trainer.accumulate_grad_batches == 0:
-            self._save_if_due(trainer, before_batch)
+            self._save_if_due(trainer, _before_batch)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remember the random states that a repeated validation has to begin with."""
-        self._random = capture()
+        self._random = _capture()
 
     def on_validation_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, *_: Any
     ) -> None:
         """Save if it is time; a resumed run repeats the validation as a whole."""
-        self._save_if_due(trainer, before_validation)
+        self._save_if_due(trainer, _before_validation)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Go back to the present states."""
@@ -125,15 +125,13 @@ class LastCheckpoint(Checkpoint):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the result; a ``SavingFailedError`` if it cannot be written."""
         self._stop.end()
-        self._save(trainer, between_epochs)
+        self._save(trainer, _between_epochs)
         if trainer.is_global_zero:
             writer = trainer.strategy.checkpoint_io
             assert isinstance(writer, files.AtomicCheckpointIO)
             writer.finish()
 
-    def on_exception(
-        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Give the signals back."""
         self._stop.end()
 
@@ -141,14 +139,14 @@ class LastCheckpoint(Checkpoint):
         """Save by the clock and by request; after a request, end the run."""
         stop = self._stop.number
         wait_s = max(self.every_s, self._duration_s / self.max_share)
-        due = trainer.is_global_zero and (
-            time.monotonic() - self._saved_at >= wait_s or _state(trainer)[1] != self._saved[1]
-        )
+        progress = _progress(trainer)
+        is_late = time.monotonic() - self._saved_at >= wait_s
+        due = trainer.is_global_zero and (is_late or progress[1] != self._saved[1])
         # Of several processes the first one has the clock, but any may be asked to stop.
         agree = trainer.strategy.reduce_boolean_decision
         if not agree(due or stop is not None, all=False):
             return
-        if _state(trainer) != self._saved:
+        if progress != self._saved:
             self._save(trainer, cut)
         if agree(stop is not None, all=False):
             raise Interruption(stop or signal.SIGTERM)
@@ -163,7 +161,7 @@ class LastCheckpoint(Checkpoint):
             self._cut = None
         self._saved_at = time.monotonic()
         self._duration_s = self._saved_at - start
-        self._saved = _state(trainer)
+        self._saved = _progress(trainer)
 
 
 class StopRequest:
@@ -171,8 +169,7 @@ class StopRequest:
 
     The first Ctrl-C is remembered, the second ends the run at once; schedulers repeat SIGTERM, so
     it is remembered however often it comes. Under SLURM, SIGUSR1 (``--signal=USR1@90``) asks for
-    the same as SIGTERM. Processes forked from this one keep the handlers but not the request.
-    ``number`` is the signal that was caught, SIGTERM for SIGUSR1, or None.
+    the same as SIGTERM. ``number`` is the signal that was caught, SIGTERM for SIGUSR1, or None.
     """
 
     def __init__(self) -> None:
@@ -195,7 +192,7 @@ class StopRequest:
         self._kept = {}
 
     def _remember(self, number: int, _: FrameType | None) -> None:
-        if os.getpid() != self._process:  # a loader's worker: its parent decides
+        if os.getpid() != self._process:  # a forked loader's worker: its parent decides
             return
         if number == signal.SIGINT and self.number is not None:
             raise Interruption(number)
@@ -220,7 +217,7 @@ def _find_place(trainer: Trainer) -> None:
         loader.load_state_dict({"num_batches": num_done})
 
 
-def _state(trainer: Trainer) -> tuple[int, float | None]:
+def _progress(trainer: Trainer) -> tuple[int, float | None]:
     """Return the step and the best score: a checkpoint that differs in neither is not saved."""
     score = getattr(_best(trainer), "best_model_score", None)
     return trainer.global_step, None if score is None else float(score)
@@ -244,16 +241,16 @@ def _forget_later_best(trainer: Trainer) -> None:
     if best is None or not best.best_model_path:
         return
     step = files.saved_step(Path(best.best_model_path))
-    if step is not None and step <= trainer.global_step:
-        return
-    _log.info("%s is newer than step %d: chosen anew", best.best_model_path, trainer.global_step)
-    fresh = ModelCheckpoint(monitor=best.monitor, mode=best.mode)
-    best.best_k_models, best.kth_value = {}, fresh.kth_value
-    best.best_model_path = best.kth_best_model_path = ""
-    best.best_model_score = None
+    if step is None or step > trainer.global_step:
+        _log.info(
+            "%s is newer than step %d: chosen anew", best.best_model_path, trainer.global_step
+        )
+        best.best_k_models, best.best_model_score = {}, None
+        best.kth_value = ModelCheckpoint(monitor=best.monitor, mode=best.mode).kth_value
+        best.best_model_path = best.kth_best_model_path = ""
 
 
-def before_batch(fit_loop: dict[str, Any]) -> None:
+def _before_batch(fit_loop: dict[str, Any]) -> None:
     """Take back the batch that was handed out and has not been trained on."""
     batches = fit_loop["epoch_loop.batch_progress"]
     for counter in (batches["total"], batches["current"]):
@@ -261,7 +258,7 @@ def before_batch(fit_loop: dict[str, Any]) -> None:
     batches["is_last_batch"] = False
 
 
-def before_validation(fit_loop: dict[str, Any]) -> None:
+def _before_validation(fit_loop: dict[str, Any]) -> None:
     """Forget what has been validated: all of the epoch's batches are trained on, none is judged."""
     validation = fit_loop["epoch_loop.val_loop.batch_progress"]
     # One batch begun and none done is how Lightning tells that a validation was cut off.
@@ -270,14 +267,13 @@ def before_validation(fit_loop: dict[str, Any]) -> None:
     validation["is_last_batch"] = False
 
 
-def between_epochs(fit_loop: dict[str, Any]) -> None:
+def _between_epochs(fit_loop: dict[str, Any]) -> None:
     """Close the epoch: the next one starts with its first batch."""
-    epochs = fit_loop["epoch_progress"]
-    for counter in (epochs["total"], epochs["current"]):
+    for counter in fit_loop["epoch_progress"].values():
         counter["completed"] = counter["processed"]
 
 
-def capture() -> dict[str, Any]:
+def _capture() -> dict[str, Any]:
     """Return the states of Python's, NumPy's and torch's generators, as tensors and numbers."""
     version, numbers, gauss = random.getstate()
     _, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002
@@ -290,7 +286,7 @@ def capture() -> dict[str, Any]:
     }
 
 
-def restore(state: dict[str, Any]) -> None:
+def _restore(state: dict[str, Any]) -> None:
     """Set the generators to captured states; those of GPUs only where there are as many."""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
@@ -299,4 +295,4 @@ def restore(state: dict[str, Any]) -> None:
     np.random.set_state((*generator, state["numpy_gauss"]))  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())
     if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all([one.cpu() for one in state["cuda"]])
+        torch.cuda.set_rng_state_all([generator.cpu() for generator in state["cuda"]])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from dopepp.core.errors import UserError
 from dopepp.data.batch import Batch
 from dopepp.training.callbacks.guards import EmptyMaps
 from dopepp.training.system import PoseSystem, ValidationOutput
@@ -125,8 +124,3 @@ def test_corners_or_centroids_alone_give_no_pose_both_do(validations, caplog):
     validations(0.9, 2.0, slice(None))
     validations.callback.on_train_end(validations.trainer, validations.system)
     assert not caplog.messages
-
-
-def test_patience_out_of_range():
-    with pytest.raises(UserError, match="patience=0"):
-        EmptyMaps(0)

@@ -20,7 +20,7 @@ from dopepp.core.errors import RunError, UserError
 from dopepp.core.files import read_csv
 from dopepp.data.batch import Batch
 from dopepp.drawing.pictures import read_rgb
-from dopepp.training.callbacks.guards import FOLDER, FiniteSteps
+from dopepp.training.callbacks.guards import FOLDER, EmptyMaps, FiniteSteps
 from dopepp.training.checkpointing.files import AtomicCheckpointIO
 from dopepp.training.system import PoseSystem, check_state
 
@@ -232,6 +232,8 @@ def test_what_may_be_saved(value):
 def test_a_count_that_means_nothing_is_refused(count):
     with pytest.raises(UserError, match="max_in_a_row"):
         FiniteSteps(count)
+    with pytest.raises(UserError, match="patience"):
+        EmptyMaps(count)
 
 
 SCRIPT = """
