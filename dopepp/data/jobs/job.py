@@ -51,16 +51,11 @@ _NAMED: Final = re.compile(r"([^=/\\]+)=(.+)")  # ``NAME=FILE``; a name is not a
 
 @dataclass(frozen=True)
 class Job:
-    """What is rendered, whoever renders how much of it.
+    """What is rendered, whoever renders how much of it."""
 
-    Attributes:
-        factory: Renders image (0, index).
-        record: The settings as plain values; equal records give equal bytes.
-    """
-
-    factory: Factory
+    factory: Factory  # renders image (0, index)
     layout: str
-    record: Mapping[str, Any]
+    record: Mapping[str, Any]  # the settings as plain values; equal records give equal bytes
 
     def writer(self, root: Path) -> Writer:
         """Return a new writer into a folder."""

@@ -53,20 +53,13 @@ OnProgress = Callable[[int, int], None]
 
 @dataclass
 class RenderReport:
-    """What a run has done.
+    """What a run has done."""
 
-    Attributes:
-        num_images: Images of the shard, all there now.
-        num_rendered: Those that this run made.
-        render_s: CPU seconds of rendering.
-        write_s: CPU seconds of encoding and writing.
-    """
-
-    num_images: int
-    num_rendered: int = 0
+    num_images: int  # images of the shard, all there now
+    num_rendered: int = 0  # those that this run made
     wall_s: float = 0.0
-    render_s: float = 0.0
-    write_s: float = 0.0
+    render_s: float = 0.0  # CPU seconds of rendering
+    write_s: float = 0.0  # CPU seconds of encoding and writing
 
     def __str__(self) -> str:
         if not self.num_rendered:
@@ -152,17 +145,12 @@ class Shard:
 
 @dataclass(frozen=True)
 class Chunk:
-    """What a shard has to do with a chunk.
-
-    Attributes:
-        required: All of the job's images in it, also those of other shards: with these it is
-            finalized.
-        missing: The shard's images in it that are not there yet.
-    """
+    """What a shard has to do with a chunk."""
 
     number: int
+    # All of the job's images in it, also those of other shards: with these it is finalized.
     required: range
-    missing: Sequence[int]
+    missing: Sequence[int]  # the shard's images in it that are not there yet
 
 
 def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
@@ -180,16 +168,11 @@ def plan(writer: Writer, shard: Shard, num_items: int) -> Iterator[Chunk]:
 
 @dataclass(frozen=True)
 class Task:
-    """Images to render and write, or a chunk to finalize.
-
-    Attributes:
-        indices: The images; for finalizing, those without which it must not happen.
-        finalizes: Whether the chunk is to be finalized.
-    """
+    """Images to render and write, or a chunk to finalize."""
 
     chunk: int
-    indices: Sequence[int]
-    finalizes: bool = False
+    indices: Sequence[int]  # the images; for finalizing, those without which it must not happen
+    finalizes: bool = False  # whether the chunk is to be finalized
 
 
 class RenderTasks:

@@ -51,57 +51,35 @@ Transforms = Float[np.ndarray, "poses 4 4"]
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A board on a picture.
+    """A board on a picture."""
 
-    Attributes:
-        name: Of the picture.
-        points: Of the board that were found, in its frame, metres.
-        pixels: Where they are.
-    """
-
-    name: str
-    points: Float[np.ndarray, "n 3"]
-    pixels: Float[np.ndarray, "n 2"]
+    name: str  # of the picture
+    points: Float[np.ndarray, "n 3"]  # of the board that were found, in its frame, metres
+    pixels: Float[np.ndarray, "n 2"]  # where they are
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """A board's pose on a picture.
+    """A board's pose on a picture."""
 
-    Attributes:
-        name: The picture's.
-        T_cam_board: The pose.
-        covariance: Of a turn about the board's origin and a shift, camera axes (radians, metres).
-        error_px: RMS reprojection error, pixels.
-        distance: From the camera to the middle of the points, metres.
-    """
-
-    name: str
-    T_cam_board: Transform
+    name: str  # the picture's
+    T_cam_board: Transform  # the pose
+    # Of a turn about the board's origin and a shift, camera axes (radians, metres).
     covariance: Float[np.ndarray, "6 6"]
-    error_px: float
-    distance: float
+    error_px: float  # RMS reprojection error, pixels
+    distance: float  # from the camera to the middle of the points, metres
 
 
 @dataclass(frozen=True)
 class Board:
-    """A flat target.
+    """A flat target."""
 
-    Attributes:
-        kind: ``charuco``, ``chess`` or ``circles``.
-        columns: Squares across (ChArUco), inner corners (chess board), circles in a row.
-        rows: The same, downwards.
-        spacing: Side of a square; of circles, twice the step from row to row; metres.
-        marker: Side of a ChArUco marker, metres.
-        dictionary: Of the ChArUco markers, without OpenCV's ``DICT_``.
-    """
-
-    kind: str
-    columns: int
-    rows: int
-    spacing: float
-    marker: float = 0.0
-    dictionary: str = DICTIONARY
+    kind: str  # `charuco`, `chess` or `circles`
+    columns: int  # squares across (ChArUco), inner corners (chess board), circles in a row
+    rows: int  # the same, downwards
+    spacing: float  # side of a square; of circles, twice the step from row to row; metres
+    marker: float = 0.0  # side of a ChArUco marker, metres
+    dictionary: str = DICTIONARY  # of the ChArUco markers, without OpenCV's `DICT_`
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:

@@ -48,38 +48,24 @@ FORMAT: Final = (
 
 @dataclass(frozen=True)
 class Reading:
-    """How a file's numbers are meant.
+    """How a file's numbers are meant."""
 
-    Attributes:
-        unit: Of positions: m, mm, cm or inch.
-        degrees: Whether angles are degrees, not radians.
-        order: Of a quaternion's numbers: ``wxyz`` as named, ``xyzw`` where w stands last.
-        inverted: Whether the poses map the base into the flange, T_flange_base.
-    """
-
-    unit: str = "m"
-    degrees: bool = False
+    unit: str = "m"  # of positions: m, mm, cm or inch
+    degrees: bool = False  # whether angles are degrees, not radians
+    # Of a quaternion's numbers: `wxyz` as named, `xyzw` where w stands last.
     order: str = "wxyz"
-    inverted: bool = False
+    inverted: bool = False  # whether the poses map the base into the flange, T_flange_base
 
 
 @dataclass(frozen=True, eq=False)
 class RobotPoses:
-    """A file's poses as they stand there.
+    """A file's poses as they stand there."""
 
-    Attributes:
-        names: Of their pictures; empty strings where there are none.
-        positions: x, y, z.
-        kind: A key of :data:`ROTATIONS`, or ``matrix``.
-        rotations: Its numbers.
-        source: The file.
-    """
-
-    names: tuple[str, ...]
-    positions: Float[np.ndarray, "poses 3"]
-    kind: str
-    rotations: Float[np.ndarray, "poses numbers"]
-    source: str
+    names: tuple[str, ...]  # of their pictures; empty strings where there are none
+    positions: Float[np.ndarray, "poses 3"]  # x, y, z
+    kind: str  # a key of `ROTATIONS`, or `matrix`
+    rotations: Float[np.ndarray, "poses numbers"]  # its numbers
+    source: str  # the file
 
     def transforms(self, reading: Reading) -> Float[np.ndarray, "poses 4 4"]:
         """Return T_base_flange of every pose, metres."""

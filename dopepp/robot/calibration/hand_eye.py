@@ -47,27 +47,18 @@ MEDIAN_CHI2: Final = 5.348
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """Where camera and board are.
+    """Where camera and board are."""
 
-    Attributes:
-        mount: Whether the camera is in the ``hand`` or on the ``bench``.
-        T_mount_cam: Where the camera is: T_flange_cam in the hand, T_base_cam on the bench.
-        T_other_board: Where the board is: T_base_board, or T_flange_board.
-        covariance: Of a turn of the camera about its own origin and a shift, camera axes (radians,
-            metres).
-        turns: How far every pose is turned from where the others expect it, radians.
-        shifts: How far it is shifted, metres.
-        inliers: Which poses were used.
-        robot_noise: The robot's own deviation that these show, radians and metres.
-    """
-
-    mount: Mount
-    T_mount_cam: Transform
-    T_other_board: Transform
+    mount: Mount  # whether the camera is in the `hand` or on the `bench`
+    T_mount_cam: Transform  # where the camera is: T_flange_cam in the hand, T_base_cam on the bench
+    T_other_board: Transform  # where the board is: T_base_board, or T_flange_board
+    # Of a turn of the camera about its own origin and a shift, camera axes (radians, metres).
     covariance: Float[np.ndarray, "6 6"]
+    # How far every pose is turned from where the others expect it, radians.
     turns: Float[np.ndarray, "poses"]
-    shifts: Float[np.ndarray, "poses"]
-    inliers: Bool[np.ndarray, "poses"]
+    shifts: Float[np.ndarray, "poses"]  # how far it is shifted, metres
+    inliers: Bool[np.ndarray, "poses"]  # which poses were used
+    # The robot's own deviation that these show, radians and metres.
     robot_noise: tuple[float, float]
 
 

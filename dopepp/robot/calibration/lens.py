@@ -82,29 +82,18 @@ def _shift(one: Sighting, other: Sighting) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
-    """A lens and what it was made of.
+    """A lens and what it was made of."""
 
-    Attributes:
-        camera: The calibrated camera.
-        error_px: RMS reprojection error over all views kept, pixels.
-        names: Of the views, and
-        errors_px: the RMS reprojection error of each, pixels.
-        outliers: Names of views that were left out, since they are far worse than the others.
-        coverage: Share of the picture's cells (8×6) in which points were seen.
-        covered: Which cells these are.
-        deviations: Standard deviations of fx, fy, cx, cy, pixels.
-        findings: Why it is not to be trusted, and what to do; empty where it is.
-    """
-
-    camera: Camera
-    error_px: float
-    names: tuple[str, ...]
-    errors_px: Float[np.ndarray, "views"]
+    camera: Camera  # the calibrated camera
+    error_px: float  # RMS reprojection error over all views kept, pixels
+    names: tuple[str, ...]  # of the views
+    errors_px: Float[np.ndarray, "views"]  # the RMS reprojection error of each, pixels
+    # Names of views that were left out, since they are far worse than the others.
     outliers: tuple[str, ...]
-    coverage: float
-    covered: Bool[np.ndarray, "rows columns"]
-    deviations: Float[np.ndarray, "4"]
-    findings: tuple[str, ...]
+    coverage: float  # share of the picture's cells (8×6) in which points were seen
+    covered: Bool[np.ndarray, "rows columns"]  # which cells these are
+    deviations: Float[np.ndarray, "4"]  # standard deviations of fx, fy, cx, cy, pixels
+    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
 
 
 def calibrate_lens(sightings: Sequence[Sighting], size: Size) -> LensCalibration:

@@ -215,26 +215,17 @@ def _unit(scale: float, unit: str) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What a calibration is worth.
+    """What a calibration is worth."""
 
-    Attributes:
-        shift: Expected error (one standard deviation) of what is seen at the board's distance,
-            metres, and
-        turn: of its rotation, radians.
-        leave_one_out: By how much the camera's place changes without each pose, metres.
-        diversity: RMS turn over pairs of poses about the three main axes, radians, descending.
-        weakest: Axis of the camera's mount along which its place is known least.
-        next_pose: What to add, in words.
-        findings: Why it is not to be trusted, and what to do; empty where it is.
-    """
-
+    # Expected error (one standard deviation) of what is seen at the board's distance, metres.
     shift: float
-    turn: float
+    turn: float  # of its rotation, radians
+    # By how much the camera's place changes without each pose, metres.
     leave_one_out: Float[np.ndarray, "poses"]
-    diversity: Vector
-    weakest: Vector
-    next_pose: str
-    findings: tuple[str, ...]
+    diversity: Vector  # RMS turn over pairs of poses about the three main axes, radians, descending
+    weakest: Vector  # axis of the camera's mount along which its place is known least
+    next_pose: str  # what to add, in words
+    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
 
 
 def explain(

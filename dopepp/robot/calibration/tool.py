@@ -25,25 +25,15 @@ MAX_RESIDUAL: Final = 0.002  # metres: more is no point that was touched
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """A tool's tip.
+    """A tool's tip."""
 
-    Attributes:
-        position: In the flange's frame, metres.
-        pivot: The point that was touched, in the base's frame, metres.
-        residuals: How far every pose's tip is from it, metres.
-        deviations: Standard deviations of the position along the flange's axes, metres.
-        amplification: Factor from the poses' errors to the tip's along the axis known least.
-        weakest: That axis in the flange's frame, a unit vector.
-        findings: Why it is not to be trusted, and what to do; empty where it is.
-    """
-
-    position: Vector
-    pivot: Vector
-    residuals: Float[np.ndarray, "poses"]
-    deviations: Vector
-    amplification: float
-    weakest: Vector
-    findings: tuple[str, ...]
+    position: Vector  # in the flange's frame, metres
+    pivot: Vector  # the point that was touched, in the base's frame, metres
+    residuals: Float[np.ndarray, "poses"]  # how far every pose's tip is from it, metres
+    deviations: Vector  # standard deviations of the position along the flange's axes, metres
+    amplification: float  # factor from the poses' errors to the tip's along the axis known least
+    weakest: Vector  # that axis in the flange's frame, a unit vector
+    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
 
 
 def find_tip(T_base_flange: Float[np.ndarray, "poses 4 4"]) -> Tip:
@@ -99,18 +89,14 @@ def _doubts(
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A plane of the robot's cell and a frame on it.
+    """A plane of the robot's cell and a frame on it."""
 
-    Attributes:
-        T_base_bench: z away from the plane, towards the robot's side; origin at the first point,
-            x towards the second.
-        residuals: Distance of every point from the plane, metres, above positive.
-        findings: Why it is not to be trusted, and what to do; empty where it is.
-    """
-
+    # z away from the plane, towards the robot's side; origin at the first point, x towards the
+    # second.
     T_base_bench: Transform
+    # Distance of every point from the plane, metres, above positive.
     residuals: Float[np.ndarray, "points"]
-    findings: tuple[str, ...]
+    findings: tuple[str, ...]  # why it is not to be trusted, and what to do; empty where it is
 
 
 def find_bench(touched: Float[np.ndarray, "points 3"], up: Vector | None = None) -> Bench:

@@ -62,17 +62,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A solid that lies on the bench.
+    """A solid that lies on the bench."""
 
-    Attributes:
-        pieces: Convex pieces of its shape, its own frame, metres.
-        mesh: What is shown of it; the pieces where it is None.
-        colour: Red, green and blue of it, 0 to 1.
-    """
-
-    pieces: tuple[Piece, ...]
-    mesh: Mesh | None = None
-    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    pieces: tuple[Piece, ...]  # convex pieces of its shape, its own frame, metres
+    mesh: Mesh | None = None  # what is shown of it; the pieces where it is None
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)  # red, green and blue of it, 0 to 1
 
 
 class Cell:

@@ -37,18 +37,12 @@ FRAME_S: Final = 0.04  # seconds from frame to frame of a recording
 
 @dataclass
 class Outcome:
-    """What came of a motion.
+    """What came of a motion."""
 
-    Attributes:
-        held: Number of the thing that was held after lift and shake; None for none.
-        collided: Whether the robot hit something before its fingers closed.
-        times: Of the recorded states, seconds.
-        states: Positions of all joints, as the simulation has them.
-    """
-
-    held: int | None = None
-    collided: bool = False
-    times: list[float] = field(default_factory=list)
+    held: int | None = None  # number of the thing that was held after lift and shake; None for none
+    collided: bool = False  # whether the robot hit something before its fingers closed
+    times: list[float] = field(default_factory=list)  # of the recorded states, seconds
+    # Positions of all joints, as the simulation has them.
     states: list[Float[np.ndarray, "positions"]] = field(default_factory=list)
 
 

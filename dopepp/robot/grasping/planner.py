@@ -79,17 +79,13 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Gripper:
-    """How the fingers move.
+    """How the fingers move."""
 
-    Attributes:
-        widths: Distance between the pads at every command of :data:`COMMANDS`, metres, descending.
-        reaches: How far the pads' ends are before the flange, metres: closing, they swing forward.
-        joints: The fingers' joints, for checks of collisions.
-    """
-
+    # Distance between the pads at every command of `COMMANDS`, metres, descending.
     widths: Float[np.ndarray, "commands"]
+    # How far the pads' ends are before the flange, metres: closing, they swing forward.
     reaches: Float[np.ndarray, "commands"]
-    joints: Float[np.ndarray, "commands 8"]
+    joints: Float[np.ndarray, "commands 8"]  # the fingers' joints, for checks of collisions
 
     @property
     def widest(self) -> float:
@@ -130,36 +126,22 @@ def measure_gripper() -> Gripper:
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """What calibrations have told the controller.
+    """What calibrations have told the controller."""
 
-    Attributes:
-        T_flange_cam: Where the camera is in the hand.
-        tip: Middle between the ends of the closed fingers, flange frame, metres.
-        T_base_bench: The bench; z is its normal.
-    """
-
-    T_flange_cam: Transform
-    tip: Vector
-    T_base_bench: Transform
+    T_flange_cam: Transform  # where the camera is in the hand
+    tip: Vector  # middle between the ends of the closed fingers, flange frame, metres
+    T_base_bench: Transform  # the bench; z is its normal
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion: joints, radians, from where the arm is.
+    """A motion: joints, radians, from where the arm is."""
 
-    Attributes:
-        approach: To above the part.
-        descent: Straight to it.
-        lift: Straight up.
-        opening: Of the fingers before they close, metres.
-        grasp: Which of the part's grasps it is.
-    """
-
-    approach: Path
-    descent: Path
-    lift: Path
-    opening: float
-    grasp: Grasp
+    approach: Path  # to above the part
+    descent: Path  # straight to it
+    lift: Path  # straight up
+    opening: float  # of the fingers before they close, metres
+    grasp: Grasp  # which of the part's grasps it is
 
 
 def rested(T_base_obj: Transform, hull: Hull, T_base_bench: Transform) -> Transform:

@@ -63,37 +63,23 @@ _DOWN: Final = np.diag([1.0, -1.0, -1.0])  # rotation of a tool that looks strai
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """What is true of a robot and nobody knows.
+    """What is true of a robot and nobody knows."""
 
-    Attributes:
-        zero: How far its joints are from where they are read, radians.
-        T_flange_cam: Where the camera is.
-        tip: Middle between the ends of the closed fingers, flange frame, metres.
-    """
-
-    zero: Joints
-    T_flange_cam: Transform
-    tip: Vector
+    zero: Joints  # how far its joints are from where they are read, radians
+    T_flange_cam: Transform  # where the camera is
+    tip: Vector  # middle between the ends of the closed fingers, flange frame, metres
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What the calibrations of a robot have found.
-
-    Attributes:
-        camera: The lens.
-        hand_eye_mm: How far the camera is off, at the distance of the parts, millimetres, and
-        hand_eye_deg: by how much it is turned, degrees.
-        tool_mm: How far the tool's tip is off, millimetres.
-        bench_mm: How far the bench is off below the tray, millimetres.
-    """
+    """What the calibrations of a robot have found."""
 
     knowledge: Knowledge
-    camera: Camera
-    hand_eye_mm: float
-    hand_eye_deg: float
-    tool_mm: float
-    bench_mm: float
+    camera: Camera  # the lens
+    hand_eye_mm: float  # how far the camera is off, at the distance of the parts, millimetres
+    hand_eye_deg: float  # by how much it is turned, degrees
+    tool_mm: float  # how far the tool's tip is off, millimetres
+    bench_mm: float  # how far the bench is off below the tray, millimetres
 
 
 def draw_robot(rng: Generator, tip: Vector) -> Robot:

@@ -14,18 +14,14 @@ FAILURES: Final = ("not seen", "wrong pose", "no plan", "collided", "slipped")
 
 @dataclass(frozen=True)
 class Source:
-    """Where the poses come from that a part is gripped by: an arm of the experiment.
+    """Where the poses come from that a part is gripped by: an arm of the experiment."""
 
-    Attributes:
-        kind: ``network``; ``exact``, the simulation's truth; or ``random``, any that the layout
-            could have.
-        matrices: Whether the network's poses go through the calibrated matrices or the true ones.
-        error: By how much exact poses are off, in a random direction and about a random axis:
-            millimetres and degrees.
-    """
-
+    # `network`; `exact`, the simulation's truth; or `random`, any that the layout could have.
     kind: str = "network"
+    # Whether the network's poses go through the calibrated matrices or the true ones.
     matrices: str = "calibrated"
+    # By how much exact poses are off, in a random direction and about a random axis: millimetres
+    # and degrees.
     error: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -39,28 +35,17 @@ class Source:
 
 @dataclass(frozen=True)
 class Task:
-    """What is tried; plain values, to be sent to a process.
+    """What is tried; plain values, to be sent to a process."""
 
-    Attributes:
-        part: A built-in part or a mesh file, and
-        unit: the file's.
-        grasps: File of grasps; None takes the built-in part's.
-        network: Checkpoint; None where no source needs one.
-        refine: Whether its poses are refined.
-        layout: Of :data:`~dopepp.robot.grasping.layouts.LAYOUTS`.
-        renderer: Of the camera's pictures.
-        yaw_deg: How far parts are turned, and
-        rest: on which faces they lie; see :class:`~dopepp.robot.grasping.layouts.Layout`.
-    """
-
-    part: str = "pivconnector"
-    unit: str | None = None
-    grasps: Path | None = None
-    network: str | None = None
-    refine: bool = True
-    layout: str = "single"
-    renderer: str = "raster"
-    yaw_deg: float = 180.0
+    part: str = "pivconnector"  # a built-in part or a mesh file
+    unit: str | None = None  # of the mesh file
+    grasps: Path | None = None  # file of grasps; None takes the built-in part's
+    network: str | None = None  # checkpoint; None where no source needs one
+    refine: bool = True  # whether its poses are refined
+    layout: str = "single"  # of `LAYOUTS`
+    renderer: str = "raster"  # of the camera's pictures
+    yaw_deg: float = 180.0  # how far parts are turned
+    # On which faces they lie; see `Layout`.
     rest: str = "front"
     seed: int = 0
     sources: tuple[Source, ...] = (Source(),)
@@ -68,33 +53,20 @@ class Task:
 
 @dataclass(frozen=True)
 class Record:
-    """What came of one trial with one source of poses.
+    """What came of one trial with one source of poses."""
 
-    Attributes:
-        number: The trial's, from 0; trials of one number are of one scene.
-        source: The source's name.
-        off: By how much the pose was put off on purpose, millimetres and degrees.
-        seen: Whether there was a pose.
-        recognised: Whether it was right: ADD below a tenth of the diameter.
-        add_mm: ADD of it, millimetres; NaN without one. Like the others in the arm's base frame,
-            so that the calibration's error is in it.
-        error_mm: How far the part's origin was off, before the part was laid flat, millimetres, and
-        error_deg: how it was turned, degrees.
-        caught: Whether the part was held after lift and shake.
-        failure: Which of :data:`FAILURES` it was; empty for none.
-        hand_eye_mm: How far the calibration was off at the part's distance, and
-        hand_eye_deg: by how much it was turned.
-    """
-
-    number: int
-    source: str
-    off: float
-    seen: bool
-    recognised: bool
+    number: int  # the trial's, from 0; trials of one number are of one scene
+    source: str  # the source's name
+    off: float  # by how much the pose was put off on purpose, millimetres and degrees
+    seen: bool  # whether there was a pose
+    recognised: bool  # whether it was right: ADD below a tenth of the diameter
+    # ADD of it, millimetres; NaN without one. Like the others in the arm's base frame, so that the
+    # calibration's error is in it.
     add_mm: float
+    # How far the part's origin was off, before the part was laid flat, millimetres.
     error_mm: float
-    error_deg: float
-    caught: bool
-    failure: str
-    hand_eye_mm: float
-    hand_eye_deg: float
+    error_deg: float  # how it was turned, degrees
+    caught: bool  # whether the part was held after lift and shake
+    failure: str  # which of `FAILURES` it was; empty for none
+    hand_eye_mm: float  # how far the calibration was off at the part's distance
+    hand_eye_deg: float  # by how much it was turned

@@ -52,27 +52,18 @@ RECOGNISED: Final = 0.1  # ADD over the diameter below which a part counts as re
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A trial's scene before anybody moves.
-
-    Attributes:
-        lying: What is on the bench, the parts first.
-        start: State of the simulation.
-        poses: Of the things, T_base_obj, as they have come to lie.
-        joints: Where the arm's controller reads the joints while it looks, radians.
-        T_base_cam: Where the camera truly is.
-        picture: What it sees.
-    """
+    """A trial's scene before anybody moves."""
 
     number: int
     cell: Cell
-    lying: Sequence[Lying]
-    start: Any
-    poses: list[Transform]
+    lying: Sequence[Lying]  # what is on the bench, the parts first
+    start: Any  # state of the simulation
+    poses: list[Transform]  # of the things, T_base_obj, as they have come to lie
     robot: Robot
     calibrated: Calibrated
-    joints: Joints
-    T_base_cam: Transform
-    picture: Picture
+    joints: Joints  # where the arm's controller reads the joints while it looks, radians
+    T_base_cam: Transform  # where the camera truly is
+    picture: Picture  # what it sees
 
     @property
     def targets(self) -> list[Transform]:
@@ -83,14 +74,11 @@ class Scene:
 
 @dataclass(eq=False)
 class Attempt:
-    """A record and what is shown of it.
-
-    Attributes:
-        believed: Where the arm looked for the part, T_base_obj; None where nothing was seen.
-    """
+    """A record and what is shown of it."""
 
     record: Record
     outcome: Outcome = field(default_factory=Outcome)
+    # Where the arm looked for the part, T_base_obj; None where nothing was seen.
     believed: Transform | None = None
 
 

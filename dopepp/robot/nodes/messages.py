@@ -60,18 +60,12 @@ Fields = dict[str, Any]
 
 @dataclass(frozen=True)
 class Message:
-    """A message.
+    """A message."""
 
-    Attributes:
-        topic: Where it goes: ``pose_part`` is below the node's name (``/dope/pose_part``),
-            ``/tf`` is not.
-        kind: Its type, ``package/Name``.
-        fields: Its fields by name; a message inside it is a dict, a picture's data are bytes.
-    """
-
+    # Where it goes: `pose_part` is below the node's name (`/dope/pose_part`), `/tf` is not.
     topic: str
-    kind: str
-    fields: Fields
+    kind: str  # its type, `package/Name`
+    fields: Fields  # its fields by name; a message inside it is a dict, a picture's data are bytes
 
 
 @dataclass(frozen=True, eq=False)

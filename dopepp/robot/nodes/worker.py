@@ -44,17 +44,11 @@ class Stamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """What may change while a node runs.
+    """What may change while a node runs."""
 
-    Attributes:
-        confidence: Least score of a pose, in [0, 1].
-        refine: Whether poses are made precise on the picture.
-        overlay: Whether the picture with the poses drawn on it is wanted.
-    """
-
-    confidence: float = 0.0
-    refine: bool = False
-    overlay: bool = False
+    confidence: float = 0.0  # least score of a pose, in [0, 1]
+    refine: bool = False  # whether poses are made precise on the picture
+    overlay: bool = False  # whether the picture with the poses drawn on it is wanted
 
     def __post_init__(self) -> None:
         check("confidence", self.confidence, float, Range(0, 1))
