@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -42,11 +43,12 @@ from dopepp.experiment.results.entries import (
     ordered,
     with_refined,
 )
-from dopepp.experiment.results.frame import Row, header_of, markdown
+from dopepp.experiment.results.frame import header_of, markdown
 from dopepp.experiment.results.pages import write_page
 from dopepp.experiment.results.paper import PaperTable, write_paper_table
 from dopepp.experiment.results.report import Report
 from dopepp.inference.estimator import PoseEstimator
+from dopepp.recovery.detection import Detection
 
 TABLE_FILE: Final = "compare.csv"
 TEXT_FILE: Final = "compare.md"
@@ -58,6 +60,13 @@ LOG_FILE: Final = "metrics.csv"
 
 NUM_PICTURES: Final = 3
 """Test images, the first ones: nobody has chosen them."""
+
+_LOGGED: Final = {
+    "train/loss": ("training loss", 1, True),
+    "val/loss": ("validation loss", 1, True),
+    "val/add_01d": ("validation ADD-0.1d (%)", 100, False),
+}
+"""Columns of a log that are drawn: label, factor, and whether the axis is logarithmic."""
 
 _MIN_COLUMNS: Final = 3
 """Tiles of fewer methods than this would be larger than anybody needs."""
@@ -79,24 +88,18 @@ def write_comparison(entries: Sequence[Entry], folder: Path) -> dict[str, Any]:
     """Print and write table and AUC curves; return the content of ``compare.md``."""
     table = compared(entries)
     means = [report.mean for entry in entries for report in entry.reports]
-    symmetric = any(row.num_symmetries > 1 for row in means)
-    compact, said = headline(table, symmetric), notes(entries, table)
-    display.show_table(
-        "comparison",
-        [{key: text for key, text in row.items() if key not in _TOO_WIDE} for row in compact],
-        num_labels=2,
-    )
-    for note in said:
-        display.console.print(note)
-    rows = full(table)
+    compact = headline(table, any(row.num_symmetries > 1 for row in means))
+    sentences, rows = notes(entries, table), full(table)
+    narrow = [{key: row[key] for key in row if key not in _TOO_WIDE} for row in compact]
+    display.show_table("comparison", narrow, num_labels=2)
+    for sentence in sentences:
+        display.console.print(sentence)
     write_csv(folder / TABLE_FILE, rows, header_of(rows))
-    page = {"table": markdown(compact), "notes": said, "picture": "", "missing": "", "origins": ""}
+    page = {"table": markdown(compact), "notes": sentences}
     write_page(folder / TEXT_FILE, "compare", **page)
-    curves = accuracy_curves(entries)
-    if curves:
-        save_accuracy_curves(
-            (folder / CURVES_FILE).with_suffix(""), curves, title="ADD, all objects"
-        )
+    if curves := accuracy_curves(entries):
+        path = (folder / CURVES_FILE).with_suffix("")
+        save_accuracy_curves(path, curves, title="ADD, all objects")
     return page
 
 
@@ -118,12 +121,16 @@ def compare_paths(
 ) -> Path:
     """Compare run folders and return the folder with the comparison.
 
-    Paths are folders of trainings, evaluations and multiruns; ``out`` is a new folder under
-    ``outputs/compare`` by default. Δ is against the method called ``baseline``: ``dope`` by
-    default, else the first one. ``num_pictures`` test images are shown through every model. The
-    methods are laid out as in the experiment's file ``table`` as well. A :class:`UserError`: a path
-    holds no run, the baseline is none of the methods, the experiment has no table, or ``out`` holds
-    a comparison already.
+    Args:
+        paths: Folders of trainings, evaluations and multiruns.
+        out: New folder; one under ``outputs/compare`` by default.
+        baseline: Method that Δ is against: ``dope`` by default, else the first one.
+        num_pictures: Test images that are shown through every model.
+        table: Experiment's file in whose table the methods are laid out as well.
+
+    Raises:
+        UserError: A path holds no run, the baseline is none of the methods, the experiment has no
+            table, or ``out`` holds a comparison already.
     """
     layout = None if table is None else PaperTable.read(table)
     runs = find_runs(paths)
@@ -148,62 +155,51 @@ def compare_runs(
     and curves of training are the networks'. The table is written first, so that it is there
     whatever befalls curves and pictures. A :class:`UserError`: the baseline is none of the methods.
     """
-    entries = group(runs)
-    names = [entry.name for entry in entries]
+    networks = group(runs)
+    names = [entry.name for entry in networks]
     if baseline is not None and baseline not in names:
         raise UserError(f"baseline {baseline!r}", ", ".join(names), "choose one of them")
-    networks = ordered(entries, baseline or BASELINE)
+    networks = ordered(networks, baseline or BASELINE)
     entries = with_refined(networks)
     page = write_comparison(entries, folder)
     panels = _panels(entries, folder)
     shown = num_pictures if any(entry.reports for entry in networks) else 0
-    tiles, note = picture_tiles(networks, shown) if shown else ([], "")
+    tiles, missing = picture_tiles(networks, shown) if shown else ([], "")
     if tiles:
         write_png(folder / PICTURES_FILE, contact_sheet(tiles, len(networks)))
         width = 2 * max([one.shape[1] for one in panels], default=_PANEL_PX)
-        columns = max(_MIN_COLUMNS, len(networks))
-        panels = [*([grid(panels, 2)] if panels else []),
-                  contact_sheet(tiles, len(networks), width // columns - _GAP_PX)]  # fmt: skip
+        tile_width = width // max(_MIN_COLUMNS, len(networks)) - _GAP_PX
+        sheet = contact_sheet(tiles, len(networks), tile_width)
+        panels = [*([grid(panels, 2)] if panels else []), sheet]
     if panels:
         write_png(folder / PANELS_FILE, grid(panels, 1 if tiles else 2))
         page["picture"] = PANELS_FILE
-    if note:
-        display.console.print(note)
-    page |= {"missing": note, "origins": markdown(_origins(networks))}
-    write_page(folder / TEXT_FILE, "compare", **page)
-    return entries
-
-
-def _origins(entries: Sequence[Entry]) -> list[Row]:
-    """Return where every result comes from: all overrides and the folder."""
-    return [
+    if missing:
+        display.console.print(missing)
+    origins = [
         {
             "method": entry.name,
             "seed": "" if run.seed is None else str(run.seed),
             "overrides": " ".join(run.overrides),
             "folder": str(run.folder),
         }
-        for entry in entries
+        for entry in networks
         for run in entry.runs
     ]
+    write_page(folder / TEXT_FILE, "compare", **page, missing=missing, origins=markdown(origins))
+    return entries
 
 
 def _panels(entries: Sequence[Entry], folder: Path) -> list[Picture]:
     """Draw what there is of loss, validation and accuracy curves; a method has one colour."""
     colours = {entry.name: f"C{number % 10}" for number, entry in enumerate(entries)}
     panels = []
-    for column, label, scale, log_y in (
-        ("train/loss", "training loss", 1, True),
-        ("val/loss", "validation loss", 1, True),
-        ("val/add_01d", "validation ADD-0.1d (%)", 100, False),
-    ):
-        lines = training_lines(entries, column, colours, scale)
-        if lines:
+    for column, (label, scale, log_y) in _LOGGED.items():
+        if lines := training_lines(entries, column, colours, scale):
             panels.append(figure_image(lines_figure(lines, "step", label, log_y)))
     if panels:
         write_png(folder / LOSS_FILE, grid(panels, len(panels)))
-    curves = accuracy_curves(entries)
-    if curves:
+    if curves := accuracy_curves(entries):
         figure = accuracy_figure(curves, title="ADD on test images", colours=colours)
         panels.append(figure_image(figure))
     return panels
@@ -228,28 +224,12 @@ def training_lines(
 
 
 def logged(path: Path, column: str) -> dict[int, float]:
-    """Return what a log holds in a column, by step; empty where there is no such file or column."""
-    cells = ((_number(row.get("step")), _number(row.get(column))) for row in read_csv(path))
-    return {int(step): value for step, value in cells if step is not None and value is not None}
-
-
-def _number(text: object) -> float | None:
-    """Return a finite number, None for anything else that a log may hold."""
-    try:
-        number = float(str(text))
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-@dataclass
-class _Model:
-    """A method's network, of its first run; or why there is none."""
-
-    name: str
-    run: Run | None = None
-    estimator: PoseEstimator | None = None
-    reason: str = ""
+    """Return the finite numbers of a log's column by step, as far as the log goes."""
+    numbers = {}
+    for row in read_csv(path):
+        with suppress(KeyError, TypeError, ValueError):
+            numbers[int(row["step"])] = float(row[column])
+    return {step: number for step, number in numbers.items() if math.isfinite(number)}
 
 
 def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[list[Tile], str]:
@@ -259,11 +239,11 @@ def picture_tiles(entries: Sequence[Entry], num: int = NUM_PICTURES) -> tuple[li
     Returns row by row the tiles of an image, one per method; and why some are missing.
     """
     measured = [run for entry in entries for run in entry.runs if run.report]
-    kinds = list(dict.fromkeys(map(_parts, measured)))
+    kinds = list(dict.fromkeys(map(_parts, measured))) or [()]
     tiles, notes = [], []
-    for number, parts in enumerate(kinds or [()]):
-        share = num // max(1, len(kinds)) + (number < num % max(1, len(kinds)))
-        rows, note = _rows([_load(entry, parts) for entry in entries], share)
+    for number, parts in enumerate(kinds):
+        share = num // len(kinds) + (number < num % len(kinds))
+        rows, note = _rows([_Model(entry, parts) for entry in entries], share)
         tiles += rows
         notes += [note] if note else []
     return tiles, " ".join(notes)
@@ -274,64 +254,74 @@ def _parts(run: Run) -> tuple[str, ...]:
     return tuple(sorted(run.report.errors)) if run.report is not None else ()
 
 
+class _Model:
+    """A method's network of some parts, of its first run; or why there is none."""
+
+    def __init__(self, entry: Entry, parts: tuple[str, ...]) -> None:
+        self.name, self.reason = entry.name, entry.failure
+        self.estimator: PoseEstimator | None = None
+        self.run = next((one for one in entry.runs if _parts(one) == parts), entry.runs[0])
+        path = self.run.checkpoint
+        if path is None or not path.is_file():
+            self.reason = entry.failure or f"no file {path}"
+            return
+        try:
+            self.estimator, self.reason = PoseEstimator.load(path), ""
+        except UserError as error:
+            self.reason = str(error)
+
+    def test_images(self, num: int) -> list[Sample]:
+        """Open the images that the run was measured on."""
+        assert self.estimator is not None
+        stored, config = trained_on(self.estimator.checkpoint.data), self.run.config
+        # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
+        given = config if "ckpt_path" in config else {}
+        path = str(self.run.checkpoint)
+        data = chosen_data(given.get("data"), given.get("virtual"), stored, path)
+        if data.root is not None:
+            data = replace(data, objects=tuple(part.name for part in self.estimator.parts))
+        source = held_out_source(data, build_parts(data), "test")
+        return [source.sample(index, 0) for index in range(min(num, len(source)))]
+
+    def tile(self, sample: Sample, colour: tuple[int, int, int]) -> Tile:
+        """Draw the answer to one image, or why there is none."""
+        reason = self.reason
+        poses: Sequence[Detection] = []
+        if self.estimator is not None:
+            try:
+                poses = self.estimator.predict(
+                    sample.image, sample.K, depth=sample.depth, cropped=True
+                )
+            except UserError as error:
+                reason = str(error)
+        if self.estimator is None or reason:
+            width, height = sample.size
+            factor = max(1, -(-MIN_WIDTH_PX // width))
+            return Tile(message_picture(width * factor, height * factor, reason), self.name)
+        known = {part.name for part in self.estimator.parts}
+        truths = [one for one in sample.instances if one.label in known]
+        wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in truths]
+        wireframes += [Wireframe(one.keypoints, colour, "predicted") for one in poses]
+        missed = "" if poses else ": finds nothing"
+        return Tile(overlay(sample.image, wireframes), f"{self.name}{missed} ({sample.key})")
+
+
 def _rows(models: Sequence[_Model], num: int) -> tuple[list[Tile], str]:
     """Return the tiles of some images, one per method; and why there are none."""
-    samples, reasons = [], []
-    for model in models:
-        if model.run is None or model.estimator is None:
-            continue
+    reasons = [f"{model.name}: {model.reason}" for model in models]
+    loaded = [model for model in models if model.estimator is not None]
+    samples: list[Sample] = []
+    for number, model in enumerate(loaded):
+        reasons = reasons if number else []
         try:
-            samples = _test_images(model.run, model.estimator, num)
+            samples = model.test_images(num)
             break
         except UserError as error:
             reasons.append(f"{model.name}: {error}")
     if not samples:
-        why = "; ".join(reasons or [f"{one.name}: {one.reason}" for one in models])
-        return [], f"No pictures of the same test images. {why}" if num else ""
-    first = next(model for model in models if model.estimator is not None)
-    return [_tile(model, sample, BLUE if model is first and len(models) > 1 else YELLOW)
-            for sample in samples for model in models], ""  # fmt: skip
-
-
-def _load(entry: Entry, parts: tuple[str, ...]) -> _Model:
-    """Load a method's checkpoint of some parts, or say why that cannot be."""
-    if not entry.runs:
-        return _Model(entry.name, reason="there is no checkpoint of it")
-    run = next((one for one in entry.runs if _parts(one) == parts), entry.runs[0])
-    if run.checkpoint is None or not run.checkpoint.is_file():
-        return _Model(entry.name, run, reason=entry.failure or f"no file {run.checkpoint}")
-    try:
-        estimator = PoseEstimator.load(run.checkpoint)
-    except UserError as error:
-        return _Model(entry.name, run, reason=str(error))
-    return _Model(entry.name, run, estimator)
-
-
-def _test_images(run: Run, estimator: PoseEstimator, num: int) -> list[Sample]:
-    """Open the images that a run was measured on."""
-    stored = trained_on(estimator.checkpoint.data)
-    # A training's config holds what its checkpoint stores; an evaluation's, what it changed.
-    given = run.config if "ckpt_path" in run.config else {}
-    data = chosen_data(given.get("data"), given.get("virtual"), stored, str(run.checkpoint))
-    if data.root is not None:
-        data = replace(data, objects=tuple(part.name for part in estimator.parts))
-    source = held_out_source(data, build_parts(data), "test")
-    return [source.sample(index, 0) for index in range(min(num, len(source)))]
-
-
-def _tile(model: _Model, sample: Sample, colour: tuple[int, int, int]) -> Tile:
-    """Draw one method's answer to one image."""
-    width, height = sample.size
-    factor = max(1, -(-MIN_WIDTH_PX // width))
-    if model.estimator is None:
-        return Tile(message_picture(width * factor, height * factor, model.reason), model.name)
-    try:
-        found = model.estimator.predict(sample.image, sample.K, depth=sample.depth, cropped=True)
-    except UserError as error:
-        return Tile(message_picture(width * factor, height * factor, str(error)), model.name)
-    known = {part.name for part in model.estimator.parts}
-    truths = [one for one in sample.instances if one.label in known]
-    wireframes = [Wireframe(one.keypoints, GREEN, "true") for one in truths]
-    wireframes += [Wireframe(one.keypoints, colour, "predicted") for one in found]
-    missed = "" if found else ": finds nothing"
-    return Tile(overlay(sample.image, wireframes), f"{model.name}{missed} ({sample.key})")
+        return [], f"No pictures of the same test images. {'; '.join(reasons)}" if num else ""
+    return [
+        model.tile(sample, BLUE if model is loaded[0] and len(models) > 1 else YELLOW)
+        for sample in samples
+        for model in models
+    ], ""

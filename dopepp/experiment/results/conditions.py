@@ -17,6 +17,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -72,12 +73,13 @@ class Condition:
     """What changes from level to level, and how its levels are shown.
 
     Attributes:
-        name: The option's name; the files are called after it.
+        name: Name of the option and of the files.
         axis: What is changed, with the unit in which levels are shown.
         level: Name of the CSV file's column of levels.
-        form: How a level is written in that unit.
-        images: What the images of its levels are, of which a file has no poses.
-        per_unit: By what a level is multiplied to have that unit.
+        form: Format of a level in that unit.
+        introduction: Beginning of the page.
+        images: The images of its levels, of which a file has no poses.
+        per_unit: Factor from a level to that unit.
         ratio: Whether levels are ratios, which a logarithmic axis spaces evenly.
     """
 
@@ -91,7 +93,7 @@ class Condition:
     ratio: bool = False
 
     def heading(self, level: float) -> str:
-        """Return what stands above a level's column."""
+        """Return the heading of a level's column."""
         return self.form.format(self.per_unit * level)
 
     def check_methods(self, methods: Mapping[str, Method]) -> None:
@@ -182,7 +184,15 @@ def record_condition(
     sections = [f"## {title}\n\n{markdown(table)}" for title, table in tables.items()]
     text = "\n".join([f"{condition.introduction}\n", *(f"{line}\n" for line in notes), *sections])
     write_whole(path, text.encode())
-    _draw(path.with_suffix(".png"), condition, values, rates)
+    panels = {}  # one per object and rate, in each every method that was measured on it
+    for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
+        for rate in rates:
+            own = [one for one in values if one.object == name and one.measure == rate.field]
+            curves = rate_curves(own, condition.per_unit)
+            drawn = {method: curve for method, curve in curves.items() if len(curve.x)}
+            panels[f"{name}: {rate.title}"] = drawn
+    figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
+    write_png(path.with_suffix(".png"), figure_image(figure))
     if tiles:
         sheet = contact_sheet(tiles, columns=len(levels))
         write_png(run_dir / f"{condition.name}_examples.png", sheet)
@@ -202,34 +212,18 @@ def _values(
                 yield from row_values(row, ["num_instances", *fields], rated, level.value)
 
 
-def _draw(
-    path: Path, condition: Condition, values: Sequence[Value], rates: Sequence[PassRate]
-) -> None:
-    """Draw a panel per object and rate, in each every method that was measured on it."""
-    panels = {}
-    for name in dict.fromkeys(value.object for value in values if value.object != MEAN):
-        for rate in rates:
-            own = [one for one in values if one.object == name and one.measure == rate.field]
-            curves = rate_curves(own, condition.per_unit)
-            shown = {method: curve for method, curve in curves.items() if len(curve.x)}
-            panels[f"{name}: {rate.title}"] = shown
-    figure = rates_figure(panels, condition.axis, len(rates), ratio=condition.ratio)
-    write_png(path, figure_image(figure))
-
-
 def check_masks(source: Source) -> None:
     """Read images until one has an instance mask; a :class:`UserError` if none has.
 
     So it shows before anything takes time whether there is something to shade.
     """
-    for index in range(len(source)):
-        if any(one.mask is not None and one.mask.any() for one in source.sample(index).instances):
-            return
-    raise UserError(
-        f"shading on {source.name}, {len(source):,} images without an instance mask",
-        "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
-        "choose such data, or leave out shading",
-    )
+    samples = (source.sample(index) for index in range(len(source)))
+    if not any(one.mask is not None and one.mask.any() for s in samples for one in s.instances):
+        raise UserError(
+            f"shading on {source.name}, {len(source):,} images without an instance mask",
+            "images with masks: renders, label images of YCB-Video, mask_visib of BOP",
+            "choose such data, or leave out shading",
+        )
 
 
 def measure_shading(
@@ -272,18 +266,16 @@ def measure_shading(
 def _shaded(share: float, metrics: Mapping[str, PoseMetrics], reached: Sequence[float]) -> Level:
     """Sum up, and say how many instances are not shaded as much as they should be."""
     # A share that is not known (NaN) is near no other.
-    outside = [one for one in reached if not abs(one - share) <= TOLERANCE]
+    num_outside = sum(not abs(one - share) <= TOLERANCE for one in reached)
     known = [one for one in reached if np.isfinite(one)]
-    facts = {
-        "share_reached": float(np.mean(known)) if known else math.nan,
-        "num_outside_tolerance": len(outside),
-    }
+    mean = float(np.mean(known)) if known else math.nan
     note = (
-        f"At {SHADING.heading(share)}, {len(outside)} of {len(reached)} instances are not within "
+        f"At {SHADING.heading(share)}, {num_outside} of {len(reached)} instances are not within "
         f"{100 * TOLERANCE:g} points of it: no mask, or no background to cover them with."
     )
     rows = {name: one.compute() for name, one in metrics.items()}
-    return Level(share, rows, facts, note if outside else "")
+    facts = {"share_reached": mean, "num_outside_tolerance": num_outside}
+    return Level(share, rows, facts, note if num_outside else "")
 
 
 def _examples(sample: Sample, shaded: Sequence[Shaded]) -> list[Tile]:
@@ -302,12 +294,13 @@ def _around_masks(sample: Sample) -> tuple[slice, slice]:
     """Return the image's rows and columns around all masks, with a margin."""
     masks = [one.mask for one in sample.instances if one.mask is not None]
     shown = np.any(masks, axis=0) if masks else np.ones(sample.image.shape[:2], bool)
-    ranges = []
-    for places in np.nonzero(shown if shown.any() else ~shown):
-        first, end = int(places.min()), int(places.max()) + 1
-        margin = round(_MARGIN * (end - first))
-        ranges.append(slice(max(0, first - margin), end + margin))
-    return ranges[0], ranges[1]
+    left, top, width, height = cv2.boundingRect(np.uint8(shown if shown.any() else ~shown))
+
+    def widened(first: int, size: int) -> slice:
+        margin = round(_MARGIN * size)
+        return slice(max(0, first - margin), first + size + margin)
+
+    return widened(top, height), widened(left, width)
 
 
 def measure_scales(
@@ -350,11 +343,9 @@ def _scale_level(scale: float, measured: Measured, unmoved: Measured) -> Level:
     return Level(scale, rows, {"visible_fraction": mean}, note)
 
 
-def _in_words(visible_fractions: Float[np.ndarray, "n"]) -> str:
-    number = len(visible_fractions)
-    if not number:
-        return "none"
-    return f"{number}, of which {100 * visible_fractions.mean():.0f} % is in sight on average"
+def _in_words(fractions: Float[np.ndarray, "n"]) -> str:
+    share = f", of which {100 * fractions.mean():.0f} % is in sight on average"
+    return f"{len(fractions)}{share}" if len(fractions) else "none"
 
 
 def _visible_fractions(measured: Measured) -> Float[np.ndarray, "n"]:

@@ -1,4 +1,4 @@
-"""What a comparison compares: run folders, and the methods that they are seeds and parts of.
+"""Run folders, and the methods of which they are seeds and parts.
 
 Trainings, evaluations and whole multiruns are read; failed and unfinished runs, too.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -32,9 +32,8 @@ from dopepp.experiment.results.report import Cost, Report
 BASELINE: Final = "dope"
 """A method of this name stands first, and every other one's Δ is against it."""
 
-_HYDRA: Final = Path(".hydra")
-_TRACES: Final = (_HYDRA, Path(CONFIG_FILE), Path(METRICS_FILE),
-                  Path(FAILURE_FILE))  # fmt: skip
+_HYDRA: Final = ".hydra"
+_TRACES: Final = (_HYDRA, CONFIG_FILE, METRICS_FILE, FAILURE_FILE)
 """A run leaves at least one of these."""
 
 _ELSEWHERE: Final = ("output_dir", "resume", "ckpt_path", "baseline", "device", "num_pictures")
@@ -55,13 +54,12 @@ class Run:
     """A run folder.
 
     Attributes:
-        overrides: What it was overridden with, without options that only name places.
-        report: Its result, None where there is none.
+        overrides: Overrides that do not only name places.
+        report: Result; None where there is none.
         failure: Why there is none, in one line; empty where none was asked for (``job=cost``).
-        config: The resolved config, empty where there is none.
+        config: Resolved config; empty where there is none.
         recipe: Everything but seed and objects that decides about the result, as one text; empty
             where unknown.
-        cost: What its network costs.
         pruned: Whether it has no result because a search stopped it.
     """
 
@@ -96,11 +94,11 @@ class Entry:
     """A method in a comparison.
 
     Attributes:
-        reports: Its results on one test set, one per seed.
-        seeds: The trainings' seeds, as many; None where unknown.
+        reports: Results on one test set, one per seed.
+        seeds: Seeds of the trainings, as many; None where unknown.
         failure: Why there is no result, in one line; empty where only the cost was asked for.
         pruned: Whether the reason is that a search stopped it, which is no failure.
-        runs: The run folders; empty where reports do not come from any.
+        runs: Run folders; empty where reports do not come from any.
         refine: How its poses were refined; empty of the network's own.
     """
 
@@ -137,10 +135,9 @@ def find_runs(paths: Sequence[Path]) -> list[Run]:
     return [read_run(folder) for folder in folders.values()]
 
 
-def _folders(path: Path) -> Iterator[Path]:
+def _folders(path: Path) -> list[Path]:
     if any((path / trace).exists() for trace in _TRACES):
-        yield path
-        return
+        return [path]
     jobs = [one for one in path.iterdir() if one.name.isdigit()] if path.is_dir() else []
     if not jobs:
         raise UserError(
@@ -148,47 +145,42 @@ def _folders(path: Path) -> Iterator[Path]:
             "the folder of a training, an evaluation or a multirun",
             "pass a folder with metrics.json or config.yaml in it",
         )
-    yield from sorted(jobs, key=lambda one: int(one.name))
+    return sorted(jobs, key=lambda job: int(job.name))
 
 
 def read_run(folder: Path) -> Run:
     """Read one run folder; whatever is missing or damaged in it becomes its failure."""
-    cost, failure, report, pruned = None, "", None, False
-    try:
-        report = _result(folder)
-        cost = _cost(folder) if report is None else report.cost
-    except _FailedError as error:
-        failure, pruned = str(error), isinstance(error, _PrunedError)
     config = _mapping(folder / CONFIG_FILE)
-    checkpoint = folder / BEST_CHECKPOINT
-    if report is not None and "checkpoint" in report.details:
-        checkpoint = folder / str(report.details["checkpoint"])
-    training, overrides = config, overrides_of(folder)
-    configs = [_as_asked(folder, config)] if config else []
+    run = Run(folder, "", overrides_of(folder), None, "", None, config, folder / BEST_CHECKPOINT)
+    try:
+        run.report, run.cost = _result(folder)
+    except UserError as error:
+        run.failure = str(error)
+    except _NoResultError as end:
+        run.failure, run.pruned = str(end), end.pruned
+    if run.report is not None and "checkpoint" in run.report.details:
+        run.checkpoint = folder / str(run.report.details["checkpoint"])
+    training, configs = config, [_as_asked(folder, config)] if config else []
     if "ckpt_path" in config:  # an evaluation: what it measured says what was trained, and how
-        checkpoint = Path(str(config["ckpt_path"]))
-        trained = checkpoint.parent.parent
+        run.checkpoint = Path(str(config["ckpt_path"]))
+        trained = run.checkpoint.parent.parent
         training = _mapping(trained / CONFIG_FILE)
-        overrides = [*overrides_of(trained), *overrides]
+        run.overrides = [*overrides_of(trained), *run.overrides]
         configs = [config, _as_asked(trained, training)] if training else []
-    model = _model(training or _mapping(folder / _HYDRA / "config.yaml"), overrides, report)
     seed = training.get("seed")
-    seed = seed if isinstance(seed, int) else None
-    recipe = _recipe(configs)
-    return Run(
-        folder, model, overrides, report, failure, seed, config, checkpoint, recipe, cost, pruned
-    )
+    run.seed = seed if isinstance(seed, int) else None
+    run.recipe = _recipe(configs)
+    run.model = _model(training or _mapping(folder / _HYDRA / "config.yaml"), run)
+    return run
 
 
-def _model(config: Mapping[str, Any], overrides: Sequence[str], report: Report | None) -> str:
+def _model(config: Mapping[str, Any], run: Run) -> str:
     """Return the model's name, of a run that ended early as far as it is known."""
     model = config.get("model")
     if isinstance(model, dict) and "name" in model:
         return str(model["name"])
-    chosen = [text.partition("=")[2] for text in overrides if text.startswith("model=")]
-    if chosen:
-        return chosen[-1]
-    return "run" if report is None else report.name
+    chosen = [text.partition("=")[2] for text in run.overrides if text.startswith("model=")]
+    return chosen[-1] if chosen else "run" if run.report is None else run.report.name
 
 
 def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
@@ -202,55 +194,45 @@ def _as_asked(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _recipe(configs: Sequence[Mapping[str, Any]]) -> str:
     """Return configs as one text, without seed, objects and what does not touch the result."""
-    kept = [
-        {key: value for key, value in config.items() if key not in ("seed", *_ELSEWHERE, *_BESIDE)}
-        for config in configs
-    ]
+    kept = [_without(config, "seed", *_ELSEWHERE, *_BESIDE) for config in configs]
     for config in kept:
         if isinstance(config.get("data"), dict):
-            data = config["data"].items()
-            config["data"] = {k: v for k, v in data if k not in ("parts", "objects")}
+            config["data"] = _without(config["data"], "parts", "objects")
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
-class _FailedError(Exception):
-    """Why a run has no result, in one line."""
+def _without(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key not in keys}
 
 
-class _PrunedError(_FailedError):
-    """When a search stopped it, and why."""
+class _NoResultError(Exception):
+    """Why a run has no result, in one line; ``pruned`` where a search stopped it."""
+
+    def __init__(self, reason: str, pruned: bool = False) -> None:
+        super().__init__(reason)
+        self.pruned = pruned
 
 
-def _result(folder: Path) -> Report | None:
-    """Return a run's result; None of a job that was to measure its network's cost alone."""
-    failed, metrics = folder / FAILURE_FILE, folder / METRICS_FILE
-    try:
-        if failed.is_file():
-            raise _FailedError(read_json(failed).get("reason", "without a reason"))
-        if (folder / PRUNED_FILE).is_file():
-            reason = read_json(folder / PRUNED_FILE).get("reason", "")
-            raise _PrunedError(reason)
-        if metrics.is_file():
-            return Report.from_record(read_json(metrics))
-    except UserError as error:
-        raise _FailedError(str(error)) from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _FailedError(f"{metrics.name} is not of this version: {error!r}") from error
-    if (folder / COST_FILE).is_file():
-        return None
-    unfinished = f"unfinished: it left no {metrics.name}"
+def _result(folder: Path) -> tuple[Report | None, Cost]:
+    """Return a run's result and cost; a job that measured its network's cost has no result."""
+    for name in (FAILURE_FILE, PRUNED_FILE):
+        if (folder / name).is_file():
+            reason = read_json(folder / name).get("reason", "without a reason")
+            raise _NoResultError(reason, name == PRUNED_FILE)
+    for name in (METRICS_FILE, COST_FILE):
+        if (folder / name).is_file():
+            stored = read_json(folder / name)
+            try:
+                if name == COST_FILE:
+                    return None, Cost(*(stored[key] for key in Cost.__annotations__))
+                report = Report.from_record(stored)
+                return report, report.cost
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise _NoResultError(f"{name} is not of this version: {error!r}") from error
+    unfinished = f"unfinished: it left no {METRICS_FILE}"
     if (folder / LAST_CHECKPOINT).is_file():
         unfinished += f"; go on with resume={folder}"
-    raise _FailedError(unfinished)
-
-
-def _cost(folder: Path) -> Cost:
-    """Return what a job that measures costs has left."""
-    try:
-        stored = read_json(folder / COST_FILE)
-        return Cost(stored["parameters"], stored["gmacs"], stored["ms_per_frame"])
-    except (UserError, KeyError) as error:
-        raise _FailedError(f"{COST_FILE} is not of this version: {error}") from error
+    raise _NoResultError(unfinished)
 
 
 def overrides_of(folder: Path) -> list[str]:
